@@ -1,1 +1,1 @@
-"""The command line: a verb is a few lines over a library call."""
+"""Command line of PlushSense; each verb parses options, calls a library function and prints the result."""

@@ -1,4 +1,4 @@
-"""``plushsense abstain DATASET --split by-subject:5 [--withhold]``."""
+"""Implement ``plushsense abstain DATASET --split by-subject:5 [--withhold]``."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def lines(result: dict[str, Any]) -> list[str]:
-    """Format the scores as text."""
+    """Format the scores of abstention as text."""
     out = marks({**result, "leaky": False})
     out.append(
         f"{result['recordings']} gestures of {result['people']} people left out, classified at their "

@@ -1,4 +1,4 @@
-"""``plushsense adapt BUNDLE RECORDINGS --out BUNDLE``."""
+"""Implement ``plushsense adapt BUNDLE RECORDINGS --out BUNDLE``."""
 
 from __future__ import annotations
 

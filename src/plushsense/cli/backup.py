@@ -1,4 +1,4 @@
-"""``plushsense backup DATASET FILE.zip``, ``backup --check FILE.zip`` and ``restore FILE.zip DEST``."""
+"""Implement ``plushsense backup DATASET FILE.zip``, ``backup --check FILE.zip`` and ``restore FILE.zip DEST``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``plushsense baselines DATASET --split leave-one-subject-out,windows:5``."""
+"""Implement ``plushsense baselines DATASET --split leave-one-subject-out,windows:5``."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def lines(result: dict[str, Any]) -> list[str]:
-    """Format the table as text, one line for each model, with an explanation."""
+    """Format the comparison as text: a table with one line per model, with explanations."""
     from plushsense.experiments.baselines.report import (
         COUNTS,
         LEAKY,

@@ -1,4 +1,4 @@
-"""``plushsense check DATASET [--only CHECK,…] [--report FILE.html] [--accept CHECK:RECORDING --why "…"]``."""
+"""Implement ``plushsense check DATASET [--only CHECK,…] [--report FILE.html] [--accept CHECK:RECORDING --why "…"]``."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _limits(texts: Sequence[str]) -> dict[str, float]:
 
 
 def overview(result: CheckReport) -> Iterator[str]:
-    """Format the findings as text: those that need a decision, then the others by severity, check and person."""
+    """Format the findings as text: those that need a decision first, the others by severity, check and person."""
     from plushsense.dataset.quality.checking import CHECKS
 
     people = len(result.dataset.subjects)
@@ -106,7 +106,7 @@ def overview(result: CheckReport) -> Iterator[str]:
 
 
 def _by_person(findings: Sequence[Finding], lines: int) -> Iterator[str]:
-    """Format findings as at most ``lines`` lines; where there are more, each person has one line with a number."""
+    """Format findings as about ``lines`` lines; if there are more, combine those of each person in one line."""
     by_person: dict[str, list[Finding]] = {}
     for f in findings:
         by_person.setdefault(f.subject, []).append(f)

@@ -1,4 +1,4 @@
-"""``plushsense demo [--quick] [--out DIR]``."""
+"""Implement ``plushsense demo [--quick] [--out DIR]``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``plushsense devices [--lsl-out URL]``, ``toy --serial-pty | --tcp PORT | --lsl NAME`` and ``simulate OUT``."""
+"""Implement ``plushsense devices [--lsl-out URL]``, ``toy --serial-pty|--tcp PORT|--lsl NAME`` and ``simulate OUT``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``plushsense evaluate DATASET --split leave-one-subject-out|by-subject:5|by-recording:5|windows:5``."""
+"""Implement ``plushsense evaluate DATASET --split leave-one-subject-out|by-subject:5|by-recording:5|windows:5``."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def lines(e: dict[str, Any]) -> list[str]:
-    """Format the scores as text: a row for each person, then the means."""
+    """Format the scores of an evaluation as text: a row for each person, then the means."""
     from plushsense.scoring.metrics import column_metrics
 
     names = {key: metric.name for key, metric in column_metrics().items()}
@@ -66,7 +66,7 @@ def lines(e: dict[str, Any]) -> list[str]:
 
 
 def deployed(e: dict[str, Any]) -> list[str]:
-    """Format the scores of the deployed networks as text: a row for each person (or fold), then the means."""
+    """Format the scores of the 8-bit networks as text: a row for each person (or fold), then the means."""
     from plushsense.scoring.metrics import column_metrics
 
     unit = "subject" if e["over"] == "subjects" else "fold"

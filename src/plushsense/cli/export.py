@@ -1,4 +1,4 @@
-"""``plushsense export BUNDLE OUT``, ``verify OUT [--target …] [--faults]`` and ``profile OUT [--target …]``."""
+"""Implement ``plushsense export BUNDLE OUT``, ``verify OUT [--target …]`` and ``profile OUT [--target …]``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``plushsense import SRC DEST [--layout NAME] [--add]``."""
+"""Implement ``plushsense import SRC DEST [--layout NAME] [--add]``."""
 
 from __future__ import annotations
 

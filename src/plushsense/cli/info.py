@@ -1,4 +1,4 @@
-"""``plushsense info DATASET|BUNDLE``, ``stats DATASET [--by COLUMN]`` and ``arch SPEC --filters 8,12,16``."""
+"""Implement ``plushsense info DATASET|BUNDLE``, ``stats DATASET [--by COLUMN]`` and ``arch SPEC --filters 8,12,16``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``plushsense live --device URL --model BUNDLE``."""
+"""Implement ``plushsense live --device URL --model BUNDLE``."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def format_update(decision: Decision, state_changed: bool, reactions: Sequence[Reaction] = ()) -> list[str]:
-    """Format changes of events, reactions, and the new state where it changed, as lines of text."""
+    """Format event changes, reactions and, if ``state_changed``, the new state as lines of text."""
     lines = [f"{event.t_s:9.2f} s  {_event(event)}" for event in decision.events]
     lines += [f"{reaction.t_s:9.2f} s    {_reaction(reaction)}" for reaction in reactions]
     if state_changed:

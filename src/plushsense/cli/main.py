@@ -1,7 +1,7 @@
-"""Run ``plushsense VERB ...``: load the verb's module, parse its options, and report errors as one sentence.
+"""Run ``plushsense VERB ...``: import the verb's module, parse its options, and report errors in one sentence.
 
-A verb is a function ``run(args) -> int`` in a module of this package, and a table in ``verbs.toml``. Only the module of
-the given verb is imported.
+A verb consists of a function in a module of this package, usually ``run(args) -> int``, and a table in ``verbs.toml``.
+Only the module of the given verb is imported.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def _overview() -> str:
 
 
 def load_verb(verb: str) -> Callable[[argparse.Namespace], int]:
-    """Import the function ``run`` of a verb.
+    """Import and return the function that runs a verb.
 
     Raises:
         PlushSenseError: for an unknown verb.
@@ -75,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
     except OSError as error:
         if _output_closed(error):
-            # The reader of standard output has ended (`| head`): not a failure of ours.
+            # The program that reads standard output has ended (as in `| head`), which is not an error.
             with contextlib.suppress(OSError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
@@ -86,14 +86,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _output_closed(error: OSError) -> bool:
-    """Return whether standard output has no reader any more, which Windows reports as an invalid argument."""
+    """Return whether standard output was closed by its reader, which Windows reports as an invalid argument."""
     if isinstance(error, BrokenPipeError):
         return True
     return sys.platform == "win32" and error.errno == errno.EINVAL and error.filename is None
 
 
 def _sentence(error: OSError) -> str:
-    """Format an error of the operating system as a sentence with the path."""
+    """Format an error of the operating system as a sentence that includes the paths concerned."""
     paths = " and ".join(f"'{os.fsdecode(p)}'" for p in (error.filename, error.filename2) if isinstance(p, str | bytes))
     why = error.strerror or str(error) or type(error).__name__
     if not paths:

@@ -1,4 +1,4 @@
-"""The verbs of ``verbs.toml``: their options for a parser, and the given values for library functions."""
+"""Read the verbs from ``verbs.toml``, add their options to a parser, and pass option values to library functions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-# Lists of names in help texts, by placeholder: module, and a collection or a function that returns one.
+# Placeholders for lists of names in help texts: each maps to a module and a collection (or function returning one).
 _LISTS = {
     "checks": ("plushsense.dataset.quality.checking", "CHECKS"),
     "layouts": ("plushsense.core.layouts", "layout_names"),
@@ -20,7 +20,7 @@ _TYPES = {"int": int, "float": float}
 
 
 class _Words(dict[str, str]):
-    """Texts for the placeholders of help texts; a list of names is imported when a help text has it."""
+    """Texts that replace placeholders in help texts; lists of names are imported only when needed."""
 
     def __missing__(self, placeholder: str) -> str:
         module, name = _LISTS[placeholder]
@@ -30,11 +30,11 @@ class _Words(dict[str, str]):
 
 _TABLES: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("verbs.toml").read_text(encoding="utf-8"))
 VERBS = {name: table for name, table in _TABLES.items() if "summary" in table}
-"""The table of every verb, by name."""
+"""Maps the name of each verb to its table."""
 
 
 def add_options(parser: argparse.ArgumentParser, table: str, words: Mapping[str, str] | None = None) -> None:
-    """Add the options of a table of ``verbs.toml``, in its order; ``words`` fill placeholders in help texts."""
+    """Add the options of a table in ``verbs.toml``, in the same order; ``words`` replace placeholders in help texts."""
     texts = _Words(words or {})
     groups: dict[str, Any] = {}
     for name, entry in {**_TABLES, **VERBS}[table].items():
@@ -57,7 +57,7 @@ def add_options(parser: argparse.ArgumentParser, table: str, words: Mapping[str,
 
 
 def _arguments(keywords: dict[str, Any], words: _Words) -> dict[str, Any]:
-    """Return an option's keywords as ``add_argument`` takes them."""
+    """Convert the entries of an option in ``verbs.toml`` into keyword arguments of ``add_argument``."""
     keywords["help"] = keywords["help"].format_map(words)
     if "type" in keywords:
         keywords["type"] = _TYPES[keywords["type"]]
@@ -69,5 +69,5 @@ def _arguments(keywords: dict[str, Any], words: _Words) -> dict[str, Any]:
 
 
 def options(args: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Return the values of some options by name, for a library function that has parameters of these names."""
+    """Return the values of the options ``names``, as keyword arguments for a library function."""
     return {name: getattr(args, name) for name in names}

@@ -16,18 +16,18 @@ from plushsense.reports.table import Table
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that raises ConfigError with one sentence and the nearest known option."""
+    """Argument parser that reports an error as a ConfigError, with the nearest known option as a hint."""
 
     words: Sequence[str] = ()
 
     def parse_args(self, args: Sequence[str], namespace: Any = None) -> argparse.Namespace:  # type: ignore[override]
-        """Parse as argparse does; keep the words for suggestions about misspelt options."""
+        """Parse arguments as argparse does, and store them in order to suggest options if one is misspelt."""
         self.words = args
         parsed: argparse.Namespace = super().parse_args(args, namespace)
         return parsed
 
     def error(self, message: str) -> NoReturn:
-        # Where a required option is misspelt, argparse reports only that it is missing.
+        # If a required option is misspelt, argparse reports only that it is missing.
         known = [o for action in self._actions for o in action.option_strings]
         typed = [word.partition("=")[0] for word in self.words if word.startswith("--") and word != "--"]
         unknown = [word for word in typed if not any(option.startswith(word) for option in known)]
@@ -38,14 +38,14 @@ class Parser(argparse.ArgumentParser):
 
 
 def utf8() -> None:
-    """Set standard output and standard error to UTF-8, whatever the console's code page is."""
+    """Set the encoding of standard output and standard error to UTF-8, regardless of the console's code page."""
     for stream, errors in ((sys.stdout, "strict"), (sys.stderr, "backslashreplace")):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(encoding="utf-8", errors=errors)
 
 
 def say(text: str) -> None:
-    """Print a message on standard error; a closed terminal is ignored."""
+    """Print a message on standard error; ignore errors, such as a closed terminal."""
     with contextlib.suppress(OSError):
         sys.stderr.write(text + "\n")
         sys.stderr.flush()
@@ -57,7 +57,7 @@ def warn(sentence: str) -> None:
 
 
 def emit(args: argparse.Namespace, result: dict[str, Any], text: str | Iterable[str]) -> None:
-    """Print the result: one JSON object with ``--json``, else text."""
+    """Print the result on standard output: ``result`` as a JSON object with ``--json``, otherwise ``text``."""
     close_active()
     if args.json:
         sys.stdout.write(json.dumps(result, ensure_ascii=False, allow_nan=False) + "\n")
@@ -67,22 +67,22 @@ def emit(args: argparse.Namespace, result: dict[str, Any], text: str | Iterable[
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Format a plain text table; columns of numbers are aligned to the right."""
+    """Format a plain-text table; align columns of numbers to the right."""
     return Table.of(head, rows).text()
 
 
 def plural(n: int, noun: str) -> str:
-    """Format a count with its noun: ``1 fold``, ``2 folds``."""
+    """Format a count with its noun, as in ``1 fold`` or ``2 folds``."""
     return f"{n} {noun}{'s' * (n != 1)}"
 
 
 def figure(value: float | None, digits: int = 3) -> str:
-    """Format a score with fixed digits; a dash for None."""
+    """Format a score with ``digits`` decimal places, or as a dash if it is None."""
     return "-" if value is None else f"{value:z.{digits}f}"
 
 
 def spread(score: dict[str, Any]) -> str:
-    """Format mean, standard deviation and interval: ``0.573 ± 0.120 (95 % 0.52 to 0.62)``."""
+    """Format mean, standard deviation and confidence interval, as in ``0.573 ± 0.120 (95 % 0.520 to 0.620)``."""
     mean, sd, ci = score["mean"], score["sd"], score.get("ci95")
     if mean is None:
         return "-"

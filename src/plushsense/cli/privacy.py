@@ -1,4 +1,4 @@
-"""``plushsense pseudonymise DATASET OUT --key FILE`` and ``plushsense forget DATASET SUBJECT [--yes]``."""
+"""Implement ``plushsense pseudonymise DATASET OUT --key FILE`` and ``plushsense forget DATASET SUBJECT [--yes]``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``plushsense protocol --model BUNDLE [--people 5] [--out DIR]``, or with ``--dataset DS`` or ``--session DIR``."""
+"""Implement ``plushsense protocol --model BUNDLE [--people 5 | --dataset DS | --session DIR] [--out DIR]``."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def lines(result: dict[str, Any]) -> list[str]:
-    """Format the table, the aims and the notes as text."""
+    """Format the result as text: the table, the aims and the notes."""
     from plushsense.experiments.protocol.report import SIMULATION, aim_table, between_table, group_table
 
     out = [result["heading"], *([SIMULATION] if result["simulated"] else [])]

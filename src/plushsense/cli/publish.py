@@ -1,4 +1,4 @@
-"""``plushsense publish DATASET OUT`` and ``plushsense publish --check PACKAGE``."""
+"""Implement ``plushsense publish DATASET OUT`` and ``plushsense publish --check PACKAGE``."""
 
 from __future__ import annotations
 

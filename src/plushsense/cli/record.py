@@ -1,4 +1,4 @@
-"""``plushsense record OUT --device URL --subject S01``."""
+"""Implement ``plushsense record OUT --device URL --subject S01``."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _report(args: argparse.Namespace, recorder: Recorder) -> int:
-    """Print the result; return 2 where the toy or the disk ended the session."""
+    """Print the result; return 2 if the session ended early because of the toy or the disk, else 0."""
     status = recorder.status()
     finished = status.done + status.skipped >= status.steps
     counts = ("skipped", "redone", "rows", "lost", "malformed", "garbage", "reconnects")
@@ -101,7 +101,7 @@ def _request(args: argparse.Namespace) -> SessionRequest:
 
 
 def _notices(request: SessionRequest, head: SessionHead, fresh: bool) -> list[str]:
-    """Return the notices to print before a session."""
+    """Return the warnings to print before a session."""
     from plushsense.recording.recorder import is_pseudo_terminal, lacks_consent
 
     notices = []
@@ -113,7 +113,7 @@ def _notices(request: SessionRequest, head: SessionHead, fresh: bool) -> list[st
 
 
 def _drive(recorder: Recorder, typed: KeySource, screen: Screen, auto: bool) -> None:  # noqa: C901
-    """Turn keys into commands and update the screen until the session ends."""
+    """Run the commands of pressed keys and update the screen until the session ends."""
     from plushsense.cli.terminal import END, KeyRepeatFilter
 
     note: str | None = None
@@ -168,7 +168,7 @@ def _drive(recorder: Recorder, typed: KeySource, screen: Screen, auto: bool) -> 
 
 
 def _wait_ready(recorder: Recorder, key: str) -> None:
-    """Wait until a script's key can take effect, since a script cannot see the screen."""
+    """Wait until a key from a script can take effect, because a script cannot see the screen."""
     recorder.wait("idle", "recording", "paused", "finished")
     while key == " " and (s := recorder.status()).state == "recording":
         if s.elapsed_s >= recorder.protocol.shortest_s:

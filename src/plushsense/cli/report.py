@@ -1,4 +1,4 @@
-"""``plushsense report OUT.html --dataset DS [--evaluation DIR …] [--model FILE …]``, or ``plushsense report SWEEP``."""
+"""Implement ``plushsense report OUT.html --dataset DS [--evaluation DIR …] [--model FILE …]`` and ``report SWEEP``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``plushsense search DATASET --max-parameters P --max-state-bytes S --max-macs-per-step M``."""
+"""Implement ``plushsense search DATASET --max-parameters P --max-state-bytes S --max-macs-per-step M``."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def preview_lines(plan: dict[str, Any]) -> list[str]:
-    """Format what a search would try, leave out and spend."""
+    """Format the plan of a search as text: networks to compare, networks left out, and the cost."""
     rungs = ", ".join(f"{e} epochs on {f} folds" for e, f in zip(plan["rungs"], plan["folds"], strict=True))
     return [
         *(f"left out: {row['arch']} {row['filters']}: {row['why']}" for row in plan["left_out"]),
@@ -45,7 +45,7 @@ def preview_lines(plan: dict[str, Any]) -> list[str]:
 
 
 def report_search() -> Callable[[SearchProgress], None]:
-    """Return a callback that reports the rungs of a search."""
+    """Return a callback that displays the progress of a search, rung by rung."""
     reporters: dict[int, ProgressReporter] = {}
 
     def report(at: SearchProgress) -> None:
@@ -60,7 +60,7 @@ def report_search() -> Callable[[SearchProgress], None]:
 
 
 def lines(s: dict[str, Any]) -> list[str]:
-    """Format the rungs, the best network and those equal to it."""
+    """Format the result of a search as text: the rungs, the finalists, the best network and the cost."""
     from plushsense.scoring.metrics import column_metrics
 
     out = marks(s)
@@ -102,13 +102,13 @@ def lines(s: dict[str, Any]) -> list[str]:
 
 
 def _rungs(s: dict[str, Any], mark: str) -> str:
-    """Format a row for each network, the longest trained first: its score after each rung, and why it stopped."""
+    """Format a row per network, longest trained first, with its score after each rung and why it stopped."""
     rows: dict[tuple[str, str, str], list[object]] = {}
     for i, rung in enumerate(s["rungs"]):
         for n in rung["networks"]:
             row = rows.setdefault((n["arch"], n["filters"], n["batch_asked"]), [None] * len(s["rungs"]) + [""])
             row[i], row[-1] = figure(n["macro_f1"]), n["went"]
-    # The order of the last rung that each was in.
+    # Sort networks by the last rung that they reached, in the order of that rung.
     names = [(n["arch"], n["filters"], n["batch_asked"]) for rung in reversed(s["rungs"]) for n in rung["networks"]]
     title = [f"after {rung['epochs']}" for rung in s["rungs"]]
     text = [

@@ -1,4 +1,4 @@
-"""Resolve the options that several verbs share, and report the progress of long work."""
+"""Resolve options that several verbs share, and report the progress of long work."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def listed(*values: str) -> list[str]:
-    """Split the values of an option given with commas or several times: ``A,B``."""
+    """Split the values of an option that accepts lists such as ``A,B`` and may be given several times."""
     return [word.strip() for value in values for word in value.split(",") if word.strip()]
 
 
@@ -23,18 +23,18 @@ _GRID_OPTIONS = ("architectures", "filters", "batches", "padding", "norm", "cont
 
 
 def grid_changes(args: argparse.Namespace, *more: str) -> dict[str, Any]:
-    """Return the keys of a grid that options change, and the options ``more`` of the verb."""
-    # An empty tuple is reported with the other problems of the grid.
+    """Return the values of the options that change a grid, and of the options ``more``."""
+    # ``--seeds 0`` gives an empty tuple, which is reported with the other problems of the grid.
     return options(args, *_GRID_OPTIONS, *more) | {"seeds": None if args.seeds is None else tuple(range(args.seeds))}
 
 
 def work_options(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the folder and the workers as a sweep and a search take them."""
+    """Return the arguments of a sweep or search for the output folder and the workers."""
     return {"overwrite": args.force, "workers": args.workers or 0} | options(args, "out", "cluster")
 
 
 def marks(result: Mapping[str, Any]) -> list[str]:
-    """Return the notices to print above scores: simulation, leaky split."""
+    """Return the notices to print above scores if they come from simulated data or a leaky split."""
     notices = []
     if result["simulated"]:
         notices.append("SIMULATION: these scores are of the virtual toy and say nothing about a real one.")
@@ -44,7 +44,7 @@ def marks(result: Mapping[str, Any]) -> list[str]:
 
 
 def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:
-    """Resolve the settings of a command."""
+    """Resolve the settings of a run from the configuration file and options; ``evaluation`` adds further settings."""
     from plushsense.workflow.config import resolve
 
     return resolve(
@@ -57,7 +57,7 @@ def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:
 
 
 def report_epochs(title: str = "training") -> Callable[[int, int, dict[str, Any]], None]:
-    """Return a callback that reports the epochs of one training."""
+    """Return a callback that displays the epochs of one training."""
     reporters: dict[str, ProgressReporter] = {}
 
     def report(epoch: int, epochs: int, row: dict[str, Any]) -> None:
@@ -73,7 +73,7 @@ def report_epochs(title: str = "training") -> Callable[[int, int, dict[str, Any]
 
 
 def report_jobs(title: str, unit: str = "folds") -> Callable[[JobProgress], None]:
-    """Return a callback that reports how many jobs are done, and the last job with its epoch."""
+    """Return a callback that displays how many jobs are done, and the latest job with its epoch."""
     reporter = ProgressReporter(title, unit, keep=True)
 
     def report(at: JobProgress) -> None:
@@ -84,7 +84,7 @@ def report_jobs(title: str, unit: str = "folds") -> Callable[[JobProgress], None
 
 
 def report_stages(indent: str = "") -> Callable[[str, int, int], None]:
-    """Return a callback that reports work in stages: (name of the stage, done, total)."""
+    """Return a callback ``(stage, done, total)`` that displays the progress of work in stages."""
     reporters: dict[str, ProgressReporter] = {}
 
     def report(stage: str, done: int, total: int) -> None:

@@ -1,4 +1,4 @@
-"""``plushsense stream-eval DATASET|FOLDER --model BUNDLE`` or ``… DATASET --split by-subject:5``."""
+"""Implement ``plushsense stream-eval DATASET|FOLDER --model BUNDLE`` or ``… DATASET --split by-subject:5``."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def _marks(result: dict[str, Any]) -> list[str]:
 
 
 def _format_model(result: dict[str, Any]) -> list[str]:
-    """Format the scores of one model as text: a row for each person and gesture, then all."""
+    """Format the scores of one model as text: a table by person and one by gesture, then false events."""
     people = [
         (person + (" TRAINED ON" if row["trained_on"] else ""), *_row(row)) for person, row in result["people"].items()
     ]

@@ -1,4 +1,4 @@
-"""``plushsense studio [--dataset DIR] [--device URL]``."""
+"""Implement ``plushsense studio [--dataset DIR] [--device URL]``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``plushsense sweep DATASET --grid paper|FILE``."""
+"""Implement ``plushsense sweep DATASET --grid paper|FILE``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def preview_lines(plan: dict[str, Any]) -> list[str]:
-    """Format what a sweep would train, or the problems of its grid."""
+    """Format the plan of a sweep as text, or the problems of its grid if there are any."""
     if plan["problems"]:
         return [f"- {line}" for line in plan["problems"]]
     return [
@@ -42,7 +42,7 @@ def preview_lines(plan: dict[str, Any]) -> list[str]:
 
 
 def lines(s: dict[str, Any]) -> list[str]:
-    """Format the best trials as text."""
+    """Format the best trials of a sweep as text."""
     from plushsense.experiments.sweep.run import best_table
 
     out = marks(s)

@@ -22,25 +22,25 @@ from plushsense.recording.recorder import Recorder
 from plushsense.recording.states import RecorderStatus
 
 END = "\x04"
-"""The key that a source returns at its end."""
+"""The key that a source returns when it has ended."""
 
 REPEAT_S = {" ": 0.7, "r": 0.1, "s": 0.1, "b": 0.1}
-"""Seconds within which the same key counts as held down. Keyboards repeat after about 0.5 s, then every 0.03 s. Nobody
-needs the space bar twice within 0.7 s; the other keys may be pressed in quick succession."""
+"""Time in seconds within which a repeated key counts as held down. Keyboards repeat a key after about 0.5 s, then every
+0.03 s. Nobody needs the space bar twice within 0.7 s, but the other keys may be pressed in quick succession."""
 
 
 class KeySource(Protocol):
-    """Source of keys; with ``script`` they come from a file or a pipe, not from a person at a keyboard."""
+    """Source of keys; ``script`` is true if they come from a file or pipe instead of a keyboard."""
 
     script: bool
 
     def get(self, timeout_s: float) -> str | None:
-        """Return the next key, None after the timeout, `END` at the end of the source."""
+        """Return the next key, or None after ``timeout_s``, or `END` if the source has ended."""
         ...
 
 
 class _Script:
-    """Characters of standard input where it is not a terminal."""
+    """Keys from standard input if it is not a terminal."""
 
     script = True
 
@@ -49,7 +49,7 @@ class _Script:
         threading.Thread(target=self._work, name="plushsense-keys", daemon=True).start()
 
     def _work(self) -> None:
-        # Not sys.stdin: a thread that waits in it would prevent the program from ending.
+        # Read the file descriptor: a thread waiting in sys.stdin would prevent the program from ending.
         decoder = codecs.getincrementaldecoder("utf-8")("replace")
         with contextlib.suppress(OSError, ValueError):
             fd = sys.stdin.fileno()
@@ -66,7 +66,7 @@ class _Script:
 
 
 class _Posix:
-    """A terminal of Linux or macOS."""
+    """Keys from a terminal on Linux or macOS."""
 
     script = False
 
@@ -85,15 +85,15 @@ class _Posix:
                 data = b""
             if not data:
                 return END
-            # Arrow and function keys send a sequence that begins with Escape: ignore it. Ctrl-D may be a slip: it is
-            # treated like q, which asks before it discards a recording.
+            # Ignore the sequences of arrow and function keys, which begin with Escape. Treat Ctrl-D, which may be a
+            # slip, like q, which asks for confirmation before a recording is discarded.
             if not (data.startswith(b"\x1b") and len(data) > 1):
                 self._waiting.extend(self._decoder.decode(data).replace(END, "q"))
         return self._waiting.popleft() if self._waiting else None
 
 
 class _Windows:
-    """A console of Windows."""
+    """Keys from a console on Windows."""
 
     script = False
 
@@ -118,7 +118,7 @@ class _Windows:
 
 @contextmanager
 def keys() -> Iterator[KeySource]:
-    """Yield a source of single key presses; restore the terminal afterwards."""
+    """Yield a source of single key presses from standard input; restore the terminal afterwards."""
     if not sys.stdin.isatty():
         yield _Script()
     elif sys.platform == "win32":
@@ -138,14 +138,14 @@ def keys() -> Iterator[KeySource]:
 
 
 class KeyRepeatFilter:
-    """Detects the automatic repetition of a key that is held down."""
+    """Detector of the automatic repetition of a key that is held down."""
 
     def __init__(self) -> None:
         self._key: str | None = None
         self._at_s = float("-inf")
 
     def repeats(self, key: str, at_s: float) -> bool:
-        """Return whether ``key`` at ``at_s`` seconds is the repetition of a key that is held down."""
+        """Return whether ``key``, received at ``at_s`` seconds, is a repetition by a key that is held down."""
         repeated = key == self._key and at_s - self._at_s < REPEAT_S.get(key.lower(), 0.0)
         self._key, self._at_s = key, at_s
         return repeated
@@ -153,9 +153,9 @@ class KeyRepeatFilter:
 
 @contextmanager
 def interrupt_on_signals() -> Iterator[None]:
-    """Raise KeyboardInterrupt once when the process is killed or its terminal is closed, as for Ctrl-C."""
+    """Raise KeyboardInterrupt once, as Ctrl-C does, if the process is terminated or its terminal is closed."""
     handled = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)]
-    # A signal that is ignored already, as with nohup, stays ignored.
+    # Keep ignoring signals that are already ignored, as with nohup.
     handled = [number for number in handled if signal.getsignal(number) is signal.SIG_DFL]
     if threading.current_thread() is not threading.main_thread():
         handled = []
@@ -190,7 +190,7 @@ KEYS = {
 
 
 def _state(s: RecorderStatus) -> tuple[str, str]:
-    """Return the line with the state and the key to press, and its colour."""
+    """Return the line that describes the state and the key to press, and its colour."""
     if s.state == "idle":
         if s.signal == "none":
             return "WAITING FOR THE TOY: switch it on, bring it near", _RED
@@ -213,7 +213,7 @@ def _state(s: RecorderStatus) -> tuple[str, str]:
 
 
 def _signal(s: RecorderStatus) -> list[tuple[str, str]]:
-    """Return the two lines about the signal, each with its colour."""
+    """Return two lines that describe the signal, each with its colour."""
     words = {
         "good": ("good", ""),
         "fair": ("fair: some readings are lost or damaged; bring the toy nearer", ""),
@@ -236,10 +236,10 @@ def _signal(s: RecorderStatus) -> list[tuple[str, str]]:
 def lines(
     s: RecorderStatus, title: str, notices: Sequence[str], typing: str | None, width: int, height: int = 1000
 ) -> list[str]:
-    """Return the screen as at most ``height`` lines, no wider than ``width``.
+    """Format the screen as at most ``height`` lines, each no wider than ``width``.
 
-    Where there is no room, lines of the highest rank are left out first: blank lines, rules, counters. The gesture, the
-    state and the keys are left out last.
+    If there are too many lines, those with the highest rank are left out first (blank lines, rules, counters), and the
+    gesture, the state and the keys last.
     """
     out: list[tuple[int, str]] = []
 
@@ -285,29 +285,29 @@ def _bar(s: RecorderStatus, width: int) -> str:
 
 
 class Screen:
-    """Displays a recorder on standard error: redrawn in place on a terminal, else one line for each change."""
+    """Display of a recorder on standard error: redrawn in place on a terminal, otherwise one line per change."""
 
     def __init__(self, recorder: Recorder, title: str, notices: Sequence[str] = ()) -> None:
-        """Prepare a screen; ``notices`` are always visible."""
+        """Prepare the screen; on a terminal, ``notices`` are displayed below ``title``."""
         self._title = title
         self._notices = notices
         self._terminal = sys.stderr.isatty()
         self._line = self._message = ""
-        # The recorder's threads add messages and the caller's thread writes them: a blocked log must not delay a frame.
+        # The recorder's threads only queue messages, so that a blocked log cannot delay frames; the caller writes them.
         self._messages: SimpleQueue[str] = SimpleQueue()
         if self._terminal:
             if sys.platform == "win32":
                 os.system("")  # enables escape sequences in the console
-            # Alternate screen, no cursor, no wrapped lines.
+            # Switch to the alternate screen, hide the cursor, and do not wrap lines.
             sys.stderr.write("\x1b[?1049h\x1b[?25l\x1b[?7l\x1b[2J")
         else:
             recorder.subscribe(self._on_change)
 
     def draw(self, status: RecorderStatus, typing: str | None = None) -> None:
-        """Draw the status; ``typing`` is an unfinished note."""
+        """Draw the status; ``typing`` is the note that is being typed, if any."""
         self._write_messages()
         if self._terminal:
-            # Standard output may be a file. Some terminals report the size 0.
+            # Ask for the size of standard error, because standard output may be a file. Some terminals report 0.
             size = os.get_terminal_size(sys.stderr.fileno())
             width, height = (size.columns or 80) - 1, (size.lines or 24) - 1
             screen = lines(status, self._title, self._notices, typing, max(1, min(_WIDEST, width)), height)
@@ -315,7 +315,7 @@ class Screen:
             sys.stderr.flush()
 
     def _on_change(self, what: str, s: RecorderStatus) -> None:
-        """Add a line for a change, for a log or a screen reader."""
+        """Queue a line that describes a change, for a log or a screen reader."""
         where = f"{s.step.gesture}, {s.step.repetition} of {s.repetitions}"
         line = {
             "idle": f"{s.done} of {s.steps}. {where}: {s.step.prompt}",
@@ -340,7 +340,7 @@ class Screen:
             sys.stderr.flush()
 
     def close(self) -> None:
-        """Write the remaining messages and restore the terminal; a closed terminal is ignored."""
+        """Write the remaining messages and restore the terminal, unless it is closed."""
         with contextlib.suppress(OSError):
             self._write_messages()
         if self._terminal:

@@ -1,4 +1,4 @@
-"""``plushsense train DATASET --arch SPEC --filters …``."""
+"""Implement ``plushsense train DATASET --arch SPEC --filters …``."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def decided(decision: Mapping[str, Any]) -> list[str]:
-    """Format the decision settings and the people they were fitted on."""
+    """Format a summary of the fitted decision settings as text; return no lines if none were fitted."""
     fitted = decision.get("fitted")
     if not fitted:
         return []
@@ -79,7 +79,7 @@ def decided(decision: Mapping[str, Any]) -> list[str]:
 
 
 def _gate(gate: Mapping[str, Any]) -> str:
-    """Format the scores of the fitted gate, or the reason why there is none."""
+    """Format the scores of the fitted gate as text, or the reason why there is no gate."""
     if "reason" in gate:
         return f"No gate for energetic gestures: {gate['reason']}."
     false = gate["false_alarms_per_hour"]

@@ -1,4 +1,4 @@
-"""``plushsense trim DATASET [--only GLOB] [--accept GLOB | --accept-above 0.8] [--set ID FROM:TO] [--undo GLOB]``."""
+"""Implement ``plushsense trim DATASET [--only GLOB] [--accept GLOB] [--set ID FROM:TO] [--undo GLOB]``."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _decides(args: argparse.Namespace) -> bool:
-    """Return whether the options change marks."""
+    """Return whether the given options change marks."""
     return bool(args.accept or args.set or args.undo) or args.accept_above is not None
 
 

@@ -1,1 +1,1 @@
-"""The data set: its folder, importing, checks, marks, trimming, privacy, publishing."""
+"""Data sets on disk: index, importing, quality checks, marks, trimming, privacy, backup and publishing."""

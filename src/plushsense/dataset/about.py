@@ -1,4 +1,4 @@
-"""Authors, contact and terms of a data set: the table ``[about]`` of ``dataset.toml``, needed to publish it.
+"""Description, authors and contact of a data set: the table ``[about]`` of ``dataset.toml``, needed to publish it.
 
     [about]
     title = "Touch on a plush companion"
@@ -6,7 +6,7 @@
     creators = [{ name = "Curie, Marie", orcid = "0000-0002-1825-0097", affiliation = "University of Paris" }]
     contact = { name = "Marie Curie", email = "marie@example.org" }
 
-Every key may be left out; an older data set has no such table.
+Every key is optional; older data sets have no such table.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _CONTACT = re.compile(r"\s*(?P<name>[^<>]*?)\s*<\s*(?P<email>[^<>]+?)\s*>\s*")
 
 @dataclass(frozen=True)
 class Creator:
-    """An author to be cited: "Family, Given", or the name of an organisation."""
+    """Author to be cited; ``name`` is "Family, Given", or the name of an organisation."""
 
     name: str
     orcid: str = ""
@@ -42,7 +42,7 @@ class Creator:
 
 @dataclass(frozen=True)
 class Contact:
-    """The person who answers questions about the data set."""
+    """Person who answers questions about the data set; false if the name or the address is missing."""
 
     name: str = ""
     email: str = ""
@@ -56,7 +56,7 @@ class Contact:
 
     @classmethod
     def parse(cls, text: str) -> Contact:
-        """Read a contact of the form ``Name <mail>``; raise DatasetError for another form."""
+        """Parse a contact of the form ``Name <address>``; raise DatasetError for any other form."""
         match = _CONTACT.fullmatch(text)
         if match is None or not match["name"] or not _EMAIL.fullmatch(match["email"]):
             raise DatasetError(
@@ -67,7 +67,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class Funding:
-    """A funder and the number of the award."""
+    """Funder of the data set, and the number of the award."""
 
     funder: str
     award: str = ""
@@ -75,9 +75,10 @@ class Funding:
 
 @dataclass(frozen=True)
 class About:
-    """Description of a data set for others; ``paper`` is the DOI of the publication that describes it.
+    """Description of a data set for its users.
 
-    ``collected`` states how the recordings were made, ``limits`` what they should not be used for.
+    ``doi`` is that of the data set, ``paper`` that of the publication that describes it. ``collected`` states how the
+    recordings were made, ``limits`` what they should not be used for, ``language`` is a code such as ``en``.
     """
 
     title: str = ""
@@ -105,7 +106,7 @@ class About:
             raise DatasetError(f"language is '{self.language}': a code like en is accepted.")
 
     def to_table(self) -> dict[str, Any]:
-        """Return plain values for TOML, without those that were left out."""
+        """Return plain values for TOML, without those that have the default."""
         defaults = asdict(About())
         return {k: _without_blanks(v) for k, v in asdict(self).items() if v != defaults[k]}
 
@@ -117,7 +118,7 @@ def _without_blanks(value: Any) -> Any:
 
 
 def _is_orcid(text: str) -> bool:
-    """Return whether a text is an ORCID iD with a correct check digit (ISO 7064, MOD 11-2)."""
+    """Return whether ``text`` is an ORCID iD with a correct check digit (ISO 7064, MOD 11-2)."""
     if not _ORCID.fullmatch(text):
         return False
     total = 0

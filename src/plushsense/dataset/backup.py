@@ -1,7 +1,7 @@
-"""Back up a data set to one zip with a manifest, verified after writing and before restoring.
+"""Back up a data set to one zip with a manifest, verified after writing and while restoring.
 
-It holds raw files, session files, marks, the people's table, evaluations and all other files, but not ``cache/`` and
-the index, which can be rebuilt. The same data set gives the same bytes.
+The zip contains all files (raw files, session files, marks, people's table, evaluations) except ``cache/`` and the
+index, which can be rebuilt, and working files. Backups of the same data set are equal byte by byte.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _NO_MANIFEST: tuple[type[Exception], ...] = (*_BROKEN, TypeError, OSError, Recur
 
 @dataclass(frozen=True)
 class Backup:
-    """Summary of a backup; ``hash`` is the data set's, ``left_out`` lists links, which are not followed."""
+    """Summary of a backup; ``hash`` is that of the data set, ``left_out`` lists links, which are not backed up."""
 
     file: str
     name: str
@@ -56,14 +56,14 @@ class Backup:
 
 
 def backup(dataset: str | Path, file: str | Path, progress: Progress | None = None) -> Backup:
-    """Write a data set into one new zip file, and read it again to verify it.
+    """Write a data set into one new zip file, and read the zip again to verify it.
 
     Args:
-        progress: called with (bytes done, bytes in all); the second half is the verification.
+        progress: called with (bytes done, number of bytes); the second half is the verification.
 
     Raises:
-        DatasetError: when ``file`` exists or lies in the data set, a file changes meanwhile, or the verification
-            fails; then no file is left.
+        DatasetError: if ``file`` exists or lies in the data set, a file changes during the backup, or the verification
+            fails. No incomplete zip is left.
     """
     folder, target = Path(dataset), Path(file)
     if target.exists() or target.is_symlink():
@@ -108,10 +108,10 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
 
 
 def check_backup(file: str | Path, progress: Progress | None = None) -> Backup:
-    """Verify that a backup holds exactly the files of its manifest, each unchanged.
+    """Verify that a backup contains exactly the files of its manifest, each unchanged.
 
     Raises:
-        DatasetError: naming what is missing, damaged or no backup at all.
+        DatasetError: if a file is missing or damaged, or ``file`` is no backup; the message names the cause.
     """
     path = Path(file)
     total = path.stat().st_size if path.is_file() else 0
@@ -123,7 +123,7 @@ def restore(file: str | Path, dest: str | Path, progress: Progress | None = None
     """Restore a data set into a new or empty folder, completely or not at all.
 
     Raises:
-        DatasetError: for a damaged backup, one whose files would leave ``dest``, or a ``dest`` that is not empty.
+        DatasetError: for a damaged backup, for one with paths outside of ``dest``, or if ``dest`` is not empty.
     """
     path, folder = Path(file), Path(dest)
     with _open_backup(path) as (archive, manifest):
@@ -251,7 +251,7 @@ def _manifest_of(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
 
 
 def _read(path: Path, archive: zipfile.ZipFile, entry: dict[str, Any], out: IO[bytes] | None = None) -> None:
-    """Read a member, into ``out`` if given, and compare it with the manifest."""
+    """Read a member, write it to ``out`` if given, and raise DatasetError if it differs from the manifest."""
     digest = hashlib.sha256()
     size = 0
     try:

@@ -1,4 +1,4 @@
-"""List the files of a data set folder with kind and owner, and keep the stamp of what its index was made from."""
+"""List the files of a data set by kind and person, and record (in a stamp) from which files its index was built."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STAMP_VERSION = 2
 
 
 def raw_files(folder: Path) -> list[tuple[str, Path]]:
-    """Return every raw file of a data set with its kind, streams or recordings; the suffix may be in any case."""
+    """Return every raw file (``.csv`` in any case) of a data set with its kind, streams or recordings."""
     return [
         (kind, path)
         for kind in (STREAMS, RECORDINGS)
@@ -31,7 +31,7 @@ def raw_files(folder: Path) -> list[tuple[str, Path]]:
 
 
 def walk_files(folder: Path) -> list[Path]:
-    """Return every file below a folder in the order of the paths; folders that cannot be listed are left out."""
+    """Return every file below a folder, sorted by path; folders that cannot be listed are left out."""
     return sorted(Path(place) / name for place, _, names in os.walk(folder) for name in names)
 
 
@@ -44,7 +44,7 @@ def sha256_of(path: Path) -> str:
 
 
 def current_stamp(folder: Path) -> dict[str, Any]:
-    """Return what an index is made from: raw files (name, size, time in ns), and hashes of the marks and the head."""
+    """Return the stamp of the present files: raw files (name, size, time in ns), hashes of the marks and the head."""
     files = [(path.relative_to(folder).as_posix(), path.stat()) for _, path in raw_files(folder)]
     return {
         "format": STAMP_VERSION,
@@ -59,12 +59,12 @@ def _index_hashes(folder: Path) -> dict[str, str]:
 
 
 def write_stamp(folder: Path, stamp: dict[str, Any]) -> None:
-    """Record what the index in ``folder`` was made from; call it after the index files were written."""
+    """Write ``stamp`` with the hashes of the index files; call this after writing the index files."""
     write_file(folder / STAMP, json.dumps(stamp | {"index": _index_hashes(folder)}) + "\n")
 
 
 def _read_stamp(folder: Path) -> dict[str, Any]:
-    """Return the stamp of the last index; empty if there is none, or it is damaged."""
+    """Return the stamp on disk; empty if there is none, or it is damaged."""
     try:
         stamp = json.loads((folder / STAMP).read_text(encoding="utf-8"))
     except (FileNotFoundError, ValueError, RecursionError):
@@ -73,17 +73,17 @@ def _read_stamp(folder: Path) -> dict[str, Any]:
 
 
 def is_index_fresh(folder: Path) -> bool:
-    """Return whether the index in ``folder`` is complete and made from the present files."""
+    """Return whether the index in ``folder`` is complete and was built from the present files."""
     return _read_stamp(folder) == current_stamp(folder) | {"index": _index_hashes(folder)}
 
 
 def is_same_raw_data(folder: Path, now: dict[str, Any]) -> bool:
-    """Return whether the index is complete and, except for the marks, was made from the files of the stamp ``now``."""
+    """Return whether the index is complete and, except for the marks, was built from the files of the stamp ``now``."""
     return _read_stamp(folder) | {"marks": now["marks"]} == now | {"index": _index_hashes(folder)}
 
 
 def missing_files(folder: Path) -> list[str]:
-    """Return the raw files of the last index that no longer exist; none when there is no stamp."""
+    """Return the raw files of the stamp on disk that no longer exist; none if there is no stamp."""
     try:
         return [str(entry[0]) for entry in _read_stamp(folder)["files"] if not (folder / str(entry[0])).is_file()]
     except (KeyError, TypeError, IndexError):
@@ -100,10 +100,10 @@ _KNOWN = {HEAD: "head", MARKS: "marks", PEOPLE: "people", **dict.fromkeys(INDEX,
 
 @dataclass(frozen=True)
 class DatasetFile:
-    """A file of a data set: its path in the folder, its kind and, in a person's folder, the person.
+    """File of a data set: its path in the folder, its kind and, in a person's folder, the person.
 
-    Kinds: head, marks, people, index, raw (recordings and streams), words (JSON files beside these), cache, evaluation,
-    working (locks, unfinished parts), other; and link for everything that is not a regular file.
+    Kinds are head, marks, people, index, raw (recordings and streams), words (JSON files in deeper folders), cache,
+    evaluation, working (locks, unfinished files), other, and link for anything that is not a regular file.
     """
 
     path: PurePosixPath
@@ -126,13 +126,13 @@ def _kind(path: PurePosixPath) -> str:
 
 
 def list_files(folder: Path) -> list[DatasetFile]:
-    """List every file below ``folder`` in the order of the paths; links to folders are listed and not followed.
+    """List every file below ``folder``, sorted by path; links to folders are listed but not followed.
 
-    Whatever lies in ``<any folder>/<person>/`` belongs to the person, if ``recordings/`` or ``streams/`` has a folder
-    of that name.
+    Files in ``<any folder>/<person>/``, except in ``cache/`` and ``evaluations/``, belong to the person if
+    ``recordings/`` or ``streams/`` has a folder of that name.
 
     Raises:
-        OSError: when a folder cannot be listed.
+        OSError: if a folder cannot be listed.
     """
 
     def refuse(cause: OSError) -> None:
@@ -154,17 +154,17 @@ def list_files(folder: Path) -> list[DatasetFile]:
 
 
 def person_folders(folder: Path) -> list[str]:
-    """Return the names of the folders below ``recordings/`` and ``streams/``: codes of people, and of nobody."""
+    """Return the folders in ``recordings/`` and ``streams/``: the codes of people, and nobody for the toy at rest."""
     there = [place for kind in (RECORDINGS, STREAMS) if (place := folder / kind).is_dir()]
     return sorted({entry.name for place in there for entry in place.iterdir() if entry.is_dir()})
 
 
 def normalize_code(word: str) -> str:
-    """Return a code in lower case without blanks and punctuation: ``P_01`` and ``p 01`` are equal."""
+    """Return a code in lower case without blanks and punctuation, so that ``P_01`` and ``p 01`` are equal."""
     return "".join(c for c in word.casefold() if c.isalnum())
 
 
 def match_code(word: str, codes: Iterable[str]) -> str:
-    """Return the element of ``codes`` that is ``word`` in another spelling; "" when there is none."""
+    """Return the first of ``codes`` that equals ``word`` after `normalize_code`; "" if there is none."""
     key = normalize_code(word)
     return next((code for code in codes if normalize_code(code) == key), "")

@@ -1,4 +1,4 @@
-"""Open a data set: build its index from the raw files and the marks, again whenever one of them changed."""
+"""Open a data set, and (re)build its index from the raw files and the marks if these changed."""
 
 from __future__ import annotations
 
@@ -56,19 +56,19 @@ class _RawFile:
 
 @dataclass
 class IndexBuild:
-    """Result of building the index: the data set, and the files that could not be read with the reason."""
+    """Result of building the index: the data set, and the reason for each file that could not be read."""
 
     dataset: Dataset
     unreadable: dict[str, str] = field(default_factory=dict)
 
 
 def open_dataset(path: str | Path) -> Dataset:
-    """Open a data set folder; the index is rebuilt if the raw files, the marks or the head changed.
+    """Open a data set folder; the index is rebuilt if the raw files or the head changed, updated if only marks did.
 
-    On a read-only disk the index is rebuilt in memory each time it is out of date.
+    On a read-only disk an outdated index is rebuilt in memory at every call.
 
     Raises:
-        DatasetError: when the folder is missing, empty, or not a data set, or a raw file is missing or unreadable.
+        DatasetError: if the folder is missing, empty or not a data set, or a raw file is missing or unreadable.
     """
     folder = Path(path)
     head = DatasetHead.read(folder)
@@ -83,7 +83,7 @@ def open_dataset(path: str | Path) -> Dataset:
             )
         stamp = current_stamp(folder)
         if is_same_raw_data(folder, stamp):
-            # Marks change no raw file.
+            # Only the marks changed, so the raw files need not be read again.
             built = IndexBuild(_indexed(folder, head, generation))
             built.dataset.recordings = apply_marks(built.dataset.recordings, read_marks(folder))
         else:
@@ -103,24 +103,24 @@ def open_dataset(path: str | Path) -> Dataset:
     except ForgottenError:
         if Generation.of(folder) != generation:
             return open_dataset(folder)
-        # An interrupted removal: the data are readable, and the index is written when it is finished.
+        # The removal of a person was interrupted: the data can be used, and completing it writes the index.
     except OSError:
-        # A read-only disk: the index only saves time.
+        # The disk is read-only; the index only saves time.
         pass
     return built.dataset
 
 
 def _indexed(folder: Path, head: DatasetHead, generation: Generation) -> Dataset:
-    """Return the data set by its index on disk."""
+    """Return the data set as its index on disk describes it."""
     recordings = read_index(folder / RECORDINGS_INDEX, RecordingInfo)
     return Dataset(folder, head, recordings, read_index(folder / STREAMS_INDEX, StreamInfo), generation)
 
 
 def rebuild_index(folder: Path, head: DatasetHead | None = None, progress: Progress | None = None) -> IndexBuild:
-    """Rebuild the index; while a raw file cannot be read, the index on disk stays as it is.
+    """Rebuild the index; it is written only if every raw file can be read.
 
     Raises:
-        ForgottenError: when a person was removed meanwhile.
+        ForgottenError: if a person was removed from the data set meanwhile.
     """
     stamp = current_stamp(folder)
     built = build_index(folder, head or DatasetHead.read(folder), progress)
@@ -131,7 +131,7 @@ def rebuild_index(folder: Path, head: DatasetHead | None = None, progress: Progr
 
 
 def write_index_files(dataset: Dataset, stamp: dict[str, Any] | None = None) -> None:
-    """Replace the index files by those of ``dataset``; ``stamp`` is the `current_stamp` before raw files were read."""
+    """Write the index files of ``dataset``; ``stamp`` is the `current_stamp` from before the raw files were read."""
     stamp = stamp or current_stamp(dataset.path)
     write_index(dataset.path / STREAMS_INDEX, dataset.streams, StreamInfo)
     write_index(dataset.path / RECORDINGS_INDEX, dataset.recordings, RecordingInfo)
@@ -139,7 +139,7 @@ def write_index_files(dataset: Dataset, stamp: dict[str, Any] | None = None) -> 
 
 
 def build_index(folder: Path, head: DatasetHead, progress: Progress | None = None) -> IndexBuild:
-    """Read every raw file, locate the recordings in their streams and apply the marks; nothing is written."""
+    """Read every raw file, locate the recordings in their streams and apply the marks, without writing anything."""
     generation = Generation.of(folder)
     files = raw_files(folder)
     unreadable: dict[str, str] = {}
@@ -170,8 +170,8 @@ DUPLICATE_FOLDER = "again-"
 def _session(relative: Path, labelled: bool = False) -> str:
     """Return the session of a raw file from its path below ``recordings/`` or ``streams/``.
 
-    The session is the folder within the person's folder, or 1 if there is none. Each labelled stream without such a
-    folder is a session named after its file.
+    The session is the name of the folder in the person's folder, or 1 if there is none. A labelled stream without such
+    a folder is a session of its own, named after its file.
     """
     inner = relative.parts[1:-1]
     if inner and not inner[0].startswith(DUPLICATE_FOLDER):
@@ -184,7 +184,7 @@ def _stream_session(folder: Path, read: _RawFile) -> str:
 
 
 def _subject(folder_name: str, gesture: Gesture | None) -> str:
-    """Return the person of a recording: that of its folder, or nobody for a gesture that nobody makes."""
+    """Return the person of a recording: its folder, or `NOBODY` for a gesture without a person (the toy at rest)."""
     return NOBODY if gesture is not None and gesture.nobody else folder_name
 
 
@@ -211,9 +211,9 @@ def _stream_info(folder: Path, head: DatasetHead, read: _RawFile) -> StreamInfo:
 
 
 def _locate(recording: ReadResult, stream: ReadResult, at: _RowLookup) -> tuple[int, int]:
-    """Return the stream row at which a recording begins and how many of its rows follow there; (−1, 0) if absent."""
+    """Return the stream row at which a recording begins and how many rows from there agree; (−1, 0) if none does."""
     frames, whole = recording.frames, stream.frames
-    # Clocks summed from delays begin at 0 in every file, so only differences are comparable.
+    # A clock that was summed from delays begins at 0 in every file, so only time differences can be compared.
     relative = recording.integrated or stream.integrated
     rows: Iterable[int]
     if frames.host_ms is not None and whole.host_ms is not None:
@@ -229,7 +229,7 @@ def _locate(recording: ReadResult, stream: ReadResult, at: _RowLookup) -> tuple[
         same = (frames.device_ms[:n] + shift == whole.device_ms[row : row + n]) & (
             frames.values[:n] == whole.values[row : row + n]
         ).all(axis=1)
-        # Rows with equal host stamps may be missing from one of the files, so compare from the start.
+        # Rows with equal host stamps may be missing from one of the files: count the agreeing rows from the start.
         agreeing = int(np.argmin(same)) if not same.all() else n
         if agreeing > best[1]:
             best = (row, agreeing)
@@ -239,10 +239,10 @@ def _locate(recording: ReadResult, stream: ReadResult, at: _RowLookup) -> tuple[
 def _best_stream(
     folder: Path, recording: _RawFile, session: str, streams: Iterable[_RawFile], lookups: dict[int, _RowLookup]
 ) -> tuple[_RawFile | None, int, int]:
-    """Return the person's stream that holds most of a recording, its row there and the rows that follow.
+    """Return the stream of ``streams`` that contains most of a recording, its first row there, and the agreeing rows.
 
-    (None, −1, 0) if there is none. The session's own stream comes first; another one counts only if it holds the whole
-    recording, since two days may begin with the same time stamps.
+    Return (None, −1, 0) if there is none. The session's own streams are searched first; another one must contain the
+    whole recording, since recordings of different days may begin with the same time stamps.
     """
     best: tuple[_RawFile | None, int, int] = (None, -1, 0)
     for own in (True, False):
@@ -276,7 +276,7 @@ def _recordings_from_files(
     by_subject: dict[str, list[_RawFile]] = {}
     for stream in streams:
         by_subject.setdefault(stream.subject, []).append(stream)
-    # Duplicates have equal content; the first in name order is the original.
+    # Of files with equal content, the first in the order of the paths is the original.
     originals: dict[str, str] = {}
     lookups = {id(s): _RowLookup.of(s.result.frames) for s in streams}
     infos = []
@@ -315,7 +315,7 @@ def _recordings_from_files(
 
 
 def _facts(folder: Path, read: _RawFile, frames: Frames, epoch_ms: int) -> dict[str, Any]:
-    """Return the index values of a recording that follow from its rows; ``epoch_ms`` is used without host times."""
+    """Return the index fields that depend on the rows only; ``epoch_ms`` is used if there are no host times."""
     return {
         "file": read.path.relative_to(folder).as_posix(),
         "rows": len(frames),
@@ -331,7 +331,7 @@ def _facts(folder: Path, read: _RawFile, frames: Frames, epoch_ms: int) -> dict[
 
 @dataclass(frozen=True)
 class _RowLookup:
-    """Rows of a stream by their stamp, the host's where there is one."""
+    """Rows of a stream by time stamp: that of the host, or of the device if there is none."""
 
     stamps: NDArray[np.int64]
     rows: NDArray[np.int64]
@@ -348,7 +348,7 @@ class _RowLookup:
 
 
 def _recordings_from_labels(folder: Path, head: DatasetHead, streams: list[_RawFile]) -> list[RecordingInfo]:
-    """Return the recordings of streams with a label on every row: one for each run of equal labels."""
+    """Return the recordings in streams with a label on every row: one for each run of equal labels."""
     infos = []
     for read in streams:
         labels = read.result.frames.labels
@@ -380,7 +380,7 @@ def _recordings_from_labels(folder: Path, head: DatasetHead, streams: list[_RawF
 
 
 def apply_marks(infos: Iterable[RecordingInfo], marks: dict[str, MarkState]) -> list[RecordingInfo]:
-    """Return the recordings with the marks applied."""
+    """Return the recordings as ``marks`` trim and exclude them."""
     out = []
     for info in infos:
         mark = marks.get(info.id, MarkState())
@@ -390,5 +390,5 @@ def apply_marks(infos: Iterable[RecordingInfo], marks: dict[str, MarkState]) -> 
 
 
 def as_dataset(dataset: Dataset | str | os.PathLike[str]) -> Dataset:
-    """Return the data set itself, or open the one at a path."""
+    """Return ``dataset``, or open it if it is a path."""
     return dataset if isinstance(dataset, Dataset) else open_dataset(Path(dataset))

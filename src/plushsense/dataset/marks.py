@@ -1,4 +1,4 @@
-"""Marks: decisions about recordings, appended to ``marks.jsonl``. Raw files never change."""
+"""Marks: decisions of people about recordings, appended to ``marks.jsonl``. Raw files are never changed."""
 
 from __future__ import annotations
 
@@ -24,12 +24,13 @@ ACTIONS = ("trim", "untrim", "exclude", "include", "accept", "unaccept")
 
 @dataclass(frozen=True)
 class Mark:
-    """A decision about a recording.
+    """Decision about a recording.
 
-    ``trim`` keeps rows ``start`` to ``stop``, ``exclude`` takes the recording out of use, ``accept`` states that the
-    findings of the check ``check`` are known and no fault; ``untrim``, ``include`` and ``unaccept`` undo them.
-    ``recording`` is the id of a recording or a stream, or "" for the whole data set. ``how`` is the origin of a trim:
-    "hand" (set by a person) or "suggested" (accepted as suggested); "" in older marks, which count as set by hand.
+    The action ``trim`` keeps the rows from ``start`` to before ``stop`` (-1: the end), ``exclude`` removes the
+    recording from use, ``accept`` states that the findings of ``check`` are known and no fault; ``untrim``, ``include``
+    and ``unaccept`` undo them. ``recording`` is the id of a recording, stream or person, or "" for the whole data set.
+    ``how`` is the origin of a trim: "hand" (set by a person) or "suggested" (a suggestion that was accepted); "" in
+    older marks counts as "hand".
     """
 
     recording: str
@@ -47,7 +48,7 @@ class Mark:
 class MarkState:
     """State of a recording after all its marks.
 
-    ``accepted`` holds the checks whose findings were accepted; ``how`` is that of the trim in force.
+    ``accepted`` holds the checks whose findings are accepted; ``how`` is that of the current trim.
     """
 
     excluded: bool = False
@@ -58,12 +59,12 @@ class MarkState:
 
     @property
     def trimmed(self) -> bool:
-        """Whether a trim is in force, even one that keeps the whole recording."""
+        """Whether the recording is trimmed, even by a trim that keeps all rows."""
         return bool(self.how) or (self.start, self.stop) != (0, -1)
 
 
 def _refuse_contradictions(mark: Mark, where: str) -> None:
-    """Refuse a mark whose values do not fit each other, or are out of range."""
+    """Raise DatasetError for a mark whose values contradict each other, or are out of range."""
     if mark.action not in ACTIONS:
         raise DatasetError(
             f"{where}: unknown mark '{mark.action}': accepted are {', '.join(ACTIONS)}.{nearest(mark.action, ACTIONS)}"
@@ -84,10 +85,10 @@ def _refuse_contradictions(mark: Mark, where: str) -> None:
 
 
 def match_ids(pattern: str, known: Iterable[str], what: str) -> list[str]:
-    """Return the ids that a pattern matches: the id itself, or a glob such as ``P19/*``.
+    """Return the ids of ``known`` that ``pattern`` matches: an id, or a glob such as ``P19/*``.
 
     Raises:
-        DatasetError: when it names none, with the nearest one.
+        DatasetError: if there is none; the message calls an id ``what`` and suggests the nearest one.
     """
     ids = sorted(set(known))
     matched = [pattern] if pattern in ids else [i for i in ids if fnmatchcase(i, pattern)]
@@ -99,7 +100,7 @@ def match_ids(pattern: str, known: Iterable[str], what: str) -> list[str]:
 
 
 def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
-    """Append marks under a file lock, so that two programs can mark at once.
+    """Append marks under a file lock, so that several programs can write marks at the same time.
 
     Raises:
         DatasetError: for a mark with contradictory values, or a folder that cannot be written.
@@ -127,13 +128,13 @@ def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
 def read_marks(folder: Path) -> dict[str, MarkState]:
     """Return the state of each marked recording.
 
-    A line that is not JSON was cut off by a crash and is skipped; JSON that is not a mark is a DatasetError.
+    A line that is not JSON (cut off by a crash) is skipped; raise DatasetError for JSON that is not a valid mark.
     """
     return MarksFollower(folder).states()
 
 
 class MarksFollower:
-    """Follows the marks of a data set: reads only what other programs appended. Not thread-safe."""
+    """Reader of the marks of a data set that reads only the lines appended since the last call. Not thread-safe."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / MARKS
@@ -147,7 +148,7 @@ class MarksFollower:
         return self._now() != self._seen
 
     def states(self) -> dict[str, MarkState]:
-        """Return the state of each marked recording, as `read_marks`; a new dictionary if something changed."""
+        """Return the state of each marked recording, like `read_marks`; a new dictionary if the file changed."""
         now = self._now()
         if now == self._seen:
             return self._last_states
@@ -170,7 +171,7 @@ class MarksFollower:
             self._lines += 1
             self._bytes += len(line) + 1
         self._states = dict(states)
-        # A line without an end may be a mark, or the beginning of one.
+        # A last line without a line end may be a complete mark or the beginning of one: do not keep its effect.
         self._take(rest, self._lines + 1, states)
         self._tail = whole[-1] if whole else self._tail
         self._seen, self._last_states = now, states
@@ -189,7 +190,7 @@ class MarksFollower:
         return now.st_ino, now.st_size, now.st_mtime_ns
 
     def _continues(self, file: BinaryIO, now: tuple[int, int, int]) -> bool:
-        """Return whether the file is the one that was read, with lines appended at most."""
+        """Return whether the file is the one that was read before, possibly with more lines."""
         if self._seen is None or now[0] != self._seen[0] or now[1] < self._bytes:
             return False
         file.seek(max(0, self._bytes - len(self._tail) - 1))
@@ -207,7 +208,7 @@ class MarksFollower:
 
 
 def apply_mark(now: MarkState, mark: Mark) -> MarkState:
-    """Return the state of a recording after one more mark."""
+    """Return the state of a recording after ``mark``, from its state ``now``."""
     match mark.action:
         case "trim":
             return replace(now, start=mark.start, stop=mark.stop, how=mark.how)

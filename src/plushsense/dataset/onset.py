@@ -1,18 +1,18 @@
 """Detect the onset and offset of a gesture in its recording from signal activity.
 
-A recording holds some rest, the gesture, and some rest. All steps use units of the device's own noise:
+A recording consists of some rest, the gesture, and some rest. All quantities are relative to the device's own noise:
 
-1. activity: the speed of each sensor (change over 0.1 s, lightly smoothed) over its speed at rest; the axes of a vector
-   are one sensor. For contact sensors (capacitive, proximity) also the distance from the level before the touch, since
-   a hand that holds still is no rest. The activity is that of the most active sensor.
-2. rest: the session's stream just before the recording (the countdown) where it is known, else the quietest stretch of
-   the recording; never much noisier than the quietest stretch.
-3. contrast: the highest activity over that at rest. Thresholds are a share of the way from rest to the highest activity
-   *in decibels*, so that they fit a faint scratch and a throw alike.
-4. from the first and last clear activity, walk outwards until it is quiet.
+1. Activity: the speed of each sensor (change over 0.1 s, lightly smoothed), divided by its speed at rest; the axes of a
+   vector are one sensor. For contact sensors (capacitive, proximity) also the distance from the level before the touch,
+   since a hand that holds still is not rest. The activity of a row is that of the most active sensor.
+2. Rest: the session's stream just before the recording (the countdown) if it is known, else the quietest stretch of the
+   recording. The noise at rest is limited to 1.5 times that of the quietest stretch.
+3. Contrast: the highest activity (95th percentile) divided by that at rest. Thresholds are a share of the way from rest
+   to the highest activity on a logarithmic scale, so that they suit both a faint scratch and a throw.
+4. Search outwards from the first and the last clear activity until the activity is low.
 
-The confidence falls with low contrast and with an onset that moves with the threshold (a slow drift into the gesture);
-it is 0 where no onset is visible. Errors on real recordings: docs/trim.md.
+The confidence is lower for a low contrast, and for an onset that depends on the threshold (a slow start of the
+gesture); it is 0 if no onset is visible. docs/trim.md reports the errors on real recordings.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from plushsense.core.recorder_csv import Frames
 Floats: TypeAlias = NDArray[np.float64]
 
 CONTEXT_S = 2.5
-"""How much of the stream before a recording is rest: the countdown is 3 s, and begins with the knock of its key."""
+"""Seconds of the stream before a recording that count as rest: the countdown of 3 s without the key press at first."""
 
 _CONTACT = ("capacitive", "proximity")
 
 
 @dataclass(frozen=True)
 class OnsetSpec:
-    """The settings of the method. Shares are of the way from rest to the highest activity, on a logarithmic scale.
+    """Settings of the method. Shares are of the way from rest to the highest activity, on a logarithmic scale.
 
-    The walk outwards ends at ``onset_at`` and ``offset_at`` after ``quiet_s`` of quiet; activity above ``clear_at`` is
-    clear. Below ``least_contrast`` there is no gesture, and activity shorter than ``least_s`` is a knock.
+    The outward search ends when the activity stayed below ``onset_at`` (``offset_at``) for ``quiet_s``; activity above
+    ``clear_at`` is clear. Below ``least_contrast`` there is no gesture; one shorter than ``least_s`` is a knock.
     """
 
     smooth_s: float = 0.05
@@ -62,10 +62,11 @@ SPEC = OnsetSpec()
 
 @dataclass(frozen=True)
 class Suggestion:
-    """Suggested trim: rows ``start`` to ``stop`` of a recording hold the gesture.
+    """Suggested trim: the gesture is in the rows from ``start`` to before ``stop`` of a recording.
 
-    If no onset is visible (movement at the first row, or no activity at all), ``start`` and its confidence are 0;
-    likewise ``stop`` is the end. ``contrast`` is activity at its height over rest, ``why`` states what is not visible.
+    If no onset is visible (movement at the first row, or no activity at all), ``start`` and its confidence are 0; if no
+    offset is visible, ``stop`` is the number of rows and its confidence 0. ``contrast`` is the highest activity divided
+    by that at rest; ``why`` explains what is not visible.
     """
 
     start: int
@@ -108,7 +109,7 @@ def suggest(frames: Frames, layout: Layout, before: Frames | None = None, spec: 
     start, stop = onset(spec.onset_at), offset(spec.offset_at)
     if (stop - start) * period_s < spec.least_s:
         return replace(nothing, why="only a knock")
-    # The edge is sharp if the result hardly changes with the threshold.
+    # An edge is sharp if its row hardly depends on the threshold.
     loose = [onset(spec.onset_at + d) for d in (-0.15, 0.1)], [offset(spec.offset_at + d) for d in (-0.1, 0.1)]
     spread = [period_s * (max(at, *moved) - min(at, *moved)) for at, moved in zip((start, stop), loose, strict=True)]
     trust = min(1.0, max(0.0, np.log(contrast / spec.least_contrast) / np.log(20.0 / spec.least_contrast)))
@@ -128,7 +129,7 @@ def suggest(frames: Frames, layout: Layout, before: Frames | None = None, spec: 
 def _activity(
     frames: Frames, layout: Layout, before: Frames | None, period_s: float, spec: OnsetSpec
 ) -> tuple[Floats, Floats, float]:
-    """Return the activity before and in the recording, (k,) and (n,), in units of the noise, and its level at rest."""
+    """Return the activity before and in the recording, (k,) and (n,), as multiples of the noise, and that at rest."""
     values = frames.values
     past = _unbroken(before, frames, layout, period_s) if before is not None else values[:0]
     k = len(past) if len(past) * period_s >= spec.stretch_s else 0
@@ -138,14 +139,14 @@ def _activity(
     n, half = len(smooth), max(1, round(spec.half_s / period_s))
     at = np.arange(n)
     ahead, behind = np.minimum(at + half, n - 1), np.maximum(at - half, 0)
-    # At the edges the span is shorter; scale to the same speed.
+    # The span is shorter at the edges: scale the change accordingly.
     change = (smooth[ahead] - smooth[behind]) * (2 * half / (ahead - behind))[:, None]
     speed = np.stack([np.sqrt((change[:, s] ** 2).mean(axis=1)) for s in _sensors(layout)], axis=1)
     calm = _quietest((speed / np.maximum(np.median(speed, axis=0), 0.5)).mean(axis=1), spec.stretch_s / period_s)
     # Movement in the countdown must not count as noise.
     quiet = np.median(speed[calm], axis=0)
     noise = np.minimum(np.median(speed[:k], axis=0), spec.noise_factor * quiet) if k else quiet
-    # At least half a count, the resolution of an integer sensor.
+    # The noise is at least half a count, the resolution of an integer sensor.
     parts = [speed / np.maximum(noise, 0.5)]
     contact = [i for i, c in enumerate(layout.channels) if c.kind in _CONTACT]
     if contact:
@@ -157,9 +158,9 @@ def _activity(
 
 
 def _off_level(x: Floats, busy: Floats, k: int, calm: slice, period_s: float, spec: OnsetSpec) -> Floats:
-    """Return how far contact sensors are from their level before the touch, in units of their variation at rest.
+    """Return the distance of contact sensors from their level before the touch, as a multiple of their noise at rest.
 
-    The level is taken at the calmest moment around the start, after a second hand has steadied the toy.
+    The level is measured at the calmest moment around the start, when a second hand already holds the toy.
     """
     width = max(3, round(spec.level_s / period_s))
     begin = max(0, k - round(0.7 / period_s))
@@ -172,7 +173,7 @@ def _off_level(x: Floats, busy: Floats, k: int, calm: slice, period_s: float, sp
 
 
 def _unbroken(before: Frames, frames: Frames, layout: Layout, period_s: float) -> NDArray[np.int64]:
-    """Return the rows before the recording that lead into it without a gap or a clock reset."""
+    """Return the last rows of ``before`` that are followed by ``frames`` without a gap or a clock reset."""
     if not len(before):
         return before.values
     steps = np.diff(np.append(before.device_ms, frames.device_ms[0]))
@@ -211,7 +212,7 @@ def _mean(x: Floats, width: int) -> Floats:
 
 
 def _quietest(busy: Floats, width: float) -> slice:
-    """Return the stretch of ``width`` rows with the least activity."""
+    """Return the stretch of ``width`` rows (at least 3) with the least activity."""
     w = min(len(busy), max(3, round(width)))
     sums = np.cumsum(np.insert(busy, 0, 0.0))
     at = int(np.argmin(sums[w:] - sums[:-w]))
@@ -219,7 +220,7 @@ def _quietest(busy: Floats, width: float) -> slice:
 
 
 def _clear(activity: Floats, threshold: float, period_s: float, spec: OnsetSpec) -> tuple[int, int]:
-    """Return the first and last row of clear activity, ignoring knocks (the key that stops the recording)."""
+    """Return the first and last row of clear activity, without knocks such as the key that stops the recording."""
     hot = np.flatnonzero(activity >= threshold)
     breaks = np.flatnonzero(np.diff(hot) * period_s > spec.join_s)
     firsts, lasts = hot[np.append(0, breaks + 1)], hot[np.append(breaks, len(hot) - 1)]
@@ -231,9 +232,9 @@ def _clear(activity: Floats, threshold: float, period_s: float, spec: OnsetSpec)
 
 
 def _walk_back(activity: Floats, rest: Floats, threshold: float, quiet: int) -> int:
-    """Return the row of ``activity`` before which it stays below the threshold for ``quiet`` rows; 0 if there is none.
+    """Return the last row of ``activity`` that follows ``quiet`` rows below ``threshold``; 0 if there is none.
 
-    ``rest`` holds the activity before its first row.
+    ``rest`` is the activity before the first row.
     """
     low = np.concatenate([rest[-quiet:], activity]) < threshold
     k = len(low) - len(activity)

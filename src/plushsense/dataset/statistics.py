@@ -1,6 +1,6 @@
 """Compute statistics of a data set: durations by gesture and group of people, and channel values by gesture.
 
-The summary statistics of the authors' ``b_training_data_analysis.m``: mean, median, variance and range by gesture.
+Durations have the statistics of the authors' ``b_training_data_analysis.m``: mean, median, variance and range.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ NOT_GIVEN = "not said"
 
 @dataclass(frozen=True)
 class SummaryStatistics:
-    """Summary of some numbers; ``variance`` is the sample variance (n − 1, as MATLAB's), None for one number."""
+    """Summary of numbers; ``variance`` is the sample variance (divisor n − 1, as in MATLAB), None for one number."""
 
     mean: float
     median: float
@@ -38,10 +38,10 @@ class SummaryStatistics:
 
 @dataclass(frozen=True)
 class Duration:
-    """The durations of one gesture in one group of people ("" for all), whole and after trimming.
+    """Durations of one gesture in one group of people ("" for all), before and after trimming.
 
-    ``before_s`` and ``after_s`` in seconds (variance in s²), ``before_rows`` and ``after_rows`` in rows; ``trimmed``
-    recordings of ``recordings`` have a mark that shortens them.
+    ``before_s`` and ``after_s`` are in seconds (variance in s²), ``before_rows`` and ``after_rows`` in rows.
+    ``recordings`` and ``people`` are counts, ``trimmed`` is the number of recordings that a mark shortens.
     """
 
     gesture: str
@@ -56,12 +56,12 @@ class Duration:
 
 
 def duration_table(dataset: Dataset, by: str | None = None) -> list[Duration]:
-    """Return durations of the used recordings, one row per gesture and group of people.
+    """Return the durations of the used recordings, one entry for each gesture and group of people.
 
-    Seconds are rows over the recording's own measured rate; a recording of a single row has none and is left out.
+    Seconds are rows divided by the measured rate of the recording; recordings without a rate (one row) are left out.
 
     Args:
-        by: a column of subjects.csv: age_group, gender, or one of the user's own; ``subject`` for each person.
+        by: the column of subjects.csv to group by (age_group, gender or a user-defined one), or ``subject``.
 
     Raises:
         DatasetError: for a column that subjects.csv does not have.
@@ -96,7 +96,7 @@ def _class_order(dataset: Dataset, gesture: str) -> int:
 
 
 def _grouping(dataset: Dataset, by: str) -> Callable[[str], str]:
-    """Return the function from a person to the group by a column of subjects.csv ("" for all)."""
+    """Return a function that maps a person to the group in the column ``by`` of subjects.csv ("" if ``by`` is "")."""
     people = read_people(dataset.path) if by not in ("", "subject") else {}
     if by not in ("", "subject"):
         if not people:
@@ -138,7 +138,7 @@ class ChannelSummary:
 def channel_table(dataset: Dataset) -> list[ChannelSummary]:
     """Compute mean and standard deviation of each channel by gesture, over the used recordings after trimming.
 
-    Reads every recording. Rows outside a channel's valid range do not count; all rows have equal weight, so a
+    This reads every recording. Values outside a channel's valid range are left out. All rows have equal weight, so a
     recording that was never stopped dominates.
     """
     layout = dataset.layout

@@ -1,8 +1,8 @@
-"""Trimming of recordings by marks: suggestions from onset detection, and accepting, adjusting or undoing them.
+"""Trim recordings by marks: suggest trims from the detected onset, and accept, adjust or undo them.
 
 By default only the start is trimmed, as in the paper: the rows before the onset are reaction time, whereas people
-disagree about the end of a gesture (docs/trim.md reports both errors). A mark that a person set by hand is never
-replaced by a suggestion.
+disagree about the end of a gesture (docs/trim.md reports both errors). A suggestion never replaces a trim that a person
+set by hand.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ STATES = ("none", "suggested", "accepted", "adjusted")
 
 @dataclass(frozen=True)
 class Trim:
-    """Suggested trim and state of one recording.
+    """Suggested trim of one recording, and its current state by the marks.
 
-    ``seconds`` (rows + 1,) are `row_times_s`.
+    ``seconds`` (rows + 1,) are the times of its rows and its end, see `row_times_s`.
     """
 
     recording: RecordingInfo
@@ -42,15 +42,15 @@ class Trim:
 
     @property
     def state(self) -> str:
-        """One of `STATES`: "accepted" is a suggestion that was marked, "adjusted" a mark that a person set."""
+        """One of `STATES`: "accepted" for a trim that was suggested, "adjusted" for one that a person set by hand."""
         if self.mark_state.trimmed:
             return "accepted" if self.mark_state.how == SUGGESTED else "adjusted"
         return "suggested" if self.suggestion.onset_visible else "none"
 
     def suggested_rows(self, offset: bool = False, above: float = 0.0) -> tuple[int, int]:
-        """Return the rows that accepting would keep; all if the start is not visible or less confident than ``above``.
+        """Return the rows that the suggestion keeps: all if the onset is not visible or its confidence below ``above``.
 
-        With ``offset`` the end is trimmed too, if it is visible and as confident.
+        With ``offset`` the end is trimmed too, if the offset is visible and its confidence at least ``above``.
         """
         s = self.suggestion
         if not s.onset_visible or s.onset_confidence < above:
@@ -59,14 +59,14 @@ class Trim:
         return s.start, s.stop if ends else self.recording.rows
 
     def current_rows(self, offset: bool = False) -> tuple[int, int]:
-        """Return the rows that a mark keeps, or else those suggested."""
+        """Return the rows that the current mark keeps; without a mark, those that the suggestion keeps."""
         if not self.mark_state.trimmed:
             return self.suggested_rows(offset)
         stop = self.recording.rows if self.mark_state.stop < 0 else min(self.mark_state.stop, self.recording.rows)
         return min(self.mark_state.start, stop), stop
 
     def to_dict(self, offset: bool = False) -> dict[str, Any]:
-        """Return plain values for JSON: the rows in force (or suggested), and the suggestion."""
+        """Return plain values for JSON: `current_rows` and the suggestion."""
         start, stop = self.current_rows(offset)
         s = self.suggestion
         return {
@@ -88,7 +88,7 @@ class Trim:
 
 @dataclass(frozen=True)
 class AcceptedTrims:
-    """Ids of recordings by what accepting did: marked, marked already, no visible or sure onset, set by hand."""
+    """Ids of recordings by the result of accepting: marked, marked before, no sure onset, trimmed by hand."""
 
     marked: tuple[str, ...] = ()
     already: tuple[str, ...] = ()
@@ -99,10 +99,10 @@ class AcceptedTrims:
 def suggest_trims(
     dataset: Dataset, recordings: Iterable[RecordingInfo] | None = None, progress: Progress | None = None
 ) -> list[Trim]:
-    """Return the suggestion and the state of each recording; by default of all that no mark excludes.
+    """Return the suggestion and the state of each of ``recordings``, by default of all that are not excluded.
 
     Raises:
-        DatasetError: for a data set whose recordings are cut from labels, which need no trimming.
+        DatasetError: for a data set with a label on every row, whose recordings need no trimming.
     """
     if dataset.layout.is_labelled:
         raise DatasetError(
@@ -113,7 +113,7 @@ def suggest_trims(
     marks = read_marks(dataset.path)
     nobody = {g.label for g in dataset.gestures.gestures if g.nobody}
     trims = {}
-    # Sorted by stream, since the data set caches the last one.
+    # Sort by stream, since the data set caches only the last one.
     for done, info in enumerate(sorted(chosen, key=lambda r: (r.stream, r.id)), 1):
         frames = dataset.read(replace(info, start=0, stop=info.rows))
         if info.gesture in nobody:
@@ -135,14 +135,14 @@ def _before(dataset: Dataset, info: RecordingInfo) -> Frames | None:
 
 
 def row_times_s(frames: Frames) -> NDArray[np.float64]:
-    """Return device time since the first row, at each row and at the end, (T + 1,); resets are skipped."""
+    """Return the device time in s since the first row, of each row and of the end, (T + 1,); clock resets are 0 s."""
     steps = np.maximum(np.diff(frames.device_ms), 0)
     usual = float(np.median(steps)) if len(steps) else 0.0
     return np.concatenate([[0.0], np.cumsum(steps), [float(steps.sum()) + usual]]) / 1000.0
 
 
 def find_recordings(dataset: Dataset, pattern: str) -> list[RecordingInfo]:
-    """Return the recordings that an id or a pattern with ``*`` and ``?`` matches; DatasetError if there is none."""
+    """Return the recordings that ``pattern`` (an id, or with ``*`` and ``?``) matches; raise DatasetError if none."""
     ids = {r.id: r for r in dataset.recordings}
     return [ids[identity] for identity in match_ids(pattern, ids, "recording")]
 
@@ -150,9 +150,9 @@ def find_recordings(dataset: Dataset, pattern: str) -> list[RecordingInfo]:
 def accept_suggestions(
     dataset: Dataset, chosen: Iterable[Trim], who: str, why: str = "", *, above: float = 0.0, offset: bool = False
 ) -> AcceptedTrims:
-    """Mark `Trim.suggested_rows`: starts of at least confidence ``above``, and with ``offset`` ends too.
+    """Accept suggestions by marks: onsets of at least confidence ``above``, with ``offset`` also such offsets.
 
-    A mark set by hand stays, and an existing mark is not repeated. Open the data set again to see the marks.
+    Trims set by hand stay, and existing marks are not written again. ``dataset`` is not updated: open it again.
     """
     marks, already, not_visible, by_hand = [], [], [], []
     for trim in chosen:
@@ -172,16 +172,16 @@ def accept_suggestions(
 
 
 def kept_rows(trim: Trim, start_s: float | None, stop_s: float | None) -> tuple[int, int]:
-    """Return the rows of a recording from ``start_s`` to ``stop_s`` (None: its edge).
+    """Return the rows of a recording from ``start_s`` to ``stop_s`` (None: its start or end).
 
     Raises:
-        DatasetError: for times outside the recording, or that keep nothing.
+        DatasetError: for times outside the recording, or without a row between them.
     """
     info, end_s = trim.recording, float(trim.seconds[-1])
     for value in (start_s, stop_s):
         if value is not None and not 0.0 <= value <= end_s + 1e-3:
             raise DatasetError(f"'{info.id}' cannot be trimmed at {value:g} s: it runs from 0 to {end_s:.3f} s.")
-    # Half a millisecond of tolerance: printed times are rounded to whole ones.
+    # Allow half a millisecond, since displayed times are rounded to milliseconds.
     start = 0 if start_s is None else int(np.searchsorted(trim.seconds, start_s - 5e-4))
     stop = info.rows if stop_s is None else int(np.searchsorted(trim.seconds, stop_s - 5e-4))
     start, stop = min(start, info.rows), min(stop, info.rows)
@@ -193,10 +193,10 @@ def kept_rows(trim: Trim, start_s: float | None, stop_s: float | None) -> tuple[
 
 
 def set_rows(dataset: Dataset, trim: Trim, start: int, stop: int, who: str, why: str = "") -> bool:
-    """Mark rows ``start`` to ``stop`` of a recording as set by hand; return False if that is the present mark.
+    """Trim a recording by hand to the rows ``start`` to ``stop``; return False if that is its current mark.
 
     Raises:
-        DatasetError: for rows that do not exist, or none.
+        DatasetError: for an empty range, or rows that do not exist.
     """
     info = trim.recording
     if not 0 <= start < stop <= info.rows:
@@ -209,13 +209,13 @@ def set_rows(dataset: Dataset, trim: Trim, start: int, stop: int, who: str, why:
 
 
 def refresh_trims(dataset: Dataset, trims: Iterable[Trim]) -> list[Trim]:
-    """Return the same suggestions with the present marks."""
+    """Return ``trims`` with the state by the marks on disk."""
     marks = read_marks(dataset.path)
     return [replace(t, mark_state=marks.get(t.recording.id, MarkState())) for t in trims]
 
 
 def undo_trims(dataset: Dataset, recordings: Sequence[RecordingInfo], who: str, why: str = "") -> tuple[str, ...]:
-    """Undo the trim of recordings, accepted or set by hand; return the ids of those that had one."""
+    """Undo the trims of ``recordings``, accepted or set by hand; return the ids of those that had one."""
     marks = read_marks(dataset.path)
     trimmed = tuple(r.id for r in recordings if marks.get(r.id, MarkState()).trimmed)
     append_marks(dataset.path, [Mark(identity, "untrim", who, why) for identity in trimmed])
@@ -224,7 +224,7 @@ def undo_trims(dataset: Dataset, recordings: Sequence[RecordingInfo], who: str, 
 
 @dataclass(frozen=True)
 class TrimResult:
-    """Result of `decide_trims`: the recordings in their new state, and the ids of those that were marked."""
+    """Result of `decide_trims`: the new state of the recordings, and the ids of those that got a mark."""
 
     dataset: Dataset
     trims: tuple[Trim, ...]
@@ -234,7 +234,7 @@ class TrimResult:
 
     @property
     def changed(self) -> frozenset[str]:
-        """The ids of the recordings that got a mark."""
+        """Ids of the recordings that got a mark."""
         return frozenset((*self.accepted.marked, *self.adjusted, *self.undone))
 
     @property
@@ -256,20 +256,21 @@ def decide_trims(
     why: str = "",
     progress: Progress | None = None,
 ) -> TrimResult:
-    """Suggest trims, and mark the given decisions.
+    """Suggest trims, and write marks for the given decisions.
 
     Args:
-        only: an id or a pattern of the recordings; by default all that no mark excludes.
-        accept: ids or patterns of recordings whose suggestion is accepted.
-        above: the least confidence to accept, 0 to 1; without ``accept``, for all recordings of ``only``.
-        keep: (id, from, to) in seconds to set by hand, None for the edge.
-        undo: ids or patterns whose trim is undone.
+        only: id or pattern of the recordings to suggest trims for; by default all that are not excluded.
+        accept: ids or patterns of the recordings whose suggestion is accepted.
+        above: least confidence to accept, 0 to 1; without ``accept``, suggestions for all of ``only`` are accepted.
+        keep: (id, from, to) in seconds to set by hand; None for the start or end of the recording.
+        undo: ids or patterns of the recordings whose trim is undone.
         offset: whether to accept suggested ends, too.
-        who: by default the login name.
+        who, why: name (by default the login name) and reason for the marks.
+        progress: called with (recordings done, number of recordings).
 
     Raises:
-        ConfigError: for a confidence out of range, or a ``keep`` of several recordings; nothing is marked then.
-        DatasetError: for unknown recordings, or times outside a recording; nothing is marked then.
+        ConfigError: for a confidence out of range, or an id in ``keep`` that matches several recordings.
+        DatasetError: for unknown recordings, or times outside a recording. In both cases no mark is written.
     """
     if above is not None and not 0.0 <= above <= 1.0:
         raise ConfigError(f"Accepting above {above:g}: a confidence from 0 to 1 is accepted.")
@@ -289,7 +290,7 @@ def decide_trims(
     rows = [(every[info.id], *kept_rows(every[info.id], start_s, stop_s)) for info, start_s, stop_s in to_keep]
     accepting = bool(by_name) or above is not None
     name = author_name(who) if accepting or undone or to_keep else ""
-    # All arguments are valid; from here on marks are written.
+    # All arguments are valid: write the marks.
     undone_ids = undo_trims(dataset, list(undone.values()), name, why)
     adjusted = tuple(t.recording.id for t, start, stop in rows if set_rows(dataset, t, start, stop, name, why))
     accepted = AcceptedTrims()

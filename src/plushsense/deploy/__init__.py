@@ -1,1 +1,1 @@
-"""Deployment of a trained bundle: quantization, C code with identical answers, and its verification."""
+"""Deploy a trained bundle: quantization, C code with the same answers bit by bit, and its verification."""

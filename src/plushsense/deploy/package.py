@@ -1,4 +1,4 @@
-"""README, Arduino library, ESP-IDF component and example firmware of an export folder, from Jinja templates."""
+"""Create README, Arduino library, ESP-IDF component and example firmware of an export folder from Jinja templates."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LICENCE = "LICENSE"
 _WIRE = ("plush_wire.h", "plush_wire.c")
 _EXAMPLE = ("plush_reaction.h", "plush_reaction.c", "plush_fake.h", "plush_fake.c")
 FIRMWARE = (*_WIRE, *_EXAMPLE, "PlushToy.ino", "main.c")
-"""The files of the example firmware; their templates are in ``c/toy``."""
+"""Files of the example firmware, with templates in ``c/toy``."""
 _TEMPLATES = {
     f"{ARDUINO}/library.properties": "library.properties",
     f"{ARDUINO}/library.json": "library.json",
@@ -40,16 +40,16 @@ _TEMPLATES = {
 
 
 def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
-    """Add the README and the packages to an export folder; ``facts`` default to those of its ``export.json``.
+    """Add README, Arduino library and ESP-IDF component to an export folder; ``facts`` default to its ``export.json``.
 
-    The library and the model are copied from the folder. Files of these names are written over.
+    The library and the model are copied from the folder. Existing files are overwritten.
 
     Returns:
-        the files that were written.
+        The written files.
 
     Raises:
-        BadInput: where the folder is no export.
-        LayoutError: for a layout that the toy's lines cannot carry.
+        BadInput: if the folder is no export.
+        LayoutError: for a layout with values that the toy's line format cannot represent.
     """
     facts = read_facts(out) if facts is None else facts
     bundle = Bundle.load(out / BUNDLE)
@@ -91,13 +91,13 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
 
 
 def copies() -> dict[str, str]:
-    """Return the files of the packages that are copies: copy to original, relative to the folder."""
+    """Return the files of the packages that are copies, mapped to their originals, relative to the export folder."""
     names = (*LIBRARY, *MODEL)
     return {f"{ARDUINO}/src/{n}": n for n in names} | {f"{IDF}/{_component_path(n)}": n for n in names}
 
 
 def changed_copies(out: Path) -> list[str]:
-    """Return the copies in an export folder that differ from their originals: ``verify`` tests only the originals."""
+    """Return the copies in an export folder that differ from their originals, since only these are verified."""
     return [
         copy
         for copy, original in copies().items()
@@ -131,7 +131,7 @@ def _component_path(name: str) -> str:
 
 
 def _keywords(headers: str) -> str:
-    """Return the Arduino editor's keywords: types, functions and constants of the headers."""
+    """Return the keywords for the Arduino editor: types, functions and constants in ``headers``."""
     code = re.sub(r"/\*.*?\*/", "", headers, flags=re.S)
     kinds = {
         "KEYWORD1": re.findall(r"^} (plush_\w+);", code, re.M),
@@ -141,24 +141,24 @@ def _keywords(headers: str) -> str:
     return "".join(f"{word}\t{kind}\n" for kind, words in kinds.items() for word in dict.fromkeys(words))
 
 
-# Touch pads of the ESP32 as (pad, GPIO); the last ones also decide how the chip starts.
+# Touch pads of the ESP32 as (pad, GPIO); the last ones are strapping pins, which also decide how the chip boots.
 _PADS = ((0, 4), (3, 15), (4, 13), (6, 14), (7, 27), (8, 33), (9, 32), (2, 2), (5, 12), (1, 0))
 _NO_PAD = 255
-# One count of the MPU-6050 in these units.
+# One count of the MPU-6050 in several units, by kind of channel.
 _MOTION = {
     "acceleration": {"count": 1.0, "g": 1 / 16384, "m/s²": 9.80665 / 16384, "m/s2": 9.80665 / 16384},
     "angular rate": {"count": 1.0, "°/s": 1 / 131, "deg/s": 1 / 131, "rad/s": math.radians(1 / 131)},
 }
 _FIRST_AXIS = {"acceleration": 0, "angular rate": 3}
 _PADDED = ("capacitive", "proximity")
-# Channels that the toy adds up (the paper's Table 1: "cumulative signal, based on all the capacitive sensors").
+# Channels that are sums of others (the paper's Table 1: "cumulative signal, based on all the capacitive sensors").
 _TOTALS = ("cap_all",)
 _MOST_DECIMALS = 9
 
 
 @dataclass(frozen=True)
 class _ChannelSource:
-    """Source of a channel: ``kind`` as in the C enum, touch pad and GPIO (or the axis), factor in steps of 1/65536."""
+    """Source of a channel: ``kind`` of the C enum, touch pad and GPIO (or the axis twice), factor in 1/65536."""
 
     kind: str
     pad: int = 0
@@ -171,7 +171,7 @@ def firmware(layout: Layout, scaler: Scaler, facts: Mapping[str, Any]) -> dict[s
     """Render the files of `FIRMWARE` for a model with these ``facts`` (of ``export.json``), by name.
 
     Raises:
-        LayoutError: for a step that no line can carry.
+        LayoutError: for a channel whose step the toy's line format cannot represent.
     """
     sources = _sources(layout)
     formats = [_decimal_format(c) for c in layout.channels]
@@ -230,7 +230,7 @@ def _sources(layout: Layout) -> list[_ChannelSource]:
 
 
 def _motion_factor(channel: Channel) -> int | None:
-    """Return the factor from sensor counts to steps of the channel, in 1/65536; None for an unknown unit."""
+    """Return the factor from sensor counts to steps of the channel, in 1/65536; None if it cannot be computed."""
     unit = _MOTION.get(channel.kind, {}).get(channel.unit)
     if unit is None or channel.offset != 0:
         return None
@@ -239,7 +239,7 @@ def _motion_factor(channel: Channel) -> int | None:
 
 
 def _decimal_format(channel: Channel) -> tuple[int, int]:
-    """Return how the line format writes a channel's integer: its multiplier and the number of decimals."""
+    """Return by what a channel's integer is multiplied for the toy's lines, and the number of decimals there."""
     decimals = 0
     while decimals < _MOST_DECIMALS and round(channel.step * 10**decimals, 6) != round(channel.step * 10**decimals):
         decimals += 1
@@ -259,7 +259,7 @@ def _line_bytes(layout: Layout, formats: list[tuple[int, int]]) -> int:
 
 
 def _statistics(layout: Layout, scaler: Scaler) -> list[tuple[int, int]]:
-    """Return mean and spread of each channel in training, as far as the scaler has them, within the valid range."""
+    """Return mean and spread of each channel in training by `measured`, limited to the valid range."""
     mean, spread = measured(layout, scaler)
     rows = []
     for at, wide, low, high in zip(

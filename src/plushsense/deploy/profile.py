@@ -1,4 +1,4 @@
-"""Cost of an export's C on a target: instructions by stage, bytes by section, stack, required symbols."""
+"""Measure the cost of the C code of an export on a target: instructions, bytes by section, stack, required symbols."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from plushsense.models.arch import Arch
 
 @dataclass(frozen=True)
 class Core:
-    """A chip, as ``cores.toml`` describes it."""
+    """Core of a chip, described in ``cores.toml``; ``cycles_low`` and ``cycles_high`` are per instruction."""
 
     name: str
     title: str
@@ -47,7 +47,7 @@ class Core:
 
     @property
     def reasons(self) -> str:
-        """Explanation of the bounds as text."""
+        """Explanation of the two bounds as text."""
         if self.flash_mb_s is None:
             return self.why
         return (
@@ -58,14 +58,14 @@ class Core:
 
 @cache
 def cores() -> tuple[Core, ...]:
-    """Read the chips of ``cores.toml``."""
+    """Return the cores of ``cores.toml``."""
     path = Path(__file__).with_name("cores.toml")
     return tuple(load_table(row, Core, path.name, BadInput) for row in read_toml(path, "cores", BadInput)["cores"])
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimated time of one step on a core, in ms, between two bounds."""
+    """Estimated time of one step on a core in ms, as a lower and an upper bound; ``step_ms`` is the time available."""
 
     core: Core
     instructions: int
@@ -75,12 +75,12 @@ class Estimate:
 
     @property
     def fits(self) -> str:
-        """``yes``, ``no``, or ``unsure`` when it depends on where in the band the chip lies."""
+        """Whether a step fits into ``step_ms``: ``yes``, ``no``, or ``unsure`` if that is between the bounds."""
         return "yes" if self.high_ms <= self.step_ms else "no" if self.low_ms > self.step_ms else "unsure"
 
     @property
     def answer(self) -> str:
-        """Verdict as text, with the share of the core and the remaining time of a step."""
+        """Verdict as text, with the share of the core's time and, if it fits, the rest of a step."""
         low, high = (f"{100 * ms / self.step_ms:.2g}" for ms in (self.low_ms, self.high_ms))
         if self.fits == "yes":
             return f"yes, uses about {low} to {high} % of the core, {self.step_ms - self.high_ms:.0f} ms left a step"
@@ -90,7 +90,7 @@ class Estimate:
 
     @property
     def verdict(self) -> str:
-        """Verdict as a whole sentence."""
+        """Verdict as text, with the rate of steps."""
         return f"fits {1000 / self.step_ms:g} Hz: {self.answer}"
 
     def to_dict(self) -> dict[str, Any]:
@@ -113,7 +113,7 @@ class Estimate:
 
 
 def estimate(core: Core, instructions: int, flash_bytes: int, samples: int, step_ms: float) -> Estimate:
-    """Estimate the time of a step from its instructions and samples, and the bytes of code and data in flash."""
+    """Estimate the time of a step; a serial flash adds reading ``flash_bytes`` per sample to the upper bound."""
     low = instructions * core.cycles_low / core.mhz / 1000
     high = instructions * core.cycles_high / core.mhz / 1000
     if core.flash_mb_s is not None:
@@ -121,10 +121,10 @@ def estimate(core: Core, instructions: int, flash_bytes: int, samples: int, step
     return Estimate(core, instructions, step_ms, low, high)
 
 
-STEPS = 50  # decisions that are counted
+STEPS = 50  # number of decisions whose instructions are counted
 STAGES = ("health", "inputs", "gate", "network", "dense", "decision", "events", "pooling")
 _HEAP = ("malloc", "calloc", "realloc", "free", "reallocarray", "aligned_alloc", "sbrk", "_sbrk", "_Znw", "_Zna")
-# The compiler's helpers for floating point: __addsf3, __mulsf3, __floatsidf, __aeabi_fadd, __aeabi_i2d …
+# Helper functions of compilers for floating point: __addsf3, __mulsf3, __floatsidf, __aeabi_fadd, __aeabi_i2d …
 _FLOAT = re.compile(r"^__(\w*[sdt]f\d?$|float|fix|aeabi_[fd](?!iv)|aeabi_u?[il]2[fd])")
 _SECTIONS = {"text": (".text", ".literal"), "rodata": (".rodata", ".srodata"), "data": (".data", ".sdata")}
 _SECTIONS["bss"] = (".bss", ".sbss")
@@ -133,14 +133,13 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost on one target, in instructions and bytes; None where the target counts nothing (the host).
+    """Cost on one target in instructions and bytes; counts are None if the target does not count (the host).
 
-    ``step`` is the mean over `STEPS` decisions with frames up to a fifth of a period early or late, ``even`` with
-    even stamps, ``step_most`` the largest step; ``gap`` is the largest single call, which bridges the longest gap.
-    ``stages`` add up to ``step``; ``clock`` (with the check of values) is the remainder, ``gate`` is 0 for a model
-    without one.
+    ``step`` is the mean over `STEPS` decisions with frames up to a fifth of a period early or late, ``step_most`` their
+    maximum, ``even`` the mean with even time stamps; ``gap`` is a call that bridges the longest gap. ``stages`` add up
+    to ``step``: ``clock`` (with the check of values) is the remainder, ``gate`` is 0 for a model without one.
     ``stack_push``, ``stack_begin`` and ``stack_memory_bytes`` are the stack depths of these functions, without a
-    callback; ``stack_functions`` is the frame of each function as the compiler reports it.
+    callback; ``stack_functions`` is the stack frame of each function as the compiler reports it.
     """
 
     target: str
@@ -166,18 +165,18 @@ class Cost:
 
     @property
     def ram_bytes(self) -> int:
-        """Bytes of one toy, its memory and static data; without stack."""
+        """Bytes of one toy object, its memory and static data, without the stack."""
         static = sum(part[name] for part in self.sections.values() for name in ("data", "bss"))
         return self.toy_bytes + self.memory_bytes + static
 
     @property
     def heap(self) -> tuple[str, ...]:
-        """Symbols of a heap that the object needs: should be empty."""
+        """Symbols of a heap that the library requires; should be empty."""
         return tuple(s for s in self.needs if s.startswith(_HEAP))
 
     @property
     def floats(self) -> tuple[str, ...]:
-        """Helpers for floating point that the object needs: should be empty."""
+        """Helper functions for floating point that the library requires; should be empty."""
         return tuple(s for s in self.needs if _FLOAT.match(s))
 
     def to_dict(self) -> dict[str, Any]:
@@ -208,13 +207,13 @@ class Cost:
 def count(
     folder: Path, target: str, facts: Mapping[str, Any], optimise: str = "-O2", *, code: Path | None = None
 ) -> Cost:
-    """Build the C of an export folder for a target, run it there and count instructions; the folder is only read.
+    """Build the C code of an export folder for a target, run it there, and count instructions.
 
-    ``code`` is the folder of the C where that is not the export's own.
+    The folder is only read. ``code`` is another folder from which to take the C code.
 
     Raises:
-        ToolError: when a tool is missing, or refuses what stands in the folder.
-        BadInput: when the golden frames are missing.
+        ToolError: if a tool is missing or fails.
+        BadInput: if there are too few golden frames.
     """
     code = code or folder
     step = int(facts["step"])
@@ -266,8 +265,8 @@ def _mean(counts: Ints) -> int:
 def _streams(folder: Path, facts: Mapping[str, Any]) -> tuple[Ints, Ints]:
     """Return frames at even times, and the same readings with jitter and the longest bridged gap at the end.
 
-    The readings are the clean touches near the beginning of the golden frames. What is counted begins and ends with a
-    frame without jitter, so that it holds whole samples only.
+    The readings are touches near the beginning of the golden frames, which have no faults. The counted part begins and
+    ends with a frame without jitter, so that it contains a whole number of samples.
     """
     span, step, period_us = int(facts["span"]), int(facts["step"]), int(facts["period_us"])
     frames, _ = read_golden(folder / GOLDEN, len(facts["channels"]), int(facts["classes"]))
@@ -286,9 +285,9 @@ def _streams(folder: Path, facts: Mapping[str, Any]) -> tuple[Ints, Ints]:
 
 
 def _whole(program: Program, step: int) -> tuple[list[int], Ints, Ints]:
-    """Run the program: return six numbers about the toy, and two tables of rows (`STEPS`, 3).
+    """Run the program; return its six numbers about the toy, and a table of the steps of each stream.
 
-    The rows follow the first decision of the even and of the jittered stream; the latter has one more, of the gap.
+    The tables, even (`STEPS`, 3) and jittered (`STEPS` + 1, 3), omit the first decision; the latter ends with the gap.
     """
     numbers = np.frombuffer(program.run(), dtype="<u4").astype(np.int64)
     if not len(numbers):
@@ -324,7 +323,7 @@ def _needs(target: str, file: Path) -> tuple[str, ...]:
 
 
 def _stack_usage(file: Path) -> dict[str, int]:
-    """Read the stack frame of each function from the compiler's report, largest first; refuse a dynamic one."""
+    """Read each function's stack frame from the compiler's report, largest first; raise BadInput for a dynamic one."""
     frames: dict[str, int] = {}
     for line in file.read_text().splitlines() if file.is_file() else ():
         place, size, kind = line.split("\t")
@@ -342,9 +341,9 @@ SUMMARY = (
 
 @dataclass(frozen=True)
 class Profile:
-    """Costs by target, and estimates by core whose target was counted.
+    """Costs by target, and estimates for the cores whose target was counted.
 
-    ``missing`` maps each target that was left out to the Debian packages that it needs.
+    ``missing`` maps each target that is not installed to the Debian packages that it needs.
     """
 
     facts: Mapping[str, Any]
@@ -361,22 +360,22 @@ class Profile:
 
     @property
     def macs_by_layer(self) -> dict[str, int]:
-        """Multiply-accumulates of a step by layer; the dense layer is computed once a step."""
+        """Multiply-accumulates of a step by layer; the dense layer is computed once per step."""
         names = (f"layer {n}" for n in range(1, len(self.arch.layers) + 1))
         macs = {name: m * self.arch.step for name, m in zip(names, self.arch.macs_per_position, strict=True)}
         return macs | {"dense": self.arch.classes * self.arch.filters[-1]}
 
     @property
     def window_instructions(self) -> dict[str, int]:
-        """Estimated instructions, by target, if the network recomputed its whole span at every step.
+        """Estimated instructions of a step, by target, if the network recomputed its whole span each time.
 
-        The instructions of a multiply-accumulate are taken from the counts.
+        The number of instructions per multiply-accumulate is assumed to be that of the counted step.
         """
         ratio = self.arch.macs_per_window / self.arch.macs_per_step
         return {name: round(c.stages["network"] * ratio) for name, c in self.costs.items() if c.stages}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the object that ``plushsense profile --json`` prints."""
+        """Return plain values for JSON, as ``plushsense profile --json`` prints them."""
         counted = {name: c for name, c in self.costs.items() if c.step is not None}
         return {
             "title": self.arch.title,
@@ -407,20 +406,18 @@ def profile(
     trust: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Profile:
-    """Count the cost of the C in an export folder; the folder is only read.
+    """Measure the cost of the C code in an export folder, which is only read.
 
     Args:
-        folder: made by ``plushsense export``.
-        targets: names of `TARGETS`; without any, all that count instructions and are installed here.
+        folder: the folder that ``plushsense export`` wrote.
+        targets: names of `TARGETS`; by default all that count instructions and are installed.
         optimise: optimisation flag of the compilers.
-        trust: also compile and run library and model files that are not what this version writes.
-        progress: called with targets done and targets in all.
+        trust: whether to compile and run library and model files that differ from what this version writes.
+        progress: called with (targets done, number of targets).
 
     Raises:
-        BadInput: when the folder is no export, lacks something, or holds C that is not what this version writes and
-            ``trust`` is not given.
-        ToolError: when a requested target is not installed here, when none is, or when a compiler refuses
-            what stands in the folder.
+        BadInput: if the folder is no export or incomplete, or its C code was changed and ``trust`` is false.
+        ToolError: if a requested target, or every target, is not installed, or a compiler fails.
     """
     progress = progress or (lambda done, total: None)
     folder = Path(folder)

@@ -1,1 +1,1 @@
-"""Evaluation of one model on people left out: folds, predictions and scores."""
+"""Evaluate one model on people left out: folds, predictions and scores."""

@@ -1,11 +1,11 @@
-"""Re-identification: measure how well a simple program recognises people by their touch, before data are published.
+"""Measure how well a simple program recognises people by their touch (re-identification), before data are published.
 
-The program learns from recordings under the people's codes and names the person of a new recording. It uses statistics
-of each recording (those of the paper's baselines, see `windows.features.statistics`) and extremely randomised trees
-(Geurts, Ernst & Wehenkel 2006). A stronger program may do better: the scores are a lower bound of the risk, and never
-prove anonymity.
+The program is trained on recordings labelled with people's codes, and predicts the person of a new recording. It uses
+statistics of each recording (those of the paper's baselines, see `windows.features.statistics`) and extremely
+randomised trees (Geurts, Ernst & Wehenkel 2006). A stronger program may do better, so that the scores are a lower bound
+of the risk and never prove anonymity.
 
-People count alike: top-1 and top-5 are averaged over people, so that chance is 1 / people and 5 / people.
+All people have equal weight: top-1 and top-5 are averaged over people, so that chance is 1 / people and 5 / people.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ FOLDS = 5
 FEWEST_RECORDINGS = 2
 CLEARLY = 0.8
 
-# The features of each program, and what they leave out.
+# The programs by name, each with a description of its features and of what they leave out.
 SEES = {
     "everything": "statistics of every channel, and the clock's rate and jitter",
     "touch": "statistics of every channel, not the clock",
@@ -60,11 +60,11 @@ _PLAN = (
 
 @dataclass(frozen=True)
 class ReidentificationTrial:
-    """The result of one program in one design.
+    """The result of one program (``sees``, a key of `SEES`) in one design (a key of `DESIGNS`).
 
     ``top1`` and ``top5`` are ``{mean, sd, ci95}`` over people (bootstrap over people); ``by_person`` is the top-1 of
-    each person, ``precision`` the share of correct answers among those that name the person, ``chance`` and
-    ``chance5`` the scores of guessing.
+    each person; ``precision`` is the share of correct predictions among those of that person; ``chance`` and
+    ``chance5`` are the scores of guessing.
     """
 
     design: str
@@ -80,7 +80,7 @@ class ReidentificationTrial:
 
     @property
     def clear(self) -> list[str]:
-        """People with both a high top-1 and a high precision."""
+        """People whose top-1 and precision are both at least `CLEARLY`."""
         return [p for p, share in self.by_person.items() if min(share, self.precision[p]) >= CLEARLY]
 
     def to_dict(self) -> dict[str, Any]:
@@ -90,9 +90,9 @@ class ReidentificationTrial:
 
 @dataclass(frozen=True)
 class Reidentified:
-    """The results of a re-identification; ``skipped`` holds the designs that the data do not allow, with the reason.
+    """The results of a re-identification; ``skipped`` has the reason for each design that the data do not allow.
 
-    ``gestures_of_one_person`` are gestures that only one person made, so that their label identifies the person.
+    ``gestures_of_one_person`` are gestures that only one person made, so that the label alone identifies the person.
     """
 
     people: int
@@ -106,11 +106,11 @@ class Reidentified:
     simulated: bool
 
     def find(self, design: str, sees: str) -> ReidentificationTrial | None:
-        """Return the trial of a design and a program; None where there is none."""
+        """Return the trial of a design and a program; None if it was skipped."""
         return next((t for t in self.trials if (t.design, t.sees) == (design, sees)), None)
 
     def under(self, codes: Mapping[str, str]) -> Reidentified:
-        """Return the results with other codes for the people; a person missing in ``codes`` keeps theirs."""
+        """Return the results with people's codes replaced by ``codes``; a code that is not in it is kept."""
 
         def renamed(shares: dict[str, float]) -> dict[str, float]:
             return {codes.get(p, p): share for p, share in shares.items()}
@@ -130,11 +130,12 @@ class Reidentified:
 def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: Progress | None = None) -> Reidentified:
     """Measure how well the people of a data set can be recognised by their recordings.
 
-    Excluded recordings and those of nobody or of unknown people are left out.
+    Excluded recordings, those of `NOBODY` or unknown people, and people with a single recording are left out.
 
     Args:
         seed: the same seed gives the same scores.
-        progress: called with fits done, and in all.
+        trees: number of trees of the classifier.
+        progress: called with the number of finished fits and of all fits.
 
     Raises:
         BadInput: with fewer than two people of at least two recordings each.
@@ -194,9 +195,9 @@ def reidentify(dataset: Dataset, *, seed: int = 1, trees: int = 150, progress: P
 
 
 def features(frames: Frames, layout: Layout) -> dict[str, Floats] | None:
-    """Return what each program sees of one recording; None for a recording that is too short.
+    """Return the features of one recording for each program in `SEES`; None for a recording that is too short.
 
-    Statistics are taken of the longest stretch without a gap, at even samples.
+    Statistics are those of the longest part without a gap, resampled at a constant rate.
     """
     segments = resample(frames, layout)
     longest = max(segments, key=len, default=None)
@@ -222,7 +223,7 @@ def _clock(device_ms: NDArray[np.int64]) -> Floats:
 
 
 def _turns(person: Texts, session: Texts) -> NDArray[np.int64]:
-    """Return the number (n,) of each recording's session among the person's; −1 for people with one session."""
+    """Number each person's sessions and return that of each recording, (n,); −1 for people with one session."""
     group = np.full(len(person), -1, dtype=np.int64)
     for name in np.unique(person):
         mine = person == name
@@ -249,7 +250,7 @@ def _trial(
             continue
         model = forest.ExtraTreesClassifier(trees, class_weight="balanced", random_state=seed, n_jobs=1)
         model.fit(x[train], truth[train])
-        # Ties, as of people with the same clock, are broken at random, not in favour of the first code.
+        # Break ties at random (for example of people with equal clocks), and not in favour of the first code.
         chances = np.round(model.predict_proba(x[test]), 9)
         likely = model.classes_[np.argsort(-(chances + 1e-10 * rng.random(chances.shape)), axis=1)]
         named[test] = likely[:, 0]
@@ -277,7 +278,7 @@ def _trial(
 
 
 def verdict(results: Reidentified) -> str:
-    """Return the verdict as one Markdown paragraph.
+    """Return a summary of the results as one Markdown paragraph.
 
     Raises:
         MissingExtraError: when jinja2 is not installed.
@@ -287,7 +288,7 @@ def verdict(results: Reidentified) -> str:
 
 
 def report(results: Reidentified, command: str) -> str:
-    """Return the whole report in Markdown; ``command`` is the command that made it."""
+    """Return the whole report in Markdown; ``command`` is the command line that it shows for repeating the test."""
     trial = results.find("recordings", "everything")
     by_person = None if trial is None else sorted(trial.by_person.items(), key=lambda item: (-item[1], item[0]))
     return _fill(

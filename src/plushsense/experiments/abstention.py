@@ -1,6 +1,6 @@
-"""Abstention: whether the confidence of a network on people left out shows that its answer is wrong.
+"""Measure abstention: how well a network's confidence separates its right answers from its wrong ones, on test people.
 
-Each recording counts with one answer, that of its last step, as the steps within a recording are hardly independent.
+Each recording contributes one answer, from its last step, because the steps within a recording depend on each other.
 """
 
 from __future__ import annotations
@@ -59,11 +59,12 @@ Floats = NDArray[np.float64]
 def last_answers(
     bundle: Bundle, dataset: Dataset, subjects: Iterable[str], spec: DecideSpec, gestures: GestureSet
 ) -> dict[str, NDArray[Any]]:
-    """Return the last answer in each of the n recordings of ``gestures`` in some people's streams.
+    """Return the network's last answer in each of the n recordings of ``gestures`` in the streams of ``subjects``.
 
     Returns:
-        ``logits`` (n, K) of the last step and smoothed ``shares`` (n, K) of the network's K classes; ``highest`` (n,)
-        smoothed logit; ``label`` (n,) the gesture that was made, known to the network or not; ``person`` (n,).
+        ``logits`` (n, K) of the last step; smoothed ``shares`` (n, K), the probabilities of the network's K classes;
+        ``highest`` (n,), the highest smoothed logit; ``label`` (n,), the true gesture, which need not be one of the
+        network's classes; ``person`` (n,).
     """
     weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
     rows: list[tuple[NDArray[Any], NDArray[Any], Any, str, str]] = []
@@ -97,7 +98,7 @@ def fold_answers(
     coverage: float,
     known_share: float,
 ) -> dict[str, Any]:
-    """Return the answers of a fold's network on the test people, with thresholds from the validation people."""
+    """Return the answers of a fold's network on the test people, and the thresholds fitted to the validation people."""
     spec = DecideSpec()
     calibration = labelled_steps(bundle, marked_streams(bundle, dataset, validation, spec), spec)
     if not len(calibration.truth):
@@ -119,7 +120,7 @@ def fold_answers(
 
 @dataclass(frozen=True)
 class FoldAnswers:
-    """Answers of a fold, the labels of its network, and the label that was withheld from it (or "")."""
+    """Answers of a fold, the labels of its network, and the label left out of its training ("" for none)."""
 
     fold: str
     withheld: str
@@ -128,25 +129,25 @@ class FoldAnswers:
 
     @property
     def scores(self) -> dict[str, Floats]:
-        """Confidences of every recording, (n,) each."""
+        """Each kind of confidence by name, an array (n,) with one value for each recording."""
         r = self.result
         return confidences(r["logits"], r["shares"], r["highest"], float(r["sure"]))
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """(n,) recordings of a gesture that the network was trained on."""
+        """Mask (n,) of the recordings of a gesture that the network was trained on."""
         return np.isin(self.result["label"], self.labels)
 
     @property
     def right(self) -> NDArray[np.bool_]:
-        """(n,) recordings whose most likely class, smoothed, is the gesture that was made."""
+        """Mask (n,) of the recordings whose most likely class after smoothing is the true gesture."""
         best = np.array(self.labels, dtype=np.str_)[self.result["shares"].argmax(axis=1)]
         return np.asarray(best == self.result["label"])
 
 
 @dataclass(frozen=True)
 class Abstaining:
-    """The outcome of `abstaining`: ``table`` as ``--json`` prints it, and the pooled ``curves`` by confidence."""
+    """The result of `abstaining`: ``table`` as ``--json`` prints it, and the ``curves`` of all folds by confidence."""
 
     table: dict[str, Any]
     curves: dict[str, RiskCoverage]
@@ -157,7 +158,7 @@ class Abstaining:
 
 
 def summarise(folds: Sequence[FoldAnswers], coverage: float, known_share: float) -> Abstaining:
-    """Return curves and figures of all folds together, by person and by withheld gesture."""
+    """Compute risk-coverage curves and scores over all folds, by person, and by withheld gesture."""
     whole = [t for t in folds if not t.withheld and len(t.result["label"])]
     right = np.concatenate([t.right[t.known] for t in whole])
     person = np.concatenate([t.result["person"][t.known] for t in whole])
@@ -208,7 +209,7 @@ def summarise(folds: Sequence[FoldAnswers], coverage: float, known_share: float)
 
 
 def _against(folds: Sequence[FoldAnswers], known_share: float) -> dict[str, Any]:
-    """Return the AUROC of known against unknown by confidence, and the shares above and below the fitted threshold."""
+    """Return the AUROC of known against unknown gestures by confidence, and the shares that the threshold separates."""
     auc: dict[str, list[float]] = {}
     passed, caught, count = [], [], 0
     for t in folds:
@@ -231,7 +232,7 @@ def _against(folds: Sequence[FoldAnswers], known_share: float) -> dict[str, Any]
 
 
 def _spread(values: Sequence[float]) -> dict[str, float | None]:
-    """Return mean and standard deviation of the finite values."""
+    """Return the mean, the standard deviation and the number of the finite values."""
     real = [v for v in values if np.isfinite(v)]
     return {
         "mean": float(np.mean(real)) if real else None,
@@ -240,7 +241,7 @@ def _spread(values: Sequence[float]) -> dict[str, float | None]:
     }
 
 
-# Okabe and Ito's colours with line styles, so that any colour vision tells them apart.
+# Okabe and Ito's colours with line styles, so that colour-blind readers can distinguish the curves.
 _STYLES = (
     ("#0072b2", "-"),
     ("#d55e00", "--"),
@@ -253,7 +254,7 @@ _STYLES = (
 
 
 def curves(measured: Mapping[str, RiskCoverage], *, title: str = "") -> Figure:
-    """Draw a risk-coverage curve for each confidence, with those of chance and of an oracle."""
+    """Draw the risk-coverage curve of each confidence, and those of random and of perfect ranking for comparison."""
     figure = new_figure(6.4, 4.2)
     axes = figure.add_subplot()
     ranked = sorted(measured.items(), key=lambda item: item[1].area)
@@ -283,14 +284,14 @@ def curves(measured: Mapping[str, RiskCoverage], *, title: str = "") -> Figure:
     return figure
 
 
-# Raise it when the meaning of a stored fold changes, also through the default smoothing.
+# Increase it when the meaning of a stored fold changes, also when the default smoothing does.
 _VERSION = 1
 FIGURE, TABLE = "risk-coverage.png", "abstaining.json"
 
 
 @dataclass(frozen=True)
 class _AnswerWork:
-    """Trains without one label (a task is a fold and that label, or "") and returns the answers on the test people."""
+    """The work of one job: train on a fold without a label ("" for none), and return the answers on its test people."""
 
     dataset: str
     arch: Arch
@@ -323,13 +324,13 @@ def _opened(path: str) -> Dataset:
 
 
 def _without_other_people(fold: Fold, windows: WindowSet, dataset: Dataset) -> Fold:
-    """Return the fold without training windows from the streams of validation and test people."""
+    """Return the fold without those training windows that lie in streams of its validation and test people."""
     people = set(windows.subject[np.concatenate([fold.validation, fold.test])].tolist()) - {NOBODY}
     return replace(fold, train=fold.train[outside_streams(windows, dataset, people)[fold.train]])
 
 
 def _without(windows: WindowSet, label: str) -> WindowSet:
-    """Return the windows of all other gestures, with class indices of their own."""
+    """Return the windows of all gestures but ``label``, with the class indices renumbered."""
     if not label:
         return windows
     at = windows.labels.index(label)
@@ -351,20 +352,22 @@ def abstaining(
     warn: Warn = silent,
     **settings: Any,
 ) -> Abstaining:
-    """Evaluate abstention: risk against coverage, stated coverage, known against unknown gestures.
+    """Evaluate abstention: risk against coverage, the stated coverage, and known against unknown gestures.
 
-    A network is trained for each fold of people. Thresholds are fitted on its validation people, and all scores are
-    from the streams of its test people. Finished trainings are kept in the data set's ``cache`` folder.
+    A network is trained for each fold of people. Its thresholds are fitted to the validation people, and all scores
+    come from the streams of the test people. Finished trainings are kept in the data set's ``cache`` folder.
 
     Args:
         split: by whole people: "by-subject:5", "leave-one-subject-out".
         withhold: also train without each gesture in turn, and measure whether it is recognised as unknown.
-        coverage: of the conformal sets; known_share: share of known gestures above the threshold for known.
+        coverage: share of steps for which the fitted conformal set of classes should contain the true one.
+        known_share: share of the known gestures that should lie above the threshold for unknown ones.
         out: a folder for ``abstaining.json`` and the figure.
         progress: called when a training is done.
 
     Raises:
-        ConfigError: for a split of windows or recordings; DatasetError: without streams.
+        ConfigError: for a split of windows or recordings; DatasetError: for a data set without streams.
+        BadInput: when the test or the validation people have no recordings in streams.
     """
     dataset = as_dataset(dataset)
     config = config or from_settings(**settings)

@@ -1,1 +1,1 @@
-"""Many jobs, whatever they are: each one kept the moment it is done, several at once."""
+"""Run many independent jobs, several at a time, and store each result as soon as it is done."""

@@ -1,7 +1,7 @@
-"""Jobs as Ray tasks on a cluster. The only module that imports Ray (extra ``cluster``).
+"""Run jobs as Ray tasks on a cluster. This is the only module that imports Ray (extra ``cluster``).
 
-The driver keeps the results, as nodes may not share its file system. Ray repeats the tasks of a lost node. Reports of
-jobs pass through a small actor beside the driver a few times a second; only they may be lost.
+The driver (the process that starts the run) stores the results, as nodes may not share its file system. Ray repeats the
+tasks of a lost node. An actor on the driver's node passes on messages of jobs, of which some may be lost.
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ from typing import Any
 from plushsense.core.errors import ConfigError, PlushSenseError, need
 from plushsense.jobs.journal import Engine, Job, JobEvent, Take, portable, thread_settings
 
-# How often a task whose process or node was lost is started again.
+# Number of times that a task is started again after its process or node was lost.
 _RETRIES = 3
-# Tasks sent beyond those that can run at once, so that no processor waits.
+# Number of tasks to submit beyond those that can run at once, so that no processor is idle.
 _SPARE = 2
 _LOOK_S = 0.5
 _ANSWER_S = 4.0
-# HTTP/2's opening words and an empty SETTINGS frame (RFC 9113, 3.4): every Ray port answers them, other ports do not.
+# The HTTP/2 connection preface and an empty SETTINGS frame (RFC 9113, 3.4). Every Ray port replies to it in kind.
 _HELLO = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0])
 
 
 def on_cluster(take: Take, work_and_shared: tuple[Any, Any], address: str, *, threads: int, gpus: float) -> Engine:
-    """Run the jobs that ``take`` gives as tasks of a cluster, as many at a time as it has processors for.
+    """Run the jobs that ``take`` returns as tasks of a cluster, as many at a time as it has processors for.
 
     Args:
-        address: as `ray.init` takes it ("auto", "host:6379", "ray://host:10001"), or "local" to start Ray here.
-        threads: processors that each task asks for, and computes on.
-        gpus: graphics processors that each task asks for.
+        address: an address for `ray.init` ("auto", "host:6379", "ray://host:10001"), or "local" to start Ray here.
+        threads: number of processors that each task requires, and of its threads.
+        gpus: number of graphics processors that each task requires, which may be a fraction.
 
     Raises:
-        MissingExtraError: without Ray. ConfigError: when nothing answers, or no node has what a task asks for.
+        MissingExtraError: without Ray. ConfigError: when the cluster cannot be reached, or no node is large enough.
         PlushSenseError: when a node cannot run PlushSense.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # Means that Ray leaves the graphics processors of a task without any visible, as it does today.
+    # Leave graphics processors visible to tasks that request none, as Ray does by default today.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     ray = need("ray", extra="cluster")
     with _connected(ray, address):
@@ -52,13 +52,13 @@ def on_cluster(take: Take, work_and_shared: tuple[Any, Any], address: str, *, th
 
 @contextmanager
 def _connected(ray: Any, address: str) -> Iterator[None]:
-    """Connect to the cluster during the context; an existing connection is used and kept open."""
+    """Connect to the cluster for the duration of the context; an existing connection is used and left open."""
     if ray.is_initialized():
         yield
         return
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
     if address == "local":
-        # By default Ray takes a third of the memory; about 100 MB for each processor suffice.
+        # By default Ray reserves a third of the memory for objects, far more than needed.
         quiet |= {"include_dashboard": False, "object_store_memory": 200 * 2**20}
     else:
         _knock(address)
@@ -79,7 +79,7 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
 
 
 def _knock(address: str) -> None:
-    """Refuse an address where nothing answers; Ray itself would try for a minute."""
+    """Raise ConfigError if no Ray answers at an address within seconds; Ray itself would try for a minute."""
     if address == "auto" or os.environ.get("RAY_USE_TLS") == "1":
         return
     found = re.fullmatch(r"(?:ray://)?(?:\[([^]]+)\]|([^:/\s\[\]]+)):(\d{1,5})", address)
@@ -91,7 +91,7 @@ def _knock(address: str) -> None:
     try:
         with socket.create_connection((found[1] or found[2], int(found[3])), timeout=_ANSWER_S) as line:
             line.sendall(_HELLO)
-            # The frame's type, behind its length: 4 is SETTINGS.
+            # The fourth byte of a frame is its type, after 3 bytes of length; 4 is SETTINGS.
             answer = line.recv(4)
             if len(answer) < 4 or answer[3] != 4:
                 raise OSError("what answers there is not Ray")
@@ -125,8 +125,8 @@ def _conduct(ray: Any, take: Take, work_and_shared: tuple[Any, Any], threads: in
     if _slots(ray, threads, gpus) == 0:
         resources = f"{threads} processors" + (f" and {gpus:g} graphics processors" if gpus else "")
         raise ConfigError(f"No node of the cluster has {resources}, which each job asks for: give fewer threads.")
-    # Ray's pickle also includes what a script defines itself. It is packed once; each process unpacks it once and may
-    # write to it, as in the pool (an object that Ray unpacks is read-only).
+    # Ray's pickle includes what the user's script defines. Each process unpacks it once, from bytes, so that the arrays
+    # are writable as in the pool; arrays in an object that Ray itself unpacks are read-only.
     packed = ray.put(ray.cloudpickle.dumps(work_and_shared))
     run = secrets.token_hex(8)
     board = ray.remote(_Board).options(num_cpus=0, max_restarts=-1, **_beside(ray)).remote()
@@ -168,7 +168,7 @@ def _conduct(ray: Any, take: Take, work_and_shared: tuple[Any, Any], threads: in
 
 
 def _slots(ray: Any, threads: int, gpus: float) -> int:
-    """Return how many tasks can run at once."""
+    """Return the number of tasks that can run at once."""
     slots = 0
     for node in ray.nodes():
         has = node["Resources"] if node["Alive"] else {}
@@ -178,20 +178,20 @@ def _slots(ray: Any, threads: int, gpus: float) -> int:
 
 
 def _beside(ray: Any) -> dict[str, Any]:
-    """Return the options that place an actor on the driver's node, which the run depends on anyway."""
+    """Return the options that place an actor on the driver's node, without which the run cannot continue anyway."""
     strategy = need("ray.util.scheduling_strategies", extra="cluster").NodeAffinitySchedulingStrategy
     return {"scheduling_strategy": strategy(ray.get_runtime_context().get_node_id(), soft=True)}
 
 
 def _messages(ray: Any, pending: Any, out: dict[Any, Job]) -> Iterator[JobEvent]:
-    """Yield the messages of the jobs since the last call."""
+    """Yield the messages of the jobs since the previous request."""
     try:
         messages = ray.get(pending)
     except ray.exceptions.RayError:
         return
     at = {job.id: job for job in out.values()}
     for job, kind, packed in messages:
-        # A report of a job that has finished in the meantime is dropped.
+        # Ignore the message of a job that has finished in the meantime.
         if job in at:
             with suppress(Exception):
                 yield JobEvent(at[job], kind, pickle.loads(packed))
@@ -216,7 +216,7 @@ def _outcome(ray: Any, ref: Any, job: Job) -> JobEvent:
 
 
 def _unfit(reason: str) -> PlushSenseError:
-    """Return the error for a node that cannot run the task at all."""
+    """Return the error for a node that cannot run any task."""
     missing = re.search(r"No module named '?([\w.]+)", reason)
     if missing:
         return PlushSenseError(
@@ -230,7 +230,7 @@ def _unfit(reason: str) -> PlushSenseError:
 
 
 class _Board:
-    """The messages since the driver's last request: the jobs that started, and the latest report of each job."""
+    """The actor that collects messages between requests of the driver: started jobs, and each job's latest report."""
 
     def __init__(self) -> None:
         self._begun: list[str] = []
@@ -255,7 +255,7 @@ _unpacked: tuple[str, Any, Any] | None = None
 
 
 def _task(run: str, expected: str, packed: list[Any], board: Any, job: str, task: Any) -> tuple[str, bytes]:
-    """Run one job on a node; return ("done", result), ("failed", exception) or ("lost", why no job can run here)."""
+    """Run one job on a node; return ("done", result), ("failed", exception) or, if no job can run, ("lost", error)."""
     global _unpacked
     ray = need("ray", extra="cluster")
     if expected != _version():

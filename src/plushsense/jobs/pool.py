@@ -1,7 +1,7 @@
-"""Run jobs in several processes of this machine, spawned alike on every system.
+"""Run jobs in several processes of this machine, which are spawned on every operating system.
 
-A worker writes its result to the journal before it reports it, so that a run killed at any moment can be continued. A
-worker whose parent has ended ends at its next message. One that dies is replaced, and its job is tried again.
+A worker saves its result in the journal before it reports it, so that a run killed at any moment can be continued. If
+the parent process ends, a worker ends at its next message. A worker that dies is replaced, and its job started again.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from plushsense.jobs.journal import (
 
 __all__ = ["Job", "JobWork", "Report", "run_jobs"]
 
-# Number of times that a job is started if its worker dies.
+# Number of times that a job is started in all if its worker dies.
 _TRIES = 2
 
 
@@ -57,14 +57,16 @@ def run_jobs(
     on_done: Callable[[Job, Result, bool], None] | None = None,
     on_failed: Callable[[Job, Exception], None] | None = None,
 ) -> dict[str, Result]:
-    """Run every job that the journal does not hold yet. Every callback is called in the caller's thread.
+    """Run all jobs whose results are not in the journal yet. All callbacks are called in the caller's thread.
 
     Args:
+        work: called as ``work(shared, task, report)`` for each job; picklable unless it runs in this process.
         shared: passed to every job, and sent to each process once. A job must not change it.
-        workers: processes at a time; 1 runs the jobs in this process. A cluster runs as many as it has processors for.
-        threads: number for each process; has no effect on this one (``workers=1``).
+        workers: number of processes; 1 runs the jobs in this process. A cluster uses all of its processors instead.
+        threads: number of threads of each process; has no effect on this one (``workers=1``).
+        journal: stores the results; jobs that are in it are not run.
         cluster: run the jobs as Ray tasks: "auto", "host:6379", "ray://host:10001", or "local" to start Ray here.
-        gpus: share of a graphics processor that each job of a cluster takes.
+        gpus: number of graphics processors for each job of a cluster, which may be a fraction.
         on_start: called with each job that starts; twice if its process or node was lost.
         on_report: called with (job, message of its work); a cluster may leave out messages.
         on_done: called with (job, result, whether it came from the journal), in the order of completion.
@@ -102,11 +104,11 @@ def run_jobs(
         elif workers == 1:
             engine = _here(left.take, work, shared, on_report)
         else:
-            # Also for a single job, whose result may depend on the number of threads.
+            # Use a process even for a single job, as its result may depend on the number of threads.
             setup = pickle.dumps((work, shared, journal))
             engine = in_processes(left.take, setup, min(workers, len(left.jobs)), threads)
         saved = cluster is None and workers > 1
-        # Closed explicitly, as an engine ends its processes then.
+        # Close the engine explicitly, which ends its processes.
         with closing(engine):  # type: ignore[type-var]
             for job, kind, what in engine:
                 if kind == "started" and on_start is not None:
@@ -144,7 +146,7 @@ def _here(take: Take, work: JobWork, shared: Any, on_report: Callable[[Job, Any]
 
 
 class _Left:
-    """The jobs that have not been started, and the claims on those that have."""
+    """The jobs that have not been started, and the journal's claims on those that have."""
 
     def __init__(
         self,
@@ -163,7 +165,7 @@ class _Left:
                 self.jobs.append(job)
 
     def take(self) -> Job | None:
-        """Return the next job that is neither done nor claimed, or else one that another process has claimed."""
+        """Return the next job that is neither done nor claimed; if there is none, one that another process claimed."""
         elsewhere: deque[Job] = deque()
         try:
             while self.jobs:
@@ -182,7 +184,7 @@ class _Left:
                 return job
             while elsewhere:
                 job = elsewhere.popleft()
-                # Do not wait for the other process: it may take long or stop, and the result is the same.
+                # Run the job here too instead of waiting: the other process may be slow or stop.
                 if not self._found(job):
                     return job
             return None
@@ -208,7 +210,7 @@ class _Left:
 
 @dataclass
 class _Worker:
-    """A process, the pipe to it, and its current job; ``ready`` once it has read the shared data."""
+    """A process, the pipe to it, and its current job; ``ready`` after it has received the shared data."""
 
     process: BaseProcess
     pipe: Connection
@@ -217,13 +219,13 @@ class _Worker:
 
 
 def in_processes(take: Take, setup: bytes, workers: int, threads: int) -> Engine:
-    """Run the jobs that ``take`` returns in so many processes, each with so many threads.
+    """Run the jobs that ``take`` returns in ``workers`` processes, each with ``threads`` threads.
 
     Args:
         setup: the pickled (work, shared, journal or None).
 
     Raises:
-        PlushSenseError: a worker that dies before it can begin, or a result that cannot be saved.
+        PlushSenseError: when a worker dies before its first job, or a result cannot be saved.
     """
     pool: list[_Worker] = []
     try:
@@ -249,14 +251,14 @@ def _start(threads: int) -> _Worker:
     process = spawn.Process(target=_serve, args=(there,), daemon=True)
     with _inherited(threads):
         process.start()
-    # Close this copy of the worker's end, so that each side notices when the other ends.
+    # Close this process's copy of the worker's end, so that reading fails once the worker has ended.
     there.close()
     return _Worker(process, here)
 
 
 @contextmanager
 def _inherited(threads: int) -> Iterator[None]:
-    """Let processes started in this context inherit their number of threads, and ignore Ctrl-C."""
+    """Make processes that are started in this context use ``threads`` threads and ignore Ctrl-C."""
     settings = thread_settings(threads)
     before = {name: os.environ.get(name) for name in settings}
     # Only the main thread may set a signal's handler.
@@ -307,7 +309,7 @@ def _conduct(pool: list[_Worker], take: Take, setup: bytes, threads: int) -> Eng
                         "than one worker needs the code under  if __name__ == '__main__':"
                     ) from None
                 worker.pipe.close()
-                # In the same place of the pool, so that it is ended with the pool.
+                # Put the new worker into the pool, so that it is ended with the others.
                 pool[pool.index(worker)] = replaced = _start(threads)
                 _send(replaced, setup)
                 if tries[job.id] < _TRIES:
@@ -331,13 +333,13 @@ def _conduct(pool: list[_Worker], take: Take, setup: bytes, threads: int) -> Eng
 
 
 def _send(worker: _Worker, message: Any) -> None:
-    # If the worker has ended, reading from the pipe will show it.
+    # If the worker has ended, the next read from the pipe fails and handles that.
     with suppress(OSError):
         worker.pipe.send(message)
 
 
 def _serve(pipe: Connection) -> None:
-    """Run jobs in a worker until it is sent None or the parent ends."""
+    """Run jobs in a worker process until None is received or the parent ends."""
     # Ctrl-C reaches every process of the terminal; the parent handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     journal: Journal | None

@@ -1,6 +1,6 @@
-"""The recorder, which the terminal or the studio drives by commands, and the preparation of a session from a request.
+"""Recorder with the commands for the terminal and the studio, and preparation of a session from a request.
 
-Commands return at once; their effects are in `plushsense.recording.states`.
+Commands do not wait for their effects, which `plushsense.recording.states` implements.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ _NO_DESCRIPTOR = "Too many files are open on this computer: saving waits until s
 
 
 class Recorder(RecordingMachine):
-    """Record one session. Use it as a context manager; commands may come from any thread.
+    """Recorder of one session. Use it as a context manager; its commands may be called from any thread.
 
     Args:
-        session: its open folder; the recorder closes it.
-        device: the toy; the caller closes it.
-        speed: times real time at which the toy runs. At 1, rows carry the computer's time; at any other speed they
-            carry the toy's time since the start.
-        auto: start and stop recordings automatically.
+        session: the open folder of the session, which the recorder closes.
+        device: the toy, which the caller closes.
+        speed: the speed of the toy as a multiple of real time. At 1, rows have the computer's time; at any other speed
+            they have the start time plus the toy's time since then.
+        auto: settings to start and stop recordings automatically; None to do it by commands.
         software: name and version of the program, for the log and the sidecars.
     """
 
     @classmethod
     def open(cls, folder: Path, device: Device, head: SessionHead | None = None, **options: Any) -> Recorder:
-        """Return a recorder for the session in ``folder``, as `OpenSession`."""
+        """Open the session in ``folder`` as `OpenSession` does, and return its recorder."""
         return cls(OpenSession(folder, head), device, **options)
 
     @property
     def toy_s(self) -> float:
-        """Seconds during which the toy has sent frames, by its own clock."""
+        """Seconds since the first frame by the toy's clock, see `FrameReceiver`."""
         with self._changed:
             return self._receiver.toy_ms / 1000.0
 
@@ -62,7 +62,7 @@ class Recorder(RecordingMachine):
 
     @property
     def begins_ms(self) -> int | None:
-        """The toy's clock at the end of the countdown; None without a countdown, or before the first frame."""
+        """Toy's clock in ms at the end of the running countdown; None if there is none, or before the first frame."""
         with self._changed:
             last = self._receiver.last
             if self._state != "countdown" or last is None:
@@ -71,7 +71,7 @@ class Recorder(RecordingMachine):
 
     @property
     def gaps(self) -> list[dict[str, Any]]:
-        """Gaps of the stream since this recorder began, as in the sidecars; ``after_row`` counts the stream's rows."""
+        """Gaps since this recorder started, as in the sidecars, but with ``after_row`` in rows of the stream."""
         with self._changed:
             return list(self._receiver.gaps)
 
@@ -81,9 +81,9 @@ class Recorder(RecordingMachine):
             return self._changed.wait_for(lambda: self._state in (*states, "stopped"), timeout_s)
 
     def start(self) -> None:
-        """Begin to read frames; raise DatasetError when the stream cannot be opened.
+        """Start reading frames; raise DatasetError if the stream's file cannot be opened.
 
-        Nothing is recorded before the first `space`.
+        No recording begins before the first `space`, unless it is automatic.
         """
         try:
             stream = StreamFile(self.session.folder / STREAM_NAME, self.session.layout)
@@ -110,7 +110,7 @@ class Recorder(RecordingMachine):
         self._reader.start()
 
     def space(self) -> None:
-        """Start the countdown, cancel it, or stop the recording, though not within the protocol's shortest_s."""
+        """Start the countdown, cancel it, or stop the recording if it has lasted the protocol's ``shortest_s``."""
         with self._notifying():
             if self._state == "idle":
                 if self._receiver.quality().signal == "unreadable":
@@ -133,7 +133,7 @@ class Recorder(RecordingMachine):
                 self._show_message("Paused: resume first (p).")
 
     def redo(self, why: str = "") -> None:
-        """Repeat the last recording, or the current one; the existing file is kept as discarded."""
+        """Record again: stop the running recording, or else discard the last one, whose file is kept."""
         with self._notifying():
             if self._state == "countdown":
                 self._cancel("The countdown was cancelled.")
@@ -150,7 +150,7 @@ class Recorder(RecordingMachine):
                 self._ready(f"'{key[0]}', {key[1]}, is to be recorded again; skip (s) keeps the earlier recording.")
 
     def skip(self) -> None:
-        """Skip this step; a recording that was to be repeated is kept."""
+        """Skip this step; if it was to be recorded again, use the earlier recording."""
         with self._notifying():
             if self._state == "countdown":
                 self._cancel("")
@@ -169,7 +169,7 @@ class Recorder(RecordingMachine):
                 self._advance(message)
 
     def go(self, number: int) -> None:
-        """Go to a step by its number from 0; an existing recording is replaced only when the new one is finished."""
+        """Go to the step ``number`` (from 0); its recording, if any, is replaced only when a new one is finished."""
         with self._notifying():
             if self._state == "countdown":
                 self._cancel("")
@@ -188,9 +188,9 @@ class Recorder(RecordingMachine):
         self.go(number)
 
     def pause(self) -> None:
-        """Pause: nothing starts until `resume`; the stream is kept all the while.
+        """Pause: no recording starts until `resume`, but the stream is still written.
 
-        A recording that is running is abandoned: its rows are in the stream only, and `resume` asks for it again.
+        A running recording is abandoned: its rows are in the stream only, and its step is to be recorded again.
         """
         with self._notifying():
             if self._state == "countdown":
@@ -223,12 +223,12 @@ class Recorder(RecordingMachine):
                 self._show_message("Note saved.")
 
     def show_message(self, text: str) -> None:
-        """Show a sentence on every display."""
+        """Show a message on every display."""
         with self._notifying():
             self._show_message(text)
 
     def close(self) -> None:
-        """Close the session: abandon a running recording and write everything else. Closing twice is harmless."""
+        """Close the session: abandon a running recording and write all other data. Closing twice is harmless."""
         with self._notifying():
             if self._state == "countdown":
                 self._cancel("")
@@ -261,17 +261,17 @@ _SIMULATED = "virtual"
 
 
 def open_toy(url: str, layout: Layout | str | None = None) -> Device:
-    """Open a toy by its URL as `open_device`; when it is disconnected later, wait for it and record the gap."""
+    """Open a toy by its URL with `open_device`; if it is disconnected later, wait for it and record the gap."""
     return open_device(url, layout, reconnect=True)
 
 
 def is_virtual(url: str) -> bool:
-    """Return whether a URL opens the virtual toy in this process."""
+    """Return whether a URL opens a virtual toy in this process."""
     return parse_url(url).scheme == _SIMULATED
 
 
 def with_speed(url: str, speed: float) -> str:
-    """Return the URL of a virtual or replayed toy with this speed, unless it names one itself."""
+    """Return ``url`` with ``speed`` if it is of a virtual or replayed toy and has no speed, else unchanged."""
     address = parse_url(url)
     if address.scheme not in (_SIMULATED, "replay") or "speed" in address.query:
         return url
@@ -285,9 +285,9 @@ def speed_of(url: str) -> float:
 
 
 def prompt_virtual(recorder: Recorder) -> None:
-    """Make the person of a virtual toy perform the requested gestures when they are recorded.
+    """Let the simulated person of a virtual toy perform each requested gesture when it is recorded.
 
-    It has no effect on any other toy. Call it before the recorder starts.
+    This has no effect on other toys. Call it before the recorder starts.
     """
     inner = getattr(recorder.device, "inner", recorder.device)
     if not isinstance(inner, VirtualDevice):
@@ -308,12 +308,12 @@ FASTEST = 1000.0
 
 @dataclass(frozen=True)
 class SessionRequest:
-    """A request for a recording session, as the terminal and the studio make it.
+    """Request of the terminal or the studio for a recording session.
 
-    ``device`` is the toy's URL, ``subject`` a code ("" for a protocol that is recorded without a person). Without a
-    ``protocol``, ``words`` or ``layout`` a continued session keeps its own, and a new one has `PROTOCOL`, its default
-    wording, and the layout of the URL or plush-15. The toy runs at ``speed`` times real time. ``simulated``: the toy is
-    a virtual one, although its URL does not say so.
+    ``device`` is the toy's URL, ``subject`` a code ("" for a protocol that is recorded without a person). Without
+    ``protocol``, ``words`` or ``layout``, a continued session keeps its own, and a new one has `PROTOCOL`, its default
+    wording, and the layout of the URL or plush-15. The toy runs at ``speed`` times real time. ``simulated`` marks a
+    virtual toy that cannot be recognised by its URL.
     """
 
     device: str
@@ -329,7 +329,7 @@ class SessionRequest:
 
 
 def check_speed(speed: float) -> float:
-    """Return a speed if it is valid, else raise ConfigError."""
+    """Return ``speed`` if it is valid, else raise ConfigError."""
     if not 0.0 <= speed <= FASTEST:
         raise ConfigError(f"--speed is {speed:g}; 0 (as fast as it can) to {FASTEST:g} is accepted.")
     return speed
@@ -338,14 +338,14 @@ def check_speed(speed: float) -> float:
 def session_folder(
     out: Path, request: SessionRequest, session: str | None = None, new: bool = False
 ) -> tuple[Path, SessionHead | None]:
-    """Return the session's folder in ``out``, and its head if it exists already.
+    """Return the folder of the requested session in ``out``, and its head if it exists.
 
     Args:
-        session: its name; None: the person's last session if it is unfinished, else a new number.
-        new: always begin a new session.
+        session: its name; None for the person's last session if that is unfinished, else for a new number.
+        new: whether to begin a new session in any case.
 
     Raises:
-        ConfigError: without a subject, or when a new session was requested and one of this name exists.
+        ConfigError: if there is no subject, or a new session was requested and one of this name exists.
         DatasetError: for an invalid code or name.
     """
     subject = request.subject
@@ -365,19 +365,19 @@ def session_folder(
 
 
 def session_layout(request: SessionRequest, folder: Path, known: SessionHead | None) -> Layout | str | None:
-    """Return the layout to open the toy with; None leaves it to the URL."""
+    """Return the layout to open the toy with; None for that of the URL."""
     if not request.layout and known is not None:
         return Layout.from_dict(known.layout, f"layout in '{folder}'")
     return request.layout or None
 
 
 def session_head(request: SessionRequest, folder: Path, fresh: bool, layout: Layout, software: str) -> SessionHead:
-    """Return the head of the requested session; settings left out for a continued session are empty.
+    """Return the head of the requested session; for a continued session, settings not requested are empty.
 
     Args:
         fresh: whether the session is new.
-        layout: the open toy's.
-        software: the program that records.
+        layout: the layout of the open toy.
+        software: name and version of the recording program.
     """
     named = request.protocol or (PROTOCOL if fresh else "")
     if not named and request.words:
@@ -399,10 +399,10 @@ def session_head(request: SessionRequest, folder: Path, fresh: bool, layout: Lay
 
 
 def is_pseudo_terminal(request: SessionRequest, head: SessionHead) -> bool:
-    """Return whether the port is a pseudo terminal, possibly of a virtual toy that is not marked as one."""
+    """Return whether the port is a pseudo terminal, possibly of a virtual toy that is not marked ``simulated``."""
     return "/dev/pts/" in request.device and not head.simulated
 
 
 def lacks_consent(head: SessionHead) -> bool:
-    """Return whether a person is recorded without a reference to a signed form."""
+    """Return whether a real session with a person has no reference to a signed consent form."""
     return not (head.consent or head.subject == NOBODY or head.simulated)

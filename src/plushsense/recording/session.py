@@ -37,14 +37,15 @@ _RESERVED = re.compile(r"(?i)con|prn|aux|nul|(com|lpt)\d")
 """Names that Windows reserves."""
 
 Key = tuple[str, int]
-"""A planned recording: its gesture and its repetition."""
+"""Key of a planned recording: its gesture and its repetition."""
 
 
 @dataclass
 class SessionProgress:
-    """The state of a session: the recording of each step, the skipped steps, and repairs after a crash.
+    """State of a session: the recording in use of each step, discarded files, skipped steps, repairs after a crash.
 
-    ``rows``: rows of the stream; ``host_ms``: time of the last one; ``repairs``: sentences for the person.
+    ``rows`` is the number of rows of the stream, ``host_ms`` the time of the last one; ``repairs`` are messages for
+    the user.
     """
 
     takes: dict[Key, str] = field(default_factory=dict)
@@ -57,10 +58,10 @@ class SessionProgress:
 
 
 def check_subject(code: str) -> str:
-    """Return a person's code; refuse one that looks like a name.
+    """Return a person's code if it is valid and does not look like a name.
 
     Raises:
-        DatasetError: for two words, a word without a digit, or more than 16 characters.
+        DatasetError: for a word without a digit, characters other than ``A-Za-z0-9_-``, or more than 16 of them.
     """
     valid = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,15}", code, re.ASCII)
     is_word = len(code) > 2 and not re.search(r"\d", code) and code != NOBODY
@@ -73,7 +74,7 @@ def check_subject(code: str) -> str:
 
 
 def check_session(name: str) -> str:
-    """Return a session's name if it can be a folder name, else raise DatasetError."""
+    """Return the name of a session if it is valid as a folder name, else raise DatasetError."""
     if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}", name, re.ASCII) is None or _RESERVED.fullmatch(name):
         raise DatasetError(
             f"'{name}' is no name for a session: give at most 32 letters and digits, such as 1 or autumn."
@@ -82,9 +83,9 @@ def check_session(name: str) -> str:
 
 
 def session_names(person: Path) -> list[str]:
-    """Return the sessions in a person's folder, in the order in which they were begun.
+    """Return the sessions in a person's folder, in the order of their start.
 
-    Numeric names are sorted by number, since the clock of a computer without a clock battery may be wrong.
+    If all names are numbers, sort by number, since the clock of a computer without a clock battery may be wrong.
     """
     folders = sorted(person.iterdir()) if person.is_dir() else []
     heads = [(head.started_ms, f.name) for f in folders if f.is_dir() and (head := SessionHead.read(f)) is not None]
@@ -94,7 +95,7 @@ def session_names(person: Path) -> list[str]:
 
 
 def is_finished(folder: Path) -> bool:
-    """Return whether the session in ``folder`` was completed."""
+    """Return whether the session in ``folder`` was completed, and no step was reopened since."""
     finished = False
     for event in read_events(folder):
         finished = event.what == "finished" or (finished and event.what not in ("redo", "go"))
@@ -116,13 +117,13 @@ def new_session(person: Path, prefix: str = "") -> str:
 
 
 class OpenSession:
-    """A session's folder, locked by this process until it is closed; ``progress`` is its state when it was opened."""
+    """Folder of a session, locked by this process until `close`; ``progress`` is its state when it was opened."""
 
     def __init__(self, folder: Path, head: SessionHead | None = None) -> None:
         """Create the session of ``head`` in ``folder``, or open the existing one.
 
         Raises:
-            DatasetError: when another program has it, ``head`` is of another session, or the disk refuses.
+            DatasetError: if another program uses it, ``head`` contradicts the existing one, or the disk fails.
         """
         self.folder = folder
         try:
@@ -164,7 +165,7 @@ class OpenSession:
         return known if given is None else self._joined(known, given)
 
     def _joined(self, known: SessionHead, given: SessionHead) -> SessionHead:
-        """Return the stored head, completed by what only the new one states; refuse contradictions."""
+        """Return the stored head with values that only ``given`` has; raise DatasetError if they contradict."""
         added: dict[str, Any] = {}
         for key in ("subject", "layout", "protocol", "age_group", "gender", "consent"):
             old, new = getattr(known, key), getattr(given, key)
@@ -195,7 +196,7 @@ class OpenSession:
 
     def _release(self) -> None:
         if self._lock.is_locked:
-            # Unlinked while locked: a process that opened it meanwhile notices and tries again. Windows unlinks it.
+            # Delete it while locked: a process that opened it meanwhile notices and tries again. Windows deletes it.
             if os.name == "posix":
                 with contextlib.suppress(OSError):
                     (self.folder / LOCK).unlink()
@@ -203,7 +204,7 @@ class OpenSession:
 
 
 def _end_torn_line(path: Path) -> None:
-    """End a log line that a crash cut off, so that the next one is separate; readers skip it."""
+    """Add a line end after a line that a crash cut off, so that the next one is separate; readers skip it."""
     if path.is_file() and path.stat().st_size:
         with path.open("rb+") as file:
             file.seek(-1, os.SEEK_END)
@@ -212,7 +213,7 @@ def _end_torn_line(path: Path) -> None:
 
 
 def _repair(folder: Path, layout: Layout, log: LogFile) -> SessionProgress:
-    """Return the progress of a session by its log and files; repair what a crash left and log each repair."""
+    """Return the progress of a session from its log and files; repair damage by a crash, and log each repair."""
     progress = SessionProgress(resumed=(folder / STREAM_NAME).exists() or any(True for _ in read_events(folder)))
     started, made = replay_log(folder, progress)
     _repair_stream(folder / STREAM_NAME, layout, progress, log)
@@ -224,7 +225,7 @@ def _repair(folder: Path, layout: Layout, log: LogFile) -> SessionProgress:
     _repair_takes(folder, progress, log, made)
     for path in sorted(folder.glob(f"*{SIDECAR}")):
         csv = path.with_suffix(".csv")
-        # The sidecar of a recording that was finished once is kept: the recording may come back.
+        # Keep the sidecar of a recording that was finished once, since its file may be restored.
         if path.name != SESSION_HEAD and csv.name not in made and not csv.exists():
             log.write([new_event("mended", file=path.name, how="sidecar without a recording removed")])
             path.unlink()
@@ -235,7 +236,7 @@ def _repair(folder: Path, layout: Layout, log: LogFile) -> SessionProgress:
 
 
 def new_event(what: str, **details: Any) -> SessionEvent:
-    """Return an event of the present moment."""
+    """Return an event with the current time."""
     return SessionEvent(what, now_ms(), details)
 
 
@@ -245,10 +246,10 @@ def _key(more: dict[str, Any]) -> Key | None:
 
 
 def replay_log(folder: Path, progress: SessionProgress) -> tuple[Key | None, dict[str, Key]]:
-    """Update ``progress`` by the events of the log.
+    """Update ``progress`` from the events of the log.
 
     Returns:
-        The recording that was begun and never ended, and the key of every file that was ever finished.
+        The key of a recording that began but did not end (or None), and the key of each file ever finished.
     """
     of: dict[str, Key] = {}
     open_key: Key | None = None
@@ -276,7 +277,7 @@ def replay_log(folder: Path, progress: SessionProgress) -> tuple[Key | None, dic
 
 
 def _repair_stream(path: Path, layout: Layout, progress: SessionProgress, log: LogFile) -> None:
-    """Count the stream's rows; move an incomplete last line to the log, so that the next row is separate."""
+    """Count the rows of the stream; move an incomplete last line to the log, so that the next row is separate."""
     if not path.exists():
         return
     with path.open("rb+") as file:
@@ -312,7 +313,7 @@ def _host_ms(line: bytes, layout: Layout) -> int:
 
 
 def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: dict[str, Key]) -> None:
-    """Check every recording: add one that the log lacks, rename one that is incomplete."""
+    """Check every recording: add those that the log lacks, rename incomplete ones, and drop missing ones."""
     known = {file: key for key, file in progress.takes.items()}
     known |= {file: key for key, files in progress.discarded.items() for file in files}
     for path in sorted(folder.glob("*.csv"), key=lambda p: (n.epoch_ms if (n := parse_name(p.name)) else 0, p.name)):
@@ -331,7 +332,7 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
         if key is not None:
             continue
         if path.name in made:
-            # It was missing, was recorded again, and is back: the newer one is used.
+            # The file was missing, so the step was recorded again, and the file is back: use the newer one.
             key = made[path.name]
             log.write([new_event("redo", file=path.name, gesture=key[0], repetition=key[1], why="made again")])
             progress.discarded.setdefault(key, []).insert(0, path.name)
@@ -359,10 +360,10 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
 
 @dataclass(frozen=True)
 class SessionSummary:
-    """The summary of a session on disk.
+    """Summary of a session on disk.
 
-    ``head`` and ``protocol`` are None where they cannot be read, with ``error`` as the reason; ``done``, ``skipped``
-    and ``steps`` are numbers of steps.
+    ``head`` and ``protocol`` are None if they cannot be read, for the reason ``error``; ``done``, ``skipped`` and
+    ``steps`` are numbers of steps.
     """
 
     folder: Path
@@ -381,7 +382,7 @@ class SessionSummary:
 
 
 def list_sessions(out: Path) -> list[SessionSummary]:
-    """Return all sessions in ``out``, the newest first; unreadable ones are included with the reason."""
+    """Return the summaries of all sessions in ``out``, the newest first, including unreadable ones."""
     sessions = [summarize_session(path.parent) for path in sorted(out.glob(f"*/*/{SESSION_HEAD}"))]
     return sorted(sessions, key=lambda s: -(s.head.started_ms if s.head is not None else 0))
 

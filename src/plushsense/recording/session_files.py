@@ -1,11 +1,11 @@
-"""The files of a session's folder: head, event log, stream and recordings, which survive a crash.
+"""Files of a session's folder: head, event log, stream and recordings, which survive a crash.
 
 session.json                     person, protocol and toy: `SessionHead`, replaced atomically
-session.jsonl                    one `SessionEvent` a line, append-only
-fulldatastream.csv               everything the toy sent, in the format of the authors' recorder
-<label>_<epoch ms>_<rows>.csv    one recording each, and beside it a sidecar of the same name that ends in .json
+session.jsonl                    one `SessionEvent` per line, append-only
+fulldatastream.csv               all frames of the toy, in the format of the authors' recorder
+<label>_<epoch ms>_<rows>.csv    one recording each; beside it a sidecar of the same name that ends in .json
 
-The folder of a person holds one folder a session: ``OUT/<subject>/<session>/``.
+The folder of a person contains one folder for each session: ``OUT/<subject>/<session>/``.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ FORMAT_VERSION = 1
 
 @dataclass(frozen=True)
 class SessionHead:
-    """The description of a session. ``subject`` is a code, never a name; ``protocol`` and ``layout`` are complete.
+    """Description of a session. ``subject`` is a code, never a name; ``protocol`` and ``layout`` are complete.
 
-    ``consent`` is a reference to the signed form, not the form. ``simulated``: the toy was the virtual one.
+    ``consent`` is a reference to the signed form, not the form. ``simulated`` is whether the toy was a virtual one.
     """
 
     subject: str
@@ -67,14 +67,14 @@ class SessionHead:
 
 @dataclass(frozen=True)
 class SessionEvent:
-    """An event of a session: ``what`` in a word, ``at_ms`` by the computer's clock, and its details.
+    """Event of a session: its kind ``what``, the computer's time ``at_ms``, and details.
 
-    ``open`` and ``close`` (a program opened and closed the session), ``countdown`` (``gesture``, ``repetition``,
-    ``countdown_s``), ``start`` (the first row), ``take`` (finished: ``file``, ``gesture``, ``repetition``),
-    ``abandon`` (stopped on purpose, ``why``: redo, pause or quit; its rows are in the stream only), ``unfinished``
-    (stopped by a crash), ``redo`` (``file``: that recording is discarded), ``keep`` (``file``: it is used again),
-    ``skip``, ``go`` (to another step), ``note``, ``pause``, ``resume``, ``gap``, ``mended`` (repaired after a crash),
-    ``failed``, ``finished``. A reader ignores other words.
+    Kinds, with their details: ``open`` and ``close`` (a program opened or closed the session), ``countdown``
+    (``gesture``, ``repetition``, ``countdown_s``), ``start`` (of a recording, with its first row), ``take`` (finished
+    recording: ``file``, ``gesture``, ``repetition``), ``abandon`` (recording stopped on purpose, ``why``: redo, pause
+    or quit; its rows are in the stream only), ``unfinished`` (stopped by a crash), ``redo`` (``file`` is discarded),
+    ``keep`` (``file`` is used again), ``skip``, ``go`` (to another step), ``note``, ``pause``, ``resume``, ``gap``,
+    ``mended`` (repaired after a crash), ``failed``, ``finished``. Readers ignore other kinds.
     """
 
     what: str
@@ -87,7 +87,7 @@ class SessionEvent:
 
 
 def read_events(folder: Path) -> Iterator[SessionEvent]:
-    """Yield the events of the log in ``folder``, in order; skip a line that a crash cut off."""
+    """Yield the events of the log in ``folder``, in order; skip lines that are incomplete because of a crash."""
     try:
         lines = (folder / SESSION_LOG).read_bytes().split(b"\n")
     except FileNotFoundError:
@@ -103,7 +103,7 @@ def read_events(folder: Path) -> Iterator[SessionEvent]:
 
 
 def discarded_recordings(folder: Path) -> dict[str, str]:
-    """Return the discarded recordings of a session, by file name, with the reason."""
+    """Return the reason for each discarded recording of a session, by file name."""
     discarded: dict[str, str] = {}
     for event in read_events(folder):
         file = str(event.details.get("file") or "")

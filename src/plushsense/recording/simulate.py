@@ -1,8 +1,8 @@
-"""Simulate recording sessions with the virtual toy, with the files of the authors' recorder.
+"""Simulate recording sessions with the virtual toy, in the file format of the authors' recorder.
 
-Each person's folder holds ``<label>_<epoch ms>_<rows>.csv`` for each recording and ``fulldatastream.csv`` for the whole
-session, which ends with some handling that is no gesture; recordings of the toy at rest are in the folder ``none``.
-A score on these recordings says nothing about a real toy.
+Each person's folder contains ``<label>_<epoch ms>_<rows>.csv`` for each recording, and ``fulldatastream.csv`` for the
+whole session, which ends with some handling that is no gesture; recordings of the toy at rest are in the folder
+``none``. Results on these recordings do not apply to a real toy.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from plushsense.devices.virtual.stream import channel_columns
 from plushsense.devices.virtual.world import WORLD, World, draw_person
 
 START_MS = 1_760_000_000_000
-"""Time of the first session, milliseconds since 1970: fixed, so that the same seed writes the same files."""
+"""Time of the first session in ms since 1970; fixed, so that the same seed writes the same files."""
 
 HANDLED = 6
-"""Number of times a person handles the toy after the recordings, which is no gesture and in the stream only."""
+"""Number of times a person handles the toy after the recordings; this is no gesture, and only in the stream."""
 
 Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
 class SimulationSummary:
-    """The size of a simulated data set."""
+    """Size of a simulated data set; ``lost`` counts frames."""
 
     folder: str
     people: int
@@ -56,7 +56,7 @@ class SimulationSummary:
 
 @dataclass(frozen=True)
 class _Take:
-    """A simulated session: all received frames, and the rows of each recording."""
+    """Simulated session: all received frames, label and rows of each recording, and the number of lost frames."""
 
     frames: Frames
     cuts: list[tuple[str, int, int]]
@@ -66,7 +66,7 @@ class _Take:
 def _session(
     who: int | None, seed: int, gestures: Sequence[str], repetitions: int, layout: Layout, world: World
 ) -> _Take:
-    """Simulate a session, drop lost lines and add the host's time to the others."""
+    """Simulate a session, with lost frames and the host's time; ``who`` is None for the toy at rest."""
     person = None if who is None else draw_person(who, seed, world)
     session = VirtualSession(person, seed, 0, world)
     episodes = [session.idle(2.0)]
@@ -77,7 +77,7 @@ def _session(
     rng = np.random.default_rng([seed, number, 0xF11E])
     frames, row_of, lost = _receive(episodes, START_MS + order * 86_400_000, True, layout, world, rng)
     if who is not None:
-        # With its own random generator, so that the recordings do not depend on it.
+        # Use another random generator, so that the recordings do not depend on the handling.
         handling = [e for _ in range(HANDLED) for e in (session.handle(), session.idle(2.0))]
         after = int(frames.host_ms[-1]) if frames.host_ms is not None else 0
         own_rng = np.random.default_rng([seed, number, 0xA4D])
@@ -91,13 +91,13 @@ def _session(
 def _receive(
     episodes: Sequence[Episode], host_ms: int, first: bool, layout: Layout, world: World, rng: np.random.Generator
 ) -> tuple[Frames, NDArray[np.int64], int]:
-    """Return the frames received from ``host_ms`` on, the frame of each sent row and of the end, and the number lost.
+    """Return the received frames, for each sent row (and the end) the index among them, and the number of lost frames.
 
-    The ``first`` frames of a session begin at a random time of that day.
+    The frames begin at ``host_ms``; if they are the ``first`` of a session, at a random time of that day.
     """
     values = np.concatenate([e.values for e in episodes])[:, channel_columns(layout)]
     device_ms = np.concatenate([e.device_ms for e in episodes])
-    # The recorder writes the last integer of a line unchanged: the delay for firmware without a clock.
+    # The recorder writes the last integer of a line unchanged, which is a delay for firmware without a clock.
     written = device_ms if DEVICE_MS in layout.wire else np.concatenate([e.delay_ms for e in episodes])
     arrives = rng.random(len(values)) >= world.lost + world.garbled
     begin = host_ms + (int(rng.integers(0, 20_000_000)) if first else 10)
@@ -118,7 +118,7 @@ def _joined(one: Frames, other: Frames) -> Frames:
 
 
 def _write(folder: Path, take: _Take, layout: Layout) -> int:
-    """Write the stream and the recordings of one session; return the rows of the recordings."""
+    """Write the stream and the recordings of one session; return the number of rows of the recordings."""
     folder.mkdir(parents=True, exist_ok=True)
     rows = 0
     host = take.frames.host_ms
@@ -146,20 +146,20 @@ def simulate(
     layout: Layout | str = "plush-15",
     world: World = WORLD,
 ) -> SimulationSummary:
-    """Write a data set shaped like the paper's: 25 people × 17 gestures × 3, and 51 at rest = 1326 recordings.
+    """Write a simulated data set, by default as the paper's: 25 people × 17 gestures × 3, and 51 at rest (1326).
 
     Args:
-        out: a new or empty folder; people become ``P01`` …, nobody ``none``.
-        people, repetitions: the size.
+        out: a new or empty folder; the folders of people are ``P01`` …, that of the toy at rest ``none``.
+        people, repetitions: the number of people, and of recordings of each gesture by each of them.
         seed: the same seed writes the same files.
-        progress: called with sessions done, sessions in all, and the folder just written.
+        progress: called with (sessions done, number of sessions, folder just written).
         at_rest: number of recordings without a person; by default gestures × repetitions, as in the paper.
         gestures: a subset of the 17, in class order.
         layout: the layout of the files: plush-15, plush-14 or accel-3.
 
     Raises:
-        ConfigError: for a size out of range or an unknown gesture.
-        DatasetError: when the folder is not empty.
+        ConfigError: for a number out of range or an unknown gesture.
+        DatasetError: if the folder is not empty.
     """
     labels = tuple(gestures) if gestures is not None else GESTURES
     unknown = [label for label in labels if label not in GESTURES]
@@ -177,7 +177,7 @@ def simulate(
     if resting > 0:
         sessions.append((NOBODY, None))
     recordings = rows = stream_rows = lost = 0
-    # Whole or not at all: an incomplete folder would look like a small data set.
+    # Write the folder completely or not at all: an incomplete one would look like a small data set.
     with new_folder(folder, DatasetError) as work:
         (work / SIMULATION_MARK).write_text(
             f"Recordings of the virtual toy, seed {seed}. Nobody touched anything.\n", "utf-8"

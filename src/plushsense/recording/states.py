@@ -1,9 +1,9 @@
-"""The state machine of a recording session, driven by commands and by the toy's frames.
+"""State machine of a recording session, driven by commands and by the toy's frames.
 
-`plushsense.recording.recorder` adds the commands. One thread reads the toy's frames, the threads of the background
-writer write them; none waits for another. All durations of a session are measured by the toy's own clock, so that a
-virtual toy at twenty times the speed counts down in a twentieth of the time, and a toy that is unplugged during the
-countdown does not start an empty recording.
+`plushsense.recording.recorder` adds the commands. One thread reads the toy's frames, those of the background writer
+write them; at real time the reader never waits for the disk. All durations of a session are measured by the toy's own
+clock, so that a virtual toy at twenty times the speed counts down in a twentieth of the time, and a toy that is
+unplugged during the countdown does not start an empty recording.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ RecorderState = Literal["idle", "countdown", "recording", "saving", "paused", "f
 
 @dataclass(frozen=True)
 class StepResult:
-    """The state of one planned recording.
+    """State of one planned recording.
 
-    ``file`` is the recording in use ("" when there is none yet), ``discarded`` the number of discarded files.
+    ``file`` is the recording in use ("" if there is none), ``discarded`` the number of discarded files.
     """
 
     step: Step
@@ -41,14 +41,15 @@ class StepResult:
 
 @dataclass(frozen=True)
 class RecorderStatus:
-    """A snapshot of a session.
+    """Snapshot of a session.
 
-    ``state`` is "finished" when all steps are recorded or skipped, "stopped" when no more data come or can be written
-    (``failed`` is the reason when the disk is the cause, else ``message``). ``done``, ``skipped`` and ``steps`` are
-    numbers of steps, ``redone`` is that of discarded files, ``existing`` the file of this step if it is recorded, and
-    ``file`` the last finished recording. ``countdown_s`` and ``left_s`` are times left, ``elapsed_s`` that of this
-    recording. ``rate_hz``, ``jitter_ms``, ``signal`` and ``bad_share`` are those of `SignalQuality`; ``away``: the toy
-    is disconnected. ``rows`` are rows of the session's stream; the other counts began with this program.
+    ``state`` is "finished" if all steps are recorded or skipped, "stopped" if no more data can be received or written
+    (the reason is ``failed`` for errors of the disk, else ``message``). ``done``, ``skipped`` and ``steps`` are numbers
+    of steps, ``redone`` is the number of discarded files, ``existing`` the file of the current step if it is recorded,
+    ``file`` the last recording in use. ``countdown_s`` and ``left_s`` are the remaining times of countdown and
+    recording, ``elapsed_s`` is the duration of the recording so far. ``rate_hz``, ``jitter_ms``, ``signal`` and
+    ``bad_share`` are those of `SignalQuality`; ``away`` is whether the toy is disconnected. ``rows`` counts the
+    session's stream; the other counts begin with this program.
     """
 
     state: RecorderState
@@ -82,13 +83,13 @@ class RecorderStatus:
 
     @property
     def bad_share_total(self) -> float:
-        """Share of all lines since this program began that were lost, malformed or out of range, 0 to 1."""
+        """Share of all lines since the start of this program that were lost, malformed or out of range, 0 to 1."""
         bad = self.lost + self.malformed + self.garbage
         return bad / max(1, self.frames + bad)
 
     @property
     def seen(self) -> str:
-        """An identifier of what is displayed: a command given to another display is outdated."""
+        """Identifier of the displayed state, by which a command for an outdated display can be recognised."""
         return f"{self.state}.{self.step.number}.{self.done}.{self.skipped}.{self.redone}"
 
 
@@ -101,13 +102,13 @@ def store_take(
     earlier: str,
     **more: Any,
 ) -> tuple[str, str]:
-    """Write a recording, its sidecar and its line in the log; ``earlier`` is the file that it replaces, or "".
+    """Write a recording, its sidecar and its log entry; ``earlier`` is the file that it replaces, or "".
 
     Returns:
-        The file's name, and a message for the person, or "".
+        The name of the file, and a message for the user, or "".
 
     Raises:
-        OSError: when the files cannot be written; no partial file is left.
+        OSError: if the files cannot be written; no partial file is left.
     """
     layout, step = session.layout, take.step
     frames = to_frames(take.frames, layout.n_channels)
@@ -131,7 +132,7 @@ def store_take(
 
 
 def write_error(session: OpenSession, recordings: int, cause: Exception) -> DatasetError:
-    """Return the error with which a session stops that cannot be written any more."""
+    """Return the error for a session that stopped because its folder cannot be written any more."""
     why = getattr(cause, "strerror", None) or cause
     remedy = "close other programs" if lacks_descriptor(cause) else "free disk space"
     return DatasetError(
@@ -146,10 +147,10 @@ def key_of(step: Step) -> Key:
 
 
 class PlanProgress:
-    """The steps of a session, in order, and the recordings made of each.
+    """Steps of a session in their order, and the recordings of each.
 
-    ``takes`` is the file in use of each step, the newest last; ``discarded`` are the other files of a step, and ``at``
-    is the number of the current step.
+    ``takes`` maps a step to its file in use, the newest last; ``discarded`` maps it to its other files. ``at`` is the
+    number of the current step.
     """
 
     def __init__(self, steps: tuple[Step, ...], progress: SessionProgress) -> None:
@@ -167,12 +168,12 @@ class PlanProgress:
 
     @property
     def last(self) -> Key | None:
-        """The step of the last recording in use; None when there is none, or it is to be recorded again."""
+        """Step of the last recording; None if there is none, or it is to be recorded again."""
         return self._last if self._last in self.takes else None
 
     @property
     def last_file(self) -> str:
-        """The file of the last recording in use; "" when there is none."""
+        """File of the last recording; "" if there is none, or it is to be recorded again."""
         return self.takes[self.last] if self.last is not None else ""
 
     @property
@@ -184,25 +185,25 @@ class PlanProgress:
         return next((s for s in order if key_of(s) not in self.takes and key_of(s) not in self.skipped), None)
 
     def next_step(self) -> Step | None:
-        """Return the step to record after the current one; None when it is the last."""
+        """Return the next step to record after the current one; None if no other is left."""
         return self._left(self.steps[self.at + 1 :] + self.steps[: self.at])
 
     def advance(self, from_start: bool = False) -> bool:
-        """Go to the next step to record, wrapping around at the end; return False when none is left."""
+        """Go to the next step to record, wrapping around at the end; return False if none is left."""
         at = 0 if from_start else self.at + 1
         left = self._left(self.steps[at:] + self.steps[:at])
         self.at = left.number if left is not None else len(self.steps) - 1
         return left is not None
 
     def discard(self, key: Key) -> str:
-        """Discard the recording of a step, so that it is recorded again; return its file."""
+        """Discard the recording of a step and go to that step, to record it again; return the file."""
         file = self.takes.pop(key)
         self.discarded.setdefault(key, []).append(file)
         self.at = next(s.number for s in self.steps if key_of(s) == key)
         return file
 
     def keep(self, key: Key) -> str:
-        """Use the newest discarded file of a step again; return it, or "" when there is none or another is used."""
+        """Use the newest discarded file of a step again; return it, or "" if there is none or another file is used."""
         if key in self.takes or not self.discarded.get(key):
             return ""
         file = self.takes[key] = self.discarded[key].pop()
@@ -224,16 +225,16 @@ Listener = Callable[[str, RecorderStatus], None]
 
 @dataclass(frozen=True)
 class AutoRecording:
-    """Automatic recording: start ``rest_s`` after the recorder is ready, stop ``take_s`` after a recording began."""
+    """Automatic recording: begin a countdown ``rest_s`` after the recorder is ready, and record for ``take_s``."""
 
     take_s: float = 5.0
     rest_s: float = 1.0
 
 
 class RecordingMachine:
-    """The state machine of a session; `Recorder` adds the commands and describes the arguments.
+    """State machine of a session; `Recorder` adds the commands and documents the arguments.
 
-    ``over`` states why the toy sends no more data; "" while it may.
+    ``over`` is the reason why the toy sends no more data; "" while it may send some.
     """
 
     def __init__(
@@ -270,7 +271,7 @@ class RecordingMachine:
         self._reader = threading.Thread(target=self._read, name="plushsense-reader", daemon=True)
 
     def subscribe(self, listener: Listener) -> None:
-        """Call ``listener(what, status)`` at every change, in the thread that made it; the listener must not block."""
+        """Call ``listener(what, status)`` at every change, in the thread that caused it; it must not block."""
         self._listeners.append(listener)
 
     def status(self) -> RecorderStatus:
@@ -310,14 +311,14 @@ class RecordingMachine:
 
     @contextlib.contextmanager
     def _notifying(self) -> Iterator[None]:
-        """Hold the lock; notify the listeners after its release, so that they may give commands."""
+        """Hold the lock, and notify the listeners after releasing it, so that they may give commands."""
         with self._changed:
             yield
         with self._changed:
             changes, self._changes = self._changes, []
         for what in changes:
             for listener in tuple(self._listeners):
-                # A listener that fails must not end a recording.
+                # An error in a listener must not end a recording.
                 with contextlib.suppress(Exception):
                     listener(what, self.status())
 
@@ -337,7 +338,7 @@ class RecordingMachine:
 
     def _enter(self, state: RecorderState, message: str) -> None:
         if self._failed:
-            # Also when a recording was still being saved while writing the stream failed.
+            # The stream may have failed while a recording was still being saved.
             state, message = "stopped", self._failed
         self._state = state
         self._since_ms = self._receiver.toy_ms
@@ -349,11 +350,11 @@ class RecordingMachine:
         return time.monotonic() - self._take.from_s if self._take is not None else 0.0
 
     def _passed_s(self) -> float:
-        """Seconds since the state was entered, by the toy's clock."""
+        """Return the seconds since the state was entered, by the toy's clock."""
         return (self._receiver.toy_ms - self._since_ms) / 1000.0
 
     def _advance(self, message: str = "", from_start: bool = False) -> None:
-        """Go to the next step to record, or to the end."""
+        """Go to the next step to record; finish the session if none is left."""
         if self._plan.advance(from_start):
             self._ready(message)
         else:
@@ -386,7 +387,7 @@ class RecordingMachine:
     def _stop(self, ended: Ended) -> None:
         take = self._take
         assert take is not None
-        # A recording that a frame has ended has its gap, if any, already.
+        # If a frame ended the recording, the gap before it has been added already.
         waiting = self._receiver.away or (self._speed == 1.0 and self._receiver.silent)
         if waiting and ended in ("space", "toy"):
             silent_ms = self._receiver.silent_ms
@@ -399,7 +400,7 @@ class RecordingMachine:
             self._writer.submit(lambda: self._save(take, ended, counters))
 
     def _read(self) -> None:
-        """Process frames as they come, in the reader's thread, independently of display and disk."""
+        """Process frames as they arrive, in the reader's thread, independently of the display."""
         over = "The toy's data have ended."
         try:
             while not self._closing:
@@ -429,7 +430,7 @@ class RecordingMachine:
                 self._enter("stopped", over)
 
     def _receive(self, frame: Frame) -> None:
-        """Process one frame."""
+        """Process one frame: detect gaps, begin and end recordings, and keep the frame for the writer."""
         row = self._receiver.rows
         frame, missing, gap = self._receiver.receive(frame)
         if gap is not None:
@@ -453,13 +454,13 @@ class RecordingMachine:
             self._begin()
 
     def _flush(self) -> None:
-        """Pass the received frames to the background writer, before anything that must be written after them."""
+        """Pass the received frames to the background writer; call this before anything to be written after them."""
         if self._writer is not None and self._received:
             self._writer.add_frames(self._received, self._receiver.toy_ms)
         self._received = []
 
     def _gap(self, gap: dict[str, Any]) -> None:
-        """Store a gap of the stream with the session and the recording, and report it."""
+        """Log a gap of the stream, add it to a running recording, and show a message if it is long."""
         (self._log_step if self._take is not None else self._log)("gap", **gap)
         if self._take is not None:
             self._take.gaps.append(gap | {"after_row": len(self._take.frames)})
@@ -473,7 +474,7 @@ class RecordingMachine:
                 self._show_message(f"{message}.")
 
     def _save(self, take: RecordingTake, ended: Ended, counters: Counters) -> None:
-        """Save one recording (in the background writer's thread), then go to the next step."""
+        """Save a recording and go to the next step; runs in a thread of the background writer."""
         key = key_of(take.step)
         with self._changed:
             saved_ms = self._receiver.now_ms()

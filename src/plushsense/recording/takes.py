@@ -34,10 +34,10 @@ SIGNAL = {
 
 @dataclass(frozen=True)
 class SignalQuality:
-    """The signal quality of the last seconds.
+    """Signal quality of the last seconds.
 
-    ``rate_hz`` in frames a second; ``jitter_ms`` is the standard deviation of the time between frames, ``signal`` a
-    key of `SIGNAL`, ``bad_share`` the share of lines that were lost, malformed or out of range.
+    ``rate_hz`` is the frame rate, ``jitter_ms`` the standard deviation of the time between frames, ``signal`` a key of
+    `SIGNAL`, ``bad_share`` the share of lines that were lost, malformed or out of range, 0 to 1.
     """
 
     rate_hz: float = 0.0
@@ -47,18 +47,18 @@ class SignalQuality:
 
 
 class SignalMonitor:
-    """Measure rate, jitter and losses of a stream of frames."""
+    """Monitor that measures rate, jitter and losses of a stream of frames."""
 
     def __init__(self, layout: Layout, silent_s: float = SILENT_S) -> None:
         self._rate_hz = layout.rate_hz
         self._silent_s = silent_s
-        # Limited by count, too: a clock that stands still never leaves the time span.
+        # Limit the count too, since with a clock that stands still no frame ever leaves the time span.
         self._clock: deque[int] = deque(maxlen=max(64, round(2 * layout.rate_hz * SPAN_MS / 1000)))
         self._losses: deque[tuple[int, int, int]] = deque(maxlen=_READINGS)
         self._last_read_s = float("-inf")
 
     def push(self, device_ms: int) -> None:
-        """Add a frame; start again after a clock that went back, or after a pause."""
+        """Add the time stamp of a frame; start again if the clock went back, or after a pause."""
         clock = self._clock
         if clock and not 0 <= device_ms - clock[-1] <= SPAN_MS:
             clock.clear()
@@ -68,7 +68,7 @@ class SignalMonitor:
             clock.popleft()
 
     def update_losses(self, counters: Counters, at_s: float) -> None:
-        """Store the counters after a reading at ``at_s`` of a monotonic clock."""
+        """Store the counters after a reading; ``at_s`` is its time by a monotonic clock."""
         self._last_read_s = at_s
         if self._clock:
             now = self._clock[-1]
@@ -77,7 +77,7 @@ class SignalMonitor:
                 self._losses.popleft()
 
     def quality(self, at_s: float, away: bool = False) -> SignalQuality:
-        """Return the signal quality at this moment of the monotonic clock."""
+        """Return the signal quality at the time ``at_s`` of the monotonic clock; none if the toy is ``away``."""
         if away or at_s - self._last_read_s > self._silent_s or len(self._clock) < 3:
             return SignalQuality()
         steps = np.diff(np.array(self._clock))
@@ -92,16 +92,16 @@ class SignalMonitor:
 
 
 Ended = Literal["space", "auto", "longest", "toy", "cut"]
-"""Why a recording ended: the space bar, automatic recording (--auto), the protocol's longest_s, the end of the toy's
-data, or "cut": it was cut from a longer stream afterwards."""
+"""Why a recording ended: the space bar, automatic recording (--auto), the protocol's ``longest_s``, or the end of the
+toy's data; "cut" if it was cut from a longer stream afterwards."""
 
 
 @dataclass
 class RecordingTake:
-    """A recording in progress.
+    """Recording in progress.
 
-    It begins at ``row`` of the session's stream and ``from_s`` of the computer's monotonic clock, with the counters
-    ``before``. ``lost`` frames are missing between its rows; ``gaps`` are `gap_entry`.
+    It begins at ``row`` of the session's stream, at the time ``from_s`` of the computer's monotonic clock; ``before``
+    are the counters at that time. ``lost`` frames are missing between its rows; ``gaps`` are of the form `gap_entry`.
     """
 
     step: Step
@@ -114,7 +114,7 @@ class RecordingTake:
 
 
 def gap_entry(rows: int, last: Frame, now: Frame | None, missing_ms: float, reason: str) -> dict[str, Any]:
-    """Return the description of a gap: rows before it, both clocks before and after it, length and reason."""
+    """Return the description of a gap: number of rows before it, both clocks before and after it, length, reason."""
     return {
         "after_row": rows,
         "device_ms": [last.device_ms, now.device_ms if now else None],
@@ -125,7 +125,7 @@ def gap_entry(rows: int, last: Frame, now: Frame | None, missing_ms: float, reas
 
 
 def measured_rate_hz(device_ms: Any) -> float:
-    """Return the frames per second by the toy's clock, without gaps and resets; 0 when it is unknown."""
+    """Return the frames per second by the toy's clock, without gaps and resets; 0 if unknown."""
     steps = np.diff(device_ms)
     even = steps[(steps >= 0) & (steps <= 1000)]
     return 1000.0 * len(even) / float(even.sum()) if even.sum() > 0 else 0.0
@@ -140,7 +140,7 @@ def sidecar(
     ended: Ended,
     **more: Any,
 ) -> dict[str, Any]:
-    """Return the metadata file of a recording: subject, gesture, clocks, device and transmission faults."""
+    """Return the metadata of a recording for its sidecar: subject, gesture, clocks, device, transmission faults."""
     assert frames.host_ms is not None
     outside = (frames.values < layout.valid_min_int) | (frames.values > layout.valid_max_int)
     step = take.step
@@ -173,14 +173,14 @@ def sidecar(
 
 
 AWAY_S = 1.0
-"""A toy that sends nothing for this long counts as disconnected."""
+"""Seconds without a frame after which the toy counts as disconnected."""
 
 JUMP_MS = 1000
-"""A toy's clock that advances by this much more than the elapsed time was misread or set: the step is not counted."""
+"""If the toy's clock advances by this much more than the elapsed time, it was misread or set: ignore the step."""
 
 
 class ReceivedFrame(NamedTuple):
-    """A frame as it is written to the files, the number of frames missing before it, and the gap if there is one."""
+    """Frame with the times to write, the number of frames missing before it, and the gap before it, if any."""
 
     frame: Frame
     missing: int
@@ -188,11 +188,12 @@ class ReceivedFrame(NamedTuple):
 
 
 class FrameReceiver:
-    """Time-stamp a toy's frames and track its clock, losses and gaps. Not thread-safe: the recorder's lock guards it.
+    """Receiver that time-stamps a toy's frames and tracks its clock, losses and gaps.
 
-    ``toy_ms`` is the time during which the toy has sent frames, by its own clock: gaps count, the time continues when
-    the clock restarts, and an impossible time stamp does not end a countdown or a recording. ``rows`` counts those of
-    the session's stream, ``lost`` the frames that are missing; ``gaps`` have ``after_row`` in rows of the stream.
+    Not thread-safe: the recorder's lock guards it. ``toy_ms`` is the time since the first frame by the toy's clock,
+    including gaps; it continues if the clock restarts, and an impossible time stamp does not end a countdown or a
+    recording. ``rows`` counts the rows of the session's stream, ``lost`` the missing frames; ``after_row`` of ``gaps``
+    is a row of the stream.
     """
 
     def __init__(self, device: Device, layout: Layout, speed: float, rows: int, host_ms: int) -> None:
@@ -215,17 +216,17 @@ class FrameReceiver:
 
     @property
     def away(self) -> bool:
-        """Return whether the connection was lost and is being restored."""
+        """Whether the connection was lost and is being restored."""
         return getattr(self._device, "state", "connected") == "waiting"
 
     @property
     def silent_ms(self) -> float:
-        """Time since the last frame, by the computer's clock."""
+        """Milliseconds since the last frame, by the computer's clock."""
         return 1000.0 * (time.monotonic() - self._last_read_s)
 
     @property
     def silent(self) -> bool:
-        """Return whether no frames arrive now."""
+        """Whether no frames arrive at present."""
         return self.away or self.silent_ms > 1000.0 * AWAY_S
 
     def quality(self) -> SignalQuality:
@@ -266,18 +267,18 @@ class FrameReceiver:
         return ReceivedFrame(frame, missing, gap)
 
     def check_malformed(self) -> None:
-        """Record the time of new malformed lines, which also show that the toy sends something."""
+        """Store the time of new malformed lines, which show that the toy at least sends something."""
         if self._device.counters.malformed != self._malformed:
             self._malformed = self._device.counters.malformed
             self._last_malformed_s = time.monotonic()
 
     def end_reading(self) -> None:
-        """Update time and counters after all frames of a reading."""
+        """Update time and counters; call this after all frames of a reading."""
         self._last_read_s = time.monotonic()
         self._monitor.update_losses(self._device.counters, self._last_read_s)
 
     def _possible_ms(self, on_host: int) -> float:
-        """Return how far the toy's clock can have advanced since the last reading, by the computer's clocks."""
+        """Return the most that the toy's clock can have advanced since the last reading, by the computer's clocks."""
         if not self._real or math.isinf(self._last_read_s):
             return math.inf
         return max(on_host, self.silent_ms)

@@ -1,4 +1,4 @@
-"""The report of evaluations: protocol, scores, people, gestures, confusions, training curves and model cards."""
+"""Write the report of evaluations: protocol, scores, people, gestures, confusions, training curves, model cards."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ def render(
     models: Sequence[Mapping[str, Any]],
     simulated: bool,
 ) -> str:
-    """Return the report as HTML. Every key of the mappings may be missing: the report then prints a dash.
+    """Return the report as HTML. Any key of the mappings may be missing; the report then shows a dash.
 
     Args:
         title: heading of the page.
         dataset: name, subjects, recordings, gestures, streams, layout, licence, hash, warnings (numbers or lists).
-        evaluations: ``Evaluation.to_dict()`` of each; optional ``title`` and ``model`` name it, ``simulated`` and
-            ``dataset`` (name, hash) describe its data.
+        evaluations: ``Evaluation.to_dict()`` of each, optionally with ``title`` and ``model`` as its name, and
+            ``simulated`` and ``dataset`` (name, hash) for its data.
         models: a model card of each (symbol, filters, …, provenance, optional ``title``).
-        simulated: whether the data set is a simulation. A banner is printed if it, an evaluation or a model is
-            simulated.
+        simulated: whether the data set is a simulation. The page has a banner if the data set, an evaluation or a model
+            is simulated.
     """
     named = [
         {
@@ -62,7 +62,7 @@ def render(
         for evaluation in evaluations
     ]
     cards = [_model(model) for model in models]
-    # Where all scores are simulated, the banner is enough; otherwise every simulated row is marked.
+    # If all scores are simulated, the banner is enough; otherwise every simulated row is marked.
     wholly = simulated and all(evaluation["simulated"] for evaluation in named)
     any_simulated = simulated or any(part["simulated"] for part in (*named, *cards))
     return render_page(
@@ -81,7 +81,7 @@ def render(
 
 
 def _evaluation(key: str, evaluation: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the template's values for one evaluation."""
+    """Return the values of one evaluation for the template."""
     nobody = evaluation.get("nobody")
     histories = [history for history in evaluation.get("histories") or () if history]
     return {
@@ -124,7 +124,7 @@ def _model(model: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def comparison_rows(evaluations: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return one row for each evaluation: contexts and scores."""
+    """Return one row for each evaluation with its contexts and scores."""
     rows = []
     for i, evaluation in enumerate(evaluations, start=1):
         recordings, pooled = evaluation.get("by_recording") or {}, evaluation.get("pooled") or {}
@@ -148,7 +148,7 @@ def comparison_rows(evaluations: Sequence[Mapping[str, Any]]) -> list[dict[str, 
 
 
 def metric_table(evaluation: Mapping[str, Any]) -> Table:
-    """Return one row for each metric. The mean over all classes, as in the paper, is always over folds."""
+    """Return one row for each metric. The paper's macro-F1 over all classes is averaged over folds in any split."""
     names = {key: f"{m.title} ({m.note})" if m.note else m.title for key, m in METRICS.items()}
     folds = wording.count_of(evaluation, "folds")
     names["macro_f1_all_classes"] = f"Macro-F1, all classes (as the paper), over {folds}"
@@ -175,7 +175,7 @@ def metric_table(evaluation: Mapping[str, Any]) -> Table:
 
 
 def context_table(evaluation: Mapping[str, Any]) -> Table | None:
-    """Return one row for each kind of context among the scored windows; None where unknown."""
+    """Return one row for each kind of context among the scored windows; None if it is unknown."""
     columns = (
         Column("context", "Context of the window"),
         Column("windows", "Windows", "count"),
@@ -190,7 +190,7 @@ def context_table(evaluation: Mapping[str, Any]) -> Table | None:
 
 
 def deployed_values(evaluation: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the scores of the 8-bit networks, means and a table by person or fold; None where not evaluated."""
+    """Return means of the 8-bit networks' scores and a table by person or fold; None if they were not evaluated."""
     int8 = evaluation.get("int8")
     if not isinstance(int8, Mapping):
         return None
@@ -216,7 +216,7 @@ def deployed_values(evaluation: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def subject_rows(evaluations: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return one row for each person with the scores in each evaluation; dashes where one lacks the person."""
+    """Return one row for each person with the scores in each evaluation, or dashes if it does not have the person."""
     tables = [{str(row.get("subject")): row for row in evaluation.get("subjects") or []} for evaluation in evaluations]
     names = sorted({name for table in tables for name in table}, key=_natural)
     return [
@@ -232,13 +232,13 @@ def subject_rows(evaluations: Sequence[Mapping[str, Any]]) -> list[dict[str, Any
 
 
 def _natural(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Return a sort key that puts P2 before P10."""
+    """Return a sort key for natural order, with P2 before P10."""
     pieces = ("".join(letters) for _, letters in groupby(name, str.isdecimal))
     return tuple((0, int(p), "") if p.isdecimal() else (1, 0, p) for p in pieces)
 
 
 def class_rows(evaluation: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return one row for each gesture: affect, precision, recall, F1, windows."""
+    """Return one row for each gesture with affect, precision, recall, F1 and number of windows."""
     return [
         {
             "label": text(row.get("label")),
@@ -254,7 +254,7 @@ def class_rows(evaluation: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def confusion_rows(confusion: Any) -> dict[str, Any] | None:
-    """Return the rows of a confusion matrix ({labels, counts}) with count, percent and shade; None without one."""
+    """Return a confusion matrix ({labels, counts}) as rows of cells with count, percent and shade; None without one."""
     if not isinstance(confusion, Mapping) or not confusion.get("labels"):
         return None
     labels = [str(label) for label in confusion["labels"]]
@@ -327,7 +327,7 @@ def model_rows(model: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Multiply-accumulates a step", count(model.get("macs_per_step"))),
         ("State on the chip (int8)", count(state, "bytes") if state else DASH),
     ]
-    # The main keys come first; without any hash, the page has a dash for it.
+    # The main keys come first; if there is no hash, the page shows a dash for it.
     hash_key = "data_hash" if "data_hash" in provenance else "dataset_hash"
     first = ["dataset", hash_key, "subjects", "preset", "code_version"]
     others = [key for key in provenance if key not in first and key != "scores"]

@@ -1,6 +1,6 @@
 """Figures that several reports share, their file formats, shades for tables, and labels of points.
 
-Labels are placed here and not by adjustText, which needs SciPy, may leave overlaps and cannot leave a label out.
+This module places labels itself, because adjustText needs SciPy, may leave overlaps and cannot leave a label out.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.transforms import Bbox
 
-# Okabe and Ito's blue and vermillion, told apart with any colour vision; the line style says the same.
+# Okabe and Ito's blue and vermillion, which colour-blind readers can distinguish; line styles differ as well.
 _TRAIN, _VALIDATION = ("#0072b2", "-", "training"), ("#d55e00", "--", "validation")
 _CELL_IN = 0.36
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure of that size in inches, outside pyplot: no window opens and no global list keeps it."""
+    """Return an empty figure of a size in inches, without pyplot, which would open a window and keep a reference."""
     figure: Figure = need("matplotlib.figure", "reports").Figure(figsize=(width, height), layout="constrained")
     return figure
 
 
 def confusion(labels: Sequence[str], counts: Any, *, title: str = "") -> Figure:
-    """Draw a confusion matrix as a heat map: shade is the share of the truth's row, framed cells are right.
+    """Draw a confusion matrix as a heat map. The shade is the share in the row; frames mark correct predictions.
 
     Args:
         labels: K class names in class order.
-        counts: (K, K) windows, truth in rows, prediction in columns.
+        counts: (K, K) numbers of windows, true classes in rows, predicted ones in columns.
         title: written above; may be empty.
 
     Raises:
@@ -74,7 +74,7 @@ def confusion(labels: Sequence[str], counts: Any, *, title: str = "") -> Figure:
             if table[i, j]:
                 axes.text(j, i, str(int(table[i, j])), ha="center", va="center", color=ink, fontsize=size, zorder=3)
     axes.set(xlim=(-0.5, k - 0.5), ylim=(k - 0.5, -0.5), xlabel="Read as", ylabel="Truth", aspect="equal")
-    # A label is a person's own text: a "$" in it is no formula.
+    # Labels are user text, in which "$" must not start a formula.
     axes.set_xticks(range(k), labels, rotation=90, parse_math=False)
     axes.set_yticks(range(k), labels, parse_math=False)
     axes.tick_params(length=0, labelsize=9)
@@ -89,10 +89,10 @@ def training_curves(histories: Sequence[Sequence[Mapping[str, Any]]], *, title: 
     """Draw loss and accuracy by epoch: thin lines for folds, a thick one for the mean of the folds still training.
 
     Args:
-        histories: a list of epochs for each fold; an epoch holds epoch, train_loss, train_accuracy,
+        histories: a list of epochs for each fold; an epoch is a mapping with epoch, train_loss, train_accuracy,
             validation_loss, validation_accuracy (any may be missing or None).
         title: written above; may be empty.
-        of: what a history is one of, for the legend.
+        of: plural noun for the histories in the legend.
     """
     figure = new_figure(9.2, 3.4)
     left, right = figure.subplots(1, 2)
@@ -123,14 +123,14 @@ def training_curves(histories: Sequence[Sequence[Mapping[str, Any]]], *, title: 
 
 
 def _curve(history: Sequence[Mapping[str, Any]], key: str) -> tuple[Any, Any]:
-    """Return epochs and finite values of one fold."""
+    """Return the epochs and the values of ``key`` in one fold, without values that are missing or not finite."""
     points = [(epoch.get("epoch", i + 1), epoch[key]) for i, epoch in enumerate(history) if epoch.get(key) is not None]
     table = np.asarray([point for point in points if np.isfinite(point[1])], dtype=float).reshape(-1, 2)
     return table[:, 0], table[:, 1]
 
 
 def _mean(lines: Sequence[tuple[Any, Any]]) -> tuple[Any, Any]:
-    """Return the mean over the folds up to where half of them still train: a mean of a few would mislead."""
+    """Return the epochs that at least half of the folds have, and the means there; a mean of fewer would mislead."""
     epochs = np.unique(np.concatenate([line[0] for line in lines]))
     table = np.full((len(lines), epochs.size), np.nan)
     for row, (at, values) in zip(table, lines, strict=True):
@@ -140,7 +140,7 @@ def _mean(lines: Sequence[tuple[Any, Any]]) -> tuple[Any, Any]:
 
 
 def svg(figure: Figure) -> bytes:
-    """Return a figure as SVG with letters as outlines, so that it needs no font; equal data give equal bytes."""
+    """Return a figure as SVG with text as outlines, so that it needs no font; equal data give equal bytes."""
     with need("matplotlib", "reports").rc_context({"svg.fonttype": "path", "svg.hashsalt": "plushsense"}):
         return _saved(figure, format="svg", metadata={"Date": None, "Creator": None})
 
@@ -151,7 +151,7 @@ def png(figure: Figure, dpi: int = 90) -> bytes:
 
 
 def data_uri(figure: Figure) -> str:
-    """Return a figure as the data URI of its SVG, to embed in a page."""
+    """Return a figure as a data URI of its SVG, for embedding in a page."""
     return svg_uri(svg(figure))
 
 
@@ -163,19 +163,19 @@ def svg_uri(content: bytes) -> str:
 def _saved(figure: Figure, **options: Any) -> bytes:
     out = io.BytesIO()
     with warnings.catch_warnings():
-        # A letter that the font lacks is drawn as a box; the user cannot act on the warning.
+        # A character that is not in the font is drawn as a box; the user can do nothing about the warning.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         figure.savefig(out, **options)
     return out.getvalue()
 
 
-# The ends of a single-hue scale (ColorBrewer "Blues"): lightness alone carries the order, so it prints in
-# grey and reads with any colour vision. The count in each cell says the same in figures.
+# The ends of a single-hue scale (ColorBrewer "Blues"), whose order is that of lightness, so that it works in grey and
+# with any colour vision. Cells also show the count.
 _LIGHT, _DARK = (247, 251, 255), (8, 64, 129)
 
 
 def shade(share: float) -> tuple[str, str]:
-    """Return background and text colour (CSS) for a share of 0 to 1; their contrast is at least 4.5 : 1."""
+    """Return background and text colour (CSS) for a share from 0 to 1, with a contrast of at least 4.5 : 1."""
     share = min(max(share, 0.0), 1.0)
     rgb = tuple(round(a + (b - a) * share) for a, b in zip(_LIGHT, _DARK, strict=True))
     ink = "#ffffff" if _contrast(rgb, (255, 255, 255)) > _contrast(rgb, (0, 0, 0)) else "#000000"
@@ -194,7 +194,7 @@ def _luminance(rgb: Sequence[int]) -> float:
 
 
 def row_shares(counts: NDArray[Any]) -> NDArray[np.float64]:
-    """Return each row of a confusion matrix (K, K) as shares of its truth; a row without windows stays zero."""
+    """Divide each row of a confusion matrix (K, K) by its sum; a row without windows stays zero."""
     table = np.asarray(counts, dtype=np.float64)
     totals = table.sum(axis=1, keepdims=True)
     shares = np.zeros_like(table)
@@ -211,7 +211,7 @@ _GAP_PT = 2.5
 
 @dataclass(frozen=True)
 class LabelledPoint:
-    """A point in data coordinates; one without a label is only not to be covered."""
+    """A point in data coordinates with its label, or "" if it has none but must not be covered by others."""
 
     x: float
     y: float
@@ -226,10 +226,10 @@ def place_labels(
     avoid: Sequence[tuple[float, float, float, float]] = (),
     size: float = 7.5,
 ) -> None:
-    """Write labels beside their points, at the nearest place that covers neither a point nor a label.
+    """Write labels beside their points, each at the nearest place where it covers neither a point nor a label.
 
-    A thin line connects a distant label with its point. A label without a free place is left out; the table beside the
-    figure contains it.
+    A thin line connects a distant label with its point. A label for which there is no free place is left out; the table
+    beside the figure contains it.
 
     Args:
         avoid: straight lines in data coordinates (left, bottom, right, top) that no label may cover.
@@ -237,7 +237,7 @@ def place_labels(
     """
     from matplotlib.transforms import Bbox
 
-    # Positions in pixels are known only after the layout.
+    # Compute the layout, which determines the positions in pixels.
     figure.draw_without_rendering()
     pixel = figure.dpi / 72
     at = axes.transData.transform([(p.x, p.y) for p in points]) if points else np.empty((0, 2))
@@ -289,7 +289,7 @@ def place_labels(
 def _free_box(
     x: float, y: float, width: float, height: float, distance: float, taken: Sequence[Bbox], inside: Bbox
 ) -> Bbox | None:
-    """Return the first free box at a distance from a point; horizontal and vertical directions come first."""
+    """Return the first free box at a distance from a point, or None; the horizontal and vertical are tried first."""
     from matplotlib.transforms import Bbox
 
     for dx, dy in sorted(_DIRECTIONS, key=lambda d: min(abs(d[0]), abs(d[1]))):

@@ -14,17 +14,17 @@ from plushsense.core.templates import fill_html
 
 ENDINGS = (".html", ".htm")
 _PACKAGE = "plushsense.reports"
-# The base template contains it; only a file that contains it is replaced by a report.
+# Tag that the base template contains; an existing file is replaced only if it has this tag.
 GENERATOR = '<meta name="generator" content="PlushSense">'
 _HEAD_BYTES = 4096
 
 
 def render_page(template: str, **values: Any) -> str:
-    """Return a page in the style of all pages; texts are escaped.
+    """Render a page in the common style; texts are escaped.
 
     Args:
         template: file name of a template of this package, which extends ``base.html.j2``.
-        values: ``title`` and ``simulated`` are required; ``made`` is by default the present time.
+        values: for the template; ``title`` and ``simulated`` are required, ``made`` defaults to the current time.
     """
     from markupsafe import Markup
 
@@ -34,7 +34,7 @@ def render_page(template: str, **values: Any) -> str:
 
 
 def check_page_path(path: str | Path) -> Path:
-    """Return the path if a report can be written there: a new .html file, or an earlier report to replace.
+    """Check that a report can be written to a path, as a new .html or .htm file or over an earlier report; return it.
 
     Raises:
         ConfigError: for another ending, a folder, or a file that is not a report of PlushSense.

@@ -1,4 +1,4 @@
-"""Write the report of a check: a summary, overlays of each gesture's recordings, and plots of findings."""
+"""Write the report of a data check: a summary, plots of findings, and overlays of each gesture's recordings."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NAMED = 12
 PLOTS = 12
 """Maximum number of plots for each check."""
 PICTURE_BYTES = 10_000_000
-"""Maximum size of all pictures of a page; as text they take a third more."""
+"""Maximum size in bytes of all pictures of a page; base64 makes them a third larger."""
 _NAMED_CHECKS = ("never-stopped", "duration", "no-onset", "several-gestures", "stuck", "flat")
 _CLOCK_CHECKS = ("clock-reset", "gaps", "lost-frames", "jitter", "resumed", "rate")
 _SIGNAL_CHECKS = (
@@ -45,7 +45,7 @@ _SEVERITY = {"error": "to decide", "warning": "to look at", "info": "good to kno
 
 
 def scale_of(dataset: Dataset, sample: int = 200) -> NDArray[np.float64]:
-    """Return the typical spread of each channel within a recording, (C,), from a sample of the recordings."""
+    """Return the typical spread of each channel within a recording, (C,), from about ``sample`` recordings."""
     used = dataset.used
     sampled = used[:: max(1, len(used) // sample)]
     spreads = [summarize(r, frames, dataset.layout).spread for r in sampled if len(frames := dataset.read(r))]
@@ -54,7 +54,7 @@ def scale_of(dataset: Dataset, sample: int = 200) -> NDArray[np.float64]:
 
 
 def _names(result: CheckReport, gesture: str) -> dict[str, str]:
-    """Return the names, with reasons, of the recordings of a gesture that have findings, the most urgent first."""
+    """Return texts by recording id that name a gesture's recordings with findings and their checks, at most `NAMED`."""
     checks: dict[str, list[str]] = {}
     for f in result.findings:
         if (
@@ -69,7 +69,7 @@ def _names(result: CheckReport, gesture: str) -> dict[str, str]:
 
 
 def gesture_figure(result: CheckReport, gesture: str, scale: NDArray[np.float64] | None = None) -> Figure:
-    """Draw all used recordings of a gesture over each other, and their durations."""
+    """Draw all used recordings of a gesture in one plot, and their durations."""
     dataset = result.dataset
     scale = scale_of(dataset) if scale is None else scale
     names = _names(result, gesture)
@@ -85,7 +85,7 @@ def gesture_figure(result: CheckReport, gesture: str, scale: NDArray[np.float64]
 
 @dataclass
 class _Pictures:
-    """Convert pictures to data URIs up to a total size; ``left_out`` counts the others."""
+    """Converts pictures to data URIs up to a total size of ``limit`` bytes; ``left_out`` counts the others."""
 
     limit: int
     size: int = 0
@@ -103,10 +103,10 @@ class _Pictures:
 
 
 def write_report(path: Path, result: CheckReport, progress: Progress | None = None) -> Path:
-    """Write the page; only an earlier report is replaced.
+    """Write the report of ``result`` as a page; of existing files only an earlier report is replaced.
 
     Raises:
-        ConfigError: when ``path`` is another file, or cannot be written.
+        ConfigError: when ``path`` is a file that is not a report, or cannot be written.
         MissingExtraError: when matplotlib is not installed.
     """
     target = check_page_path(path)
@@ -114,7 +114,7 @@ def write_report(path: Path, result: CheckReport, progress: Progress | None = No
 
 
 def render(result: CheckReport, progress: Progress | None = None) -> str:
-    """Return the page as HTML."""
+    """Return the report of ``result`` as an HTML page."""
     dataset = result.dataset
     pictures = _Pictures(PICTURE_BYTES)
     gestures = [g.label for g in dataset.gestures.gestures if any(r.gesture == g.label for r in dataset.used)]
@@ -124,7 +124,7 @@ def render(result: CheckReport, progress: Progress | None = None) -> str:
     plotter = _Plotter(dataset, scale)
     report = progress or (lambda done, total: None)
     total = len(by_check) + len(gestures)
-    # Findings come first: if pictures must be left out, they are more important than overlays.
+    # Add plots of findings first, because overlays are the less important pictures to leave out.
     sections = []
     for name, findings in by_check.items():
         sections.append(_section(name, findings, plotter, pictures))
@@ -186,7 +186,7 @@ def _section(name: str, findings: list[Finding], plotter: _Plotter, pictures: _P
 
 
 def _spread(findings: list[Finding]) -> list[Finding]:
-    """Return the findings by severity, each person's first finding before second ones, so that the plots differ."""
+    """Sort findings by severity, then the first of each person before second ones, so that plots show many people."""
     turns: Counter[tuple[str, str]] = Counter()
     order = []
     for f in findings:
@@ -209,14 +209,14 @@ class _Plotter:
         return self._dataset.layout
 
     def can_draw(self, f: Finding) -> bool:
-        """Return whether a plot helps to judge this finding."""
+        """Return whether there is a plot that helps to judge this finding."""
         if f.recording:
             info = self._recordings[f.recording]
             return info.stop - info.start >= _DRAWN_ROWS and (f.check in _SIGNAL_CHECKS or f.check in _CLOCK_CHECKS)
         return bool(f.stream) and f.check in (*_CLOCK_CHECKS, "stuck", "flat", "drift", "garbage")
 
     def draw(self, f: Finding) -> Iterator[Figure]:
-        """Yield one or two figures: the clock for findings about time, and the channels with the place marked."""
+        """Yield up to two figures: the clock for findings about time, and the channels with the place marked."""
         frames = self._frames(f)
         if not len(frames):
             return

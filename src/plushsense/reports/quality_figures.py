@@ -1,4 +1,4 @@
-"""Draw the recordings of a gesture over each other, the places of findings, and trims."""
+"""Draw overlays of a gesture's recordings, the places of findings, and trims."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Okabe and Ito's colours, for any colour vision; grey is for recordings without findings.
+# Okabe and Ito's colours, which colour-blind readers can distinguish; recordings without findings are grey.
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 GREY, BAND, MARK = "#9aa0a6", "#e8f0fa", "#d55e00"
 _POINTS = 1500
@@ -34,7 +34,7 @@ _FEW = 40
 
 @dataclass(frozen=True)
 class Line:
-    """A recording in an overlay: ``seconds`` and ``size`` (T,) of its deviation, and a ``name`` if it has findings."""
+    """A recording in an overlay: its deviation ``size`` (T,) from rest at ``seconds``; a name if it has findings."""
 
     seconds: NDArray[np.float64]
     size: NDArray[np.float64]
@@ -43,10 +43,10 @@ class Line:
 
 
 def from_rest(frames: Frames, layout: Layout, scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the difference of each channel from its rest in the recording, (T, C), in units of ``scale``.
+    """Return the difference of each channel from its rest level in the recording, (T, C), in units of ``scale``.
 
-    Rest is the 10th percentile of channels with a baseline, and the median of others. Values are clipped to the valid
-    range.
+    The rest level is the 10th percentile of channels of `LEVEL_KINDS`, and the median of others. Values are clipped to
+    the valid range.
     """
     values = np.clip(frames.values, layout.valid_min_int, layout.valid_max_int)
     level = np.array([c.kind in LEVEL_KINDS for c in layout.channels])
@@ -55,12 +55,12 @@ def from_rest(frames: Frames, layout: Layout, scale: NDArray[np.float64]) -> NDA
 
 
 def deviation(frames: Frames, layout: Layout, scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the Euclidean distance of all channels from their rest, (T,), in units of ``scale``."""
+    """Return the Euclidean norm over the channels of `from_rest`, (T,)."""
     return np.asarray(np.sqrt(np.square(from_rest(frames, layout, scale)).sum(axis=1)))
 
 
 def line(frames: Frames, layout: Layout, scale: NDArray[np.float64], lasts: float, name: str = "") -> Line:
-    """Return a recording for an overlay, reduced to the maximum of each section."""
+    """Return a recording as a line of an overlay; a long one is reduced to the maxima of equal sections."""
     size = deviation(frames, layout, scale)
     seconds = np.linspace(0.0, lasts, len(size))
     step = -(-len(size) // _LINE_POINTS)
@@ -71,11 +71,11 @@ def line(frames: Frames, layout: Layout, scale: NDArray[np.float64], lasts: floa
 
 
 def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float) -> Figure:
-    """Draw all recordings of a gesture over each other, those with a name in colour, and below their durations."""
+    """Draw all recordings of a gesture in one plot, those with a name in colour, and below it their durations."""
     figure = new_figure(9.2, 4.3)
     top, strip = figure.subplots(2, 1, height_ratios=(3.2, 1), sharex=True)
     named = [one for one in lines if one.name]
-    # A recording that never stopped would compress all others.
+    # Ignore the length of a recording that was never stopped, which would compress all others.
     end = max([1.8 * mean_s, *(one.lasts for one in lines if one.lasts < 4 * mean_s)], default=1.0)
     few = len(lines) <= _FEW
     for one in lines:
@@ -85,7 +85,7 @@ def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float
         style = "-" if i < len(COLOURS) else "--"
         top.plot(one.seconds, one.size, style, color=COLOURS[i % len(COLOURS)], linewidth=1.4, label=one.name)
     heights = [s for one in lines for s in (np.percentile(one.size, 99.5),) if one.size.size]
-    # Recordings of one row have no height and no length.
+    # Without height or length, as with recordings of one row, the axes need another limit than 0.
     top.set_ylim(0, (1.25 * float(np.percentile(heights, 98)) if heights else 0.0) or 1.0)
     top.set_ylabel("deviation from rest\n(1 = usual)", fontsize=9)
     top.set_title(f"{gesture}: {len(lines)} recordings", fontsize=10, parse_math=False)
@@ -95,7 +95,7 @@ def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float
             text.set_parse_math(False)
     strip.axvspan((1 - tolerance) * mean_s, (1 + tolerance) * mean_s, color=BAND, zorder=0)
     strip.axvline(mean_s, color=COLOURS[1], linewidth=1.0)
-    # A fixed vertical offset separates the dots, and gives the same picture each time.
+    # Fixed vertical offsets separate the dots and, unlike random ones, always give the same picture.
     rest = [one.lasts for one in lines if not one.name]
     strip.plot(rest, (np.arange(len(rest)) * 0.618) % 1.0, "o", color=GREY, markersize=2.6, alpha=0.7)
     for i, one in enumerate(named):
@@ -131,7 +131,7 @@ def signals(
 ) -> Figure:
     """Draw channels of a recording (default: all) by row, and mark ``rows``.
 
-    Channels of several kinds are drawn as differences from their rest, each divided by its ``scale``.
+    Channels of several kinds are drawn as differences from their rest level, each divided by its ``scale``.
     """
     figure = new_figure(7.4, 2.2)
     axes = figure.add_subplot()
@@ -155,11 +155,11 @@ def signals(
 
 
 def clock(frames: Frames, rows: Sequence[tuple[int, int]] = (), *, first_row: int = 0, title: str = "") -> Figure:
-    """Draw the difference of the device clock between rows, and mark ``rows``."""
+    """Draw the differences of the device clock between successive rows, and mark ``rows``."""
     figure = new_figure(7.4, 2.2)
     axes = figure.add_subplot()
     steps = np.diff(frames.device_ms)
-    # Always draw the most deviating ones.
+    # Always draw the 200 most deviating steps, whatever else is left out.
     far = np.argsort(np.abs(steps - np.median(steps)))[-200:] if len(steps) else np.empty(0, dtype=np.int64)
     at = np.unique(np.concatenate([_thinned(len(steps)), far])) if len(steps) else far
     axes.plot(at + first_row + 2, steps[at], color=COLOURS[1], linewidth=0.8)
@@ -175,7 +175,7 @@ def clock(frames: Frames, rows: Sequence[tuple[int, int]] = (), *, first_row: in
 
 
 def baselines(lows: NDArray[np.float64], layout: Layout, channels: Sequence[int], *, title: str = "") -> Figure:
-    """Draw the baseline of channels over a session, one value for every 10 s."""
+    """Draw the baselines of channels over a session; ``lows`` has one value for every 10 s."""
     figure = new_figure(7.4, 2.2)
     axes = figure.add_subplot()
     minutes = np.arange(len(lows)) / 6
@@ -210,10 +210,10 @@ _MARK, _SUGGESTION = "#d55e00", "#000000"
 
 
 def trim_page(dataset: Dataset, trims: Sequence[Trim], offset: bool = True) -> Figure:
-    """Draw one page of recordings: every channel over the device clock, with suggested and marked trims.
+    """Draw one page of recordings: all channels against the device clock, with suggested and marked trims.
 
-    Suggested edges are dotted lines, marked edges solid lines, and trimmed parts are shaded. Channels of one kind share
-    a lane, each drawn as the difference from its median, relative to the largest difference of the kind.
+    Suggested edges are dotted, marked edges solid, and trimmed parts shaded. Channels of one kind share a strip of the
+    plot, each drawn as the difference from its median, relative to the largest difference of the kind.
 
     Args:
         trims: at most `PER_PAGE` results of `plushsense.dataset.trimming.suggest_trims`.

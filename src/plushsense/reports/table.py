@@ -1,4 +1,4 @@
-"""A table of raw values that prints as text, HTML, Markdown and CSV, and the formats of its cells."""
+"""Tables of raw values that can be written as text, HTML, Markdown and CSV, and the formats of their cells."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DASH = "—"
 
 Row = Mapping[str, Any]
 Kind = Literal["text", "count", "percent", "share", "right"]
-"""How a column is printed; "right" is finished text that is aligned to the right."""
+"""How a column is printed; "right" is formatted text that is aligned to the right."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Column:
         key: the key of its values in each row, and its name in CSV.
         head: the heading; a line feed breaks it in HTML.
         kind: format and alignment.
-        score: whether the values depend on how the data were split, so that the heading bears the table's marks.
+        score: whether the values depend on the split, so that the heading shows the table's marks (leaky, simulated).
         group: a heading over this column and its neighbours of the same group.
-        leaky: whether the values of this column alone are of a leaky split.
+        leaky: whether the values of this column are of a leaky split, where the table as a whole is not.
         plain: the heading in text and Markdown; by default group and head.
         style: CSS classes of the column's cells in HTML.
     """
@@ -47,17 +47,17 @@ class Column:
 class Table:
     """Rows of raw values under columns.
 
-    A missing value is None or absent. A value may be a pair (value, note): HTML prints the note small below the value,
-    the other formats leave it out. The key ``class`` of a row is its CSS class.
+    A missing value is None or absent. A value may be a pair (value, note): HTML shows the note in small type below the
+    value, the other formats leave it out. The key ``class`` of a row is its CSS class.
 
     Args:
         name: a file name without its ending.
-        title: what the table holds.
-        columns: from left to right.
-        rows: mappings by column key.
+        title: heading of the table.
+        columns: the columns from left to right.
+        rows: mappings from column keys to values.
         notes: sentences to print below the table.
-        limit: rows that are printed; CSV always has all. None: all.
-        leaky, simulated: what the columns of scores are marked with.
+        limit: maximum of rows that are printed; None: all. CSV always has all rows.
+        leaky, simulated: marks to show in the headings of columns of scores.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Table:
 
     @classmethod
     def of(cls, heads: Sequence[str], rows: Iterable[Sequence[object]]) -> Table:
-        """Return a table of finished cells, as the command line prints them."""
+        """Return a table of formatted cells, as the command line prints them."""
         columns = tuple(Column(str(i), head) for i, head in enumerate(heads))
         cells = ({str(i): None if cell is None else str(cell) for i, cell in enumerate(row)} for row in rows)
         return cls("", "", columns, tuple(cells))
@@ -91,9 +91,9 @@ class Table:
         return [[_cell(_value(row, c)[0], FORMATS[c.kind]) for c in self.columns] for row in self.rows[: self.limit]]
 
     def text(self) -> str:
-        """Return the table for a terminal, from which numbers are copied: counts without groups, shares of 1.
+        """Return the table for a terminal, aligned, with missing values blank.
 
-        Numbers are aligned to the right; missing values are blank.
+        So that numbers can be copied, counts are not grouped by thousands, and shares are numbers from 0 to 1.
         """
         heads = [self._heading(c) for c in self.columns]
         rows = ([_value(row, c)[0] for c in self.columns] for row in self.rows[: self.limit])
@@ -108,7 +108,7 @@ class Table:
         return "\n".join([line(heads), line(["-" * w for w in widths]), *map(line, cells)])
 
     def markdown(self) -> str:
-        """Return the table in the Markdown of GitHub."""
+        """Return the table in GitHub's Markdown."""
         rules = ["---" if c.kind == "text" else "---:" for c in self.columns]
         rows = [[self._heading(c) for c in self.columns], rules, *self.cells()]
         return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows)
@@ -188,19 +188,19 @@ def _numeric(cells: Iterable[str]) -> bool:
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """Return a real number with fixed digits; a dash for a missing value or one that is not a finite number."""
+    """Format a real number with a fixed number of decimals; return a dash for a value that is missing or not finite."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         return DASH
     return f"{value:.{digits}f}"
 
 
 def percent(value: Any, digits: int = 1) -> str:
-    """Return a share of 1 in percent; a dash as for `number`."""
+    """Format a share from 0 to 1 in percent; return a dash as `number` does."""
     return DASH if number(value) == DASH else f"{number(100 * value, digits)} %"
 
 
 def count(value: Any, unit: str = "") -> str:
-    """Return a whole number in groups of three with its unit; of a list its length; a dash for a missing value."""
+    """Format a whole number, or the length of a list, in groups of three with its unit; a dash for a missing value."""
     if isinstance(value, Sequence | Mapping) and not isinstance(value, str):
         value = len(value)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
@@ -210,7 +210,7 @@ def count(value: Any, unit: str = "") -> str:
 
 
 def text(value: Any) -> str:
-    """Return a value as text, lists joined by commas; a dash for a missing value."""
+    """Format a value as text, with the items of lists joined by commas; return a dash for a missing value."""
     if value is None or value == "":
         return DASH
     if isinstance(value, Mapping):
@@ -228,7 +228,7 @@ def mean_sd(metric: Any) -> str:
 
 
 def interval(metric: Any) -> str:
-    """Return ``0.512 to 0.607``, the 95 % interval of a metric of an evaluation."""
+    """Return the 95 % interval of a metric of an evaluation, such as ``0.512 to 0.607``."""
     ends = metric.get("ci95") if isinstance(metric, Mapping) else None
     if not isinstance(ends, Sequence) or len(ends) != 2 or DASH in (number(ends[0]), number(ends[1])):
         return DASH

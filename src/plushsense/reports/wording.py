@@ -1,4 +1,4 @@
-"""Describe splits, contexts, spread, leaks and simulations in the words that all reports share."""
+"""Texts that all reports share, on splits, contexts, spread, leaks and simulations."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _SPLITS_BY_PERSON = ("leave-one-subject-out", "by-subject")
 
 
 def describe_split(split: str, folds: int | None = None, decides: bool | None = None) -> tuple[str, str]:
-    """Describe how the data were divided, and who validates; an unknown split is quoted.
+    """Return sentences on how the data were divided and on who validates; an unknown split is quoted.
 
-    ``decides`` is whether validation ends the training; None: unknown.
+    ``decides`` tells whether validation ends the training (early stopping); None: unknown.
     """
     kind, _, given_folds = split.partition(":")
     if split == "windows:holdout":
@@ -35,7 +35,7 @@ def describe_split(split: str, folds: int | None = None, decides: bool | None = 
 
 
 def describe_contexts(evaluation: Mapping[str, Any]) -> tuple[str, str]:
-    """Describe the context of the training windows and of the scored windows."""
+    """Return descriptions of the context of the training windows and of the scored windows."""
     scored = evaluation.get("context")
     trained = evaluation.get("train_context") or scored
     return CONTEXT_WORDS.get(str(trained), text(trained)), CONTEXT_WORDS.get(str(scored), text(scored))
@@ -68,7 +68,7 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def averaged_over(evaluation: Mapping[str, Any]) -> str:
-    """Return "subjects" or "folds": what the means of an evaluation have one value each of."""
+    """Return "subjects" or "folds", the units over which the means of an evaluation are taken."""
     stored = evaluation.get("over")
     if stored in ("subjects", "folds"):
         return str(stored)
@@ -76,14 +76,14 @@ def averaged_over(evaluation: Mapping[str, Any]) -> str:
 
 
 def count_of(evaluation: Mapping[str, Any], units: str) -> str:
-    """Return the number of ``units`` ("subjects" or "folds") of an evaluation: "25 people", "1 fold"."""
+    """Return the number of ``units`` ("subjects" or "folds") of an evaluation in words: "25 people", "1 fold"."""
     n = len(evaluation.get(units) or [])
     one, many = ("person", "people") if units == "subjects" else ("fold", "folds")
     return f"{n or 'the'} {one if n == 1 else many}"
 
 
 def describe_spread(evaluation: Mapping[str, Any]) -> str:
-    """Describe what mean, deviation and interval are taken over, and the limits of the interval."""
+    """Return sentences on the units of mean, standard deviation and interval, and on the limits of the interval."""
     units = averaged_over(evaluation)
     number = count_of(evaluation, units)
     pooled = "Pooled: over all windows at once."
@@ -102,7 +102,7 @@ def describe_spread(evaluation: Mapping[str, Any]) -> str:
 
 
 def describe_runs(trials: Sequence[Mapping[str, Any]]) -> str:
-    """Return the seeds and folds that the scores of a sweep's trials are means of."""
+    """Return in words the numbers of seeds and folds over which the scores of a sweep's trials are averaged."""
     seeds, folds = (max((int(t.get(key) or 1) for t in trials), default=1) for key in ("seeds", "folds"))
     if seeds * folds == 1:
         return "one seed, no spread"
@@ -112,7 +112,7 @@ def describe_runs(trials: Sequence[Mapping[str, Any]]) -> str:
 
 
 def is_simulated(evaluation: Mapping[str, Any], default: bool) -> bool:
-    """Return whether an evaluation's scores are of a simulation; ``default`` where it does not say."""
+    """Return whether an evaluation's scores are of a simulation; ``default`` if it does not contain this."""
     for table in (evaluation, evaluation.get("dataset")):
         if isinstance(table, Mapping) and isinstance(table.get("simulated"), bool):
             return bool(table["simulated"])
@@ -133,7 +133,7 @@ def describe_other_data(evaluation: Mapping[str, Any], dataset: Mapping[str, Any
 
 
 def evaluation_title(evaluation: Mapping[str, Any]) -> str:
-    """Return the title of an evaluation: its own ``title``, or one of model, split and contexts."""
+    """Return the ``title`` of an evaluation, or if it has none, one made from model, split and contexts."""
     if evaluation.get("title"):
         return str(evaluation["title"])
     scored = str(evaluation.get("context", DASH))

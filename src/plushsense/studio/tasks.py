@@ -1,8 +1,8 @@
-"""The long tasks of the studio, and the worker process in which `plushsense.studio.app.jobs` runs each of them.
+"""Define the long tasks of the studio and the worker process in which `plushsense.studio.app.jobs` runs each one.
 
 The worker reads one line of JSON, ``{"task": ..., "spec": {...}}``, from standard input. It writes lines of JSON to
-standard output: ``{"progress": {...}}``, ``{"warning": "..."}``, and at the end ``{"result": {...}}`` or
-``{"refused": "..."}``. A process that ends without either was stopped.
+standard output: ``{"progress": {...}}``, ``{"warning": "..."}``, and finally ``{"result": {...}}`` or
+``{"refused": "..."}`` with an error message. A process that ends with neither of these was stopped.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from plushsense.workflow.reporting import check_folder
 
 
 class TaskReporter:
-    """Writes the progress and the warnings of a task as lines of JSON; any thread may call it."""
+    """Writer of the progress and warnings of a task as lines of JSON; its methods are thread-safe."""
 
     def __init__(self, out: Any) -> None:
         self._out, self._lock = out, threading.Lock()
@@ -55,15 +55,15 @@ class TaskReporter:
             self._out.flush()
 
     def progress(self, **values: Any) -> None:
-        """Report the progress of the task as plain values."""
+        """Report the progress of the task."""
         self.write(progress=values)
 
     def count(self, done: int, total: int) -> None:
-        """Report how many of ``total`` items are done."""
+        """Report that ``done`` of ``total`` items are done."""
         self.progress(done=done, total=total)
 
     def stage(self, stage: str, done: int, total: int) -> None:
-        """Report how many items of a stage are done."""
+        """Report that ``done`` of ``total`` items of a stage are done."""
         self.progress(stage=stage, done=done, total=total)
 
     def warn(self, sentence: str) -> None:
@@ -72,10 +72,10 @@ class TaskReporter:
 
 
 class Clock:
-    """Estimates the remaining time of a task from the share of the work that is done.
+    """Estimator of the remaining time of a task from the share of the work that is done.
 
-    Work that an earlier run finished is reported at once and says nothing about the speed: time is measured from the
-    first report that took longer than ``instant_s``.
+    A resumed task reports the work of earlier runs within moments, which does not indicate its speed. Therefore, time
+    is measured from the first report that came more than ``instant_s`` after the previous one.
     """
 
     def __init__(self, instant_s: float = 0.02) -> None:
@@ -84,7 +84,7 @@ class Clock:
         self._start_share = 0.0
 
     def at(self, share: float) -> dict[str, Any]:
-        """Return ``share``, and ``left_s``: the remaining seconds, or None while they are unknown."""
+        """Return a dictionary with ``share`` and ``left_s``, the remaining seconds (None if unknown)."""
         now = time.monotonic()
         if self._start_share == 0.0 or (now - self._last_s < self._instant_s and now - self._start_s < 1.0):
             self._start_share, self._start_s = share, now
@@ -95,7 +95,7 @@ class Clock:
 
 
 def run_check(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Check every recording of ``spec["dataset"]``."""
+    """Check every recording of the data set ``spec["dataset"]`` and return counts of the findings."""
     report = check_dataset(spec["dataset"], progress=reporter.count)
     counts = report.counts()
     return {
@@ -110,13 +110,13 @@ def run_check(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 
 UNPACKED = UnpackLimits(total_bytes=4_000_000_000, files=50_000)
-"""Limits of an uploaded zip."""
+"""Limits for unpacking an uploaded zip."""
 
 
 def run_import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Import ``sessions`` (folders in ``recordings``, collected in ``work``) or the zip ``archive`` into ``dest``.
 
-    With ``add``, ``dest`` is an existing data set. The archive is the studio's own copy and is removed at the end.
+    With ``add``, ``dest`` is an existing data set. The archive is the studio's copy and is removed afterwards.
     """
     settings: dict[str, Any] = {"add_to": True} if spec.get("add") else {"name": spec.get("name") or None}
     if spec.get("layout"):
@@ -143,7 +143,7 @@ def run_import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 @contextmanager
 def _collected(spec: dict[str, Any]) -> Iterator[Path]:
-    """Yield a temporary folder with only these sessions, as hard links if the disk supports them."""
+    """Yield a temporary folder with only the chosen sessions, as hard links if the file system supports them."""
     recordings = Path(spec["recordings"])
     work = Path(spec["work"])
     work.mkdir(parents=True, exist_ok=True)
@@ -164,10 +164,10 @@ def _link_or_copy(source: str, target: str) -> str:
 
 
 def run_simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Simulate ``people`` with ``repetitions`` each as the new data set ``dest``; ``work`` holds temporary files."""
+    """Simulate ``people`` persons with ``repetitions`` as the new data set ``dest``; use ``work`` temporarily."""
     work = Path(spec["work"])
     work.mkdir(parents=True, exist_ok=True)
-    # The data set holds copies of the recordings.
+    # The sessions can be temporary, because the data set contains copies of the recordings.
     with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=work) as place:
         done = simulate(
             Path(place) / "sessions",
@@ -181,10 +181,10 @@ def run_simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
 
 
 def run_pseudonymise(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Write a pseudonymised copy of ``dataset`` to ``place``; the keys are arguments of `pseudonymise`.
+    """Write a pseudonymised copy of ``dataset`` to ``place``; the other keys are arguments of `pseudonymise`.
 
     Raises:
-        ConfigError: without ``words``. They are not stored, so a job resumed after a restart lacks them.
+        ConfigError: if ``words`` is missing, as in a job resumed after a restart, because words are never stored.
     """
     if "words" not in spec:
         raise ConfigError("The words to remove are not stored: enter them again on the publish page.")
@@ -218,7 +218,7 @@ def run_validate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
 
 
 def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Train and save a bundle; in a dry run, return the estimate of `preview_training`."""
+    """Train and save a bundle; for a dry run, return only the estimate made by `preview_training`."""
     config = from_settings(**spec.get("settings", {}))
     if spec.get("dry"):
         from plushsense.trials.estimate import preview_training
@@ -264,7 +264,7 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 
 def _free_path(path: Path, content: bytes) -> Path:
-    """Return the path, or a numbered one beside it if another file has been written there meanwhile."""
+    """Return ``path``, or a numbered path next to it if a file with other content exists there."""
     number, free = 2, path
     while free.exists() and not (free.is_file() and free.read_bytes() == content):
         free = path.with_stem(f"{path.stem} {number}")
@@ -273,7 +273,7 @@ def _free_path(path: Path, content: bytes) -> Path:
 
 
 def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Evaluate; return the output folder, the report and the main scores, in a dry run the estimate."""
+    """Evaluate; return the output folder, the report and the main scores, or the estimate for a dry run."""
     config = from_settings(**spec.get("settings", {}))
     if spec.get("split"):
         config = replace(config, evaluation=replace(config.evaluation, split=spec["split"]))
@@ -315,7 +315,7 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
 
 
 def run_sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Run a sweep; return ``out`` and the main figures of the summary, in a dry run the preview."""
+    """Run a sweep; return the folder ``out`` and main values of the summary, or the preview for a dry run."""
     from plushsense.experiments.sweep.run import preview, sweep
 
     changes = dict(spec.get("changes", {}))
@@ -339,7 +339,7 @@ def run_sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 
 def run_search(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Run a search; return ``out`` and the main figures of the summary, in a dry run the preview."""
+    """Run a search; return the folder ``out`` and main values of the summary, or the preview for a dry run."""
     from plushsense.experiments.search.run import preview_search, search
 
     changes = {**spec.get("asked", {}), **spec.get("changes", {})}
@@ -362,23 +362,23 @@ def run_search(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 
 def run_profile(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Profile the export ``spec["place"]``."""
+    """Profile the exported code in the folder ``spec["place"]``."""
     return {"profile": _profile(Path(spec["place"]), reporter)}
 
 
 def _profile(folder: Path, reporter: TaskReporter) -> dict[str, Any]:
-    """Return the profile with the ``digest`` of the profiled files, or ``refused``: why there is no profile."""
+    """Return the profile of an export, or the reason ``refused`` why there is none, with a ``digest`` of the files."""
     digest = folder_digest(folder)
     reporter.progress(stage="profile")
     try:
         return {"digest": digest, **profile(folder, progress=partial(reporter.stage, "profile")).to_dict()}
     except ToolError as refusal:
-        # An export without a profile is valid.
+        # Not an error: an export without a profile is valid.
         return {"digest": digest, "refused": str(refusal)}
 
 
 def run_export(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Export ``bundle`` to ``place``, ``also`` in further formats; a ``dataset`` other than "" calibrates it again."""
+    """Export ``bundle`` to ``place``, in the formats ``also`` too; calibrate it again if ``dataset`` is not ""."""
     reporter.progress(stage="export")
     done = export(
         spec["bundle"],
@@ -396,8 +396,8 @@ _SAMPLES = 100_000
 def run_verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Verify the export ``place`` on ``targets``, by default on all that are available.
 
-    With ``dataset``, recordings are streamed, too; with ``faults``, mutants are tried; with ``trust``, changed C files
-    are compiled and run.
+    The input is recordings of ``dataset`` if given, else generated data. With ``faults``, check that mutants of the
+    code are detected. With ``trust``, also compile and run C files that differ from those PlushSense writes.
     """
     folder = Path(spec["place"])
     digest = folder_digest(folder)
@@ -431,11 +431,11 @@ TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
     "validate": run_validate,
     "pseudonymise": run_pseudonymise,
 }
-"""The functions of the tasks. Each takes a spec and returns a result; both hold plain values."""
+"""Functions of the tasks by name. Specs and results contain only JSON values."""
 
 
 def main() -> int:
-    """Run one task; return 0 if it is done, 1 if interrupted, 2 if refused."""
+    """Run the requested task; return 0 if it succeeded, 1 if it was interrupted, and 2 if it failed."""
     # Libraries may print, but standard output is reserved for messages.
     out, sys.stdout = sys.stdout, sys.stderr
     reporter = TaskReporter(out)
@@ -460,7 +460,7 @@ def main() -> int:
 
 
 def _end_with_studio() -> None:
-    """End this process with the studio, whose end closes standard input."""
+    """Wait until the studio ends, which closes standard input; then end this process."""
     while sys.stdin.read(1):
         pass
     if sys.platform != "win32" and os.getpgrp() == os.getpid():

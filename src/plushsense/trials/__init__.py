@@ -1,1 +1,1 @@
-"""Trials of a grid of networks: the grid, the plan of trainings, their scores and tables."""
+"""Train and compare the networks of a grid: the grid itself, the plan of trainings, their scores and tables."""

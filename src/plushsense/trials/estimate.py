@@ -1,7 +1,7 @@
-"""Previews of a training or an evaluation: windows, folds, cost and an estimate of the time on this machine.
+"""Preview a training or an evaluation: windows, folds, cost and an estimate of the time on this machine.
 
-The speed is measured by a few epochs of the same network on a few of its windows, in this process. The estimate leaves
-out reading and cutting the data and fitting decisions.
+The speed is measured by training the same network on a few of its windows for a few epochs, in this process. The
+estimate does not include the time for reading and cutting the data and for fitting decisions.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _BATCHES, _EPOCHS = 3, 3
 def preview_training(
     dataset: Dataset | str | os.PathLike[str], config: RunConfig, *, warn: Warn = silent
 ) -> dict[str, Any]:
-    """Return what `api.train` would train on; see `preview_evaluation` for the keys."""
+    """Return what `api.train` would train on and its cost; see `preview_evaluation` for the keys."""
     dataset = as_dataset(dataset)
     gestures = classes_for(dataset, config.evaluation.classes, config.windows.context, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
@@ -49,11 +49,11 @@ def preview_training(
 def preview_evaluation(
     dataset: Dataset | str | os.PathLike[str], config: RunConfig, *, warn: Warn = silent
 ) -> dict[str, Any]:
-    """Return what `api.evaluate` would do, without training.
+    """Return what `api.evaluate` would train on and its cost, without the training itself.
 
     Returns:
-        ``split``, ``leaky``, ``context``, ``simulated``, ``folds``, ``people``, ``classes``, ``windows``, ``epochs``
-        (at most), ``parameters``, ``macs`` of all training, ``seconds`` (estimated).
+        ``split``, ``leaky``, ``context``, ``simulated``, ``dataset``, ``folds``, ``people``, ``classes``, ``windows``,
+        ``epochs`` (at most), ``parameters``, ``macs`` of all trainings, ``seconds`` (estimated).
     """
     dataset = as_dataset(dataset)
     gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)
@@ -72,7 +72,7 @@ def preview_evaluation(
 def plan_seconds(planned: Plan, macs: float, workers: int) -> float:
     """Estimate the seconds that ``macs`` multiply-accumulates of a plan take, ``workers`` trainings at a time.
 
-    The speed is that of the training of median cost; other networks may differ.
+    The speed is measured with the training of median cost; that of other networks may differ.
     """
     job = sorted(planned.jobs, key=planned.macs)[len(planned.jobs) // 2]
     task: Task = job.task
@@ -103,7 +103,7 @@ def _describe(
 
 
 def _seconds_a_mac(windows: WindowSet, network: Arch, spec: TrainSpec) -> float:
-    """Measure the seconds for each multiply-accumulate of training, in the fastest of a few small epochs."""
+    """Measure the seconds of training per multiply-accumulate, in the fastest of a few short epochs."""
     from plushsense.training.fit import fit
 
     few = max(spec.batch, 64) * _BATCHES

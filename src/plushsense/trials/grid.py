@@ -1,8 +1,8 @@
 """Grids: networks × epochs × batches to train and compare, checked as a whole before anything runs.
 
-A training contains the shorter ones: rate, order and turns of an epoch follow from its number and the seed, not from
-how many epochs are to come. Only where validation decides when to stop (``patience``) every number of epochs is a
-training of its own.
+A long training includes the shorter ones of the same network: learning rate, order of windows and rotations of an epoch
+depend on its number and the seed, not on the number of epochs to follow. With early stopping (``patience``), each
+number of epochs needs its own training.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ if TYPE_CHECKING:
 
 
 FULL: Literal["full"] = "full"
-# A decision every 50 ms, as everywhere.
+# Time between decisions, 50 ms as in all of PlushSense.
 _STEP_S = 0.05
-# Settings of the preset that a grid may change; None keeps the preset's.
+# Training settings that a grid may change; None keeps the value of the preset.
 _OF_TRAINING = ("learning_rate", "halve_every", "patience", "augment", "turn_deg")
 
 
 @dataclass(frozen=True)
 class GridSpec:
-    """Settings of a grid, not checked on construction: `problems` reports everything at once.
+    """Settings of a grid. The constructor checks nothing; `problems` reports all errors at once.
 
-    A network uses as many of each set of ``filters`` as it has layers. ``seeds`` are those of the trainings; the split
-    has its own, so that all trainings of a grid have the same folds. ``classes`` is "all", "shared" or labels joined by
-    commas. ``threads`` is part of the id of a training, as PyTorch's own layers sum in an order that depends on it.
+    A network of n layers uses the first n numbers of each set of ``filters``. ``seeds`` are those of the trainings;
+    ``split_seed`` gives all of them the same folds. ``classes`` is "all", "shared" or labels joined by commas.
+    ``threads`` is part of a training's id, because the order of sums in PyTorch's layers depends on it.
     """
 
     name: str = "grid"
@@ -79,7 +79,7 @@ class GridSpec:
 
     @property
     def training(self) -> TrainSpec:
-        """The settings of every training but epochs, batch and seed, which belong to the trial."""
+        """Training settings; epochs, batch and seed differ by training and are set in the plan."""
         changes = {key: getattr(self, key) for key in _OF_TRAINING if getattr(self, key) is not None}
         return PRESETS[self.preset].changed(device=self.device, threads=self.threads, **changes)
 
@@ -89,21 +89,21 @@ class GridSpec:
         return WindowSpec(window_s=self.window_s, step_s=self.step_s, context=self.context)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON; ``augment`` only where it is set, so that earlier grids keep their identity."""
+        """Return plain values for JSON; ``augment`` is left out if None, so that ids of old grids do not change."""
         return {key: value for key, value in asdict(self).items() if key != "augment" or value is not None}
 
 
 # Paper, section 3.6: 13 architectures × 4 filter sets × 3 epochs × 3 batches = 468 trials.
 GRIDS: dict[str, GridSpec] = {"paper": GridSpec(name="paper")}
-# The network that the paper chose (section 3.6.2 and Figure 10), best with 250 epochs and batches of 64; the other one
-# that it shows (Figure 11).
+# The network that the paper chose (section 3.6.2 and Figure 10), which was best with 250 epochs and batches of 64, and
+# the second network that it shows (Figure 11).
 CHOSEN = ("14d1_39d2_41d4", slashed(DEFAULT_FILTERS))
 SECOND = ("19d1_19d2_19d4_17d8", "4/6/8/8")
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One network, trained for ``epochs`` in batches of ``batch`` windows ("full": all)."""
+    """One network, trained for ``epochs`` in batches of ``batch`` windows ("full": all windows in one batch)."""
 
     arch: Arch
     filter_set: tuple[int, ...]
@@ -113,18 +113,18 @@ class Trial:
 
 @dataclass(frozen=True)
 class Training:
-    """Trials that one training covers: they differ in their epochs only, the shortest first."""
+    """The trials that one training covers; they differ only in their epochs, the shortest first."""
 
     trials: tuple[Trial, ...]
 
     @property
     def epochs(self) -> tuple[int, ...]:
-        """The epochs after which it is scored."""
+        """The numbers of epochs after which the training is scored."""
         return tuple(trial.epochs for trial in self.trials)
 
 
 def trainings(grid: GridSpec, layout: Layout, classes: int) -> list[Training]:
-    """Return the trainings that contain all trials of a grid without `problems`."""
+    """Return the trainings that cover all trials of a grid, which must have no `problems`."""
     planned = []
     nested = grid.training.patience is None
     for symbol in grid.architectures:
@@ -152,12 +152,12 @@ def _network(grid: GridSpec, symbol: str, filters: Sequence[int], layout: Layout
 def problems(
     grid: GridSpec, layout: Layout | None = None, past: int | None = None, windows: int | None = None
 ) -> list[str]:
-    """Return everything that keeps a grid from being trained, one sentence each.
+    """Return a sentence for each reason why a grid cannot be trained.
 
     Args:
-        layout: of the toy, for the length of a window in samples.
-        past: samples up to the end of a recording in its stream, for at least half of the recordings.
-        windows: smallest number of training windows of a fold, or more where the split cannot be made.
+        layout: layout of the toy, for the length of a window in samples.
+        past: median over the recordings of the number of samples in the stream up to the recording's end.
+        windows: smallest number of training windows in a fold; if the split cannot be made, the number of all windows.
     """
     wrong = _of_settings(grid)
     shapes: dict[str, int] = {}
@@ -234,7 +234,7 @@ def _refused(make: Callable[[], object]) -> list[str]:
 
 
 def _twice(grid: GridSpec) -> list[str]:
-    """Report trials that are in the grid more than once: repeated values, and several names of one network."""
+    """Report trials that are in the grid more than once: repeated values, or one network under several names."""
     wrong = []
     for key in ("epochs", "batches", "seeds"):
         values = getattr(grid, key)
@@ -256,16 +256,16 @@ def _twice(grid: GridSpec) -> list[str]:
 
 
 def _too_long(grid: GridSpec, symbol: str, layout: Layout, past: int | None) -> list[str]:
-    """Report a network that needs more samples than a window, or its real past, has.
+    """Report a network that needs more samples than a window, or with padding and context "stream" the real past, has.
 
-    Without a real past a receptive field may exceed the window by less than its widest dilation, as the paper's 126d2.
+    Without a real past, a receptive field may exceed the window by less than its widest dilation, as the paper's 126d2.
     """
-    # An unknown padding or norm is reported already.
+    # `_of_settings` reports an unknown padding or norm.
     known = replace(grid, padding=grid.padding if grid.padding in PADDINGS else "mirror", norm="batch")
     try:
         arch = _network(known, symbol, (1,) * 4, layout, 2)
     except BadInput as cause:
-        # A problem of the window, which may be reported already.
+        # The window is wrong; report it unless `_of_settings` already does.
         return [] if _of_settings(grid) else [first_line(cause)]
     field, window = arch.receptive_field, arch.window
     if grid.padding == "stream" and grid.context == "stream":
@@ -285,7 +285,7 @@ def _too_long(grid: GridSpec, symbol: str, layout: Layout, past: int | None) -> 
 
 
 def first_line(cause: Exception) -> str:
-    """Return the first line of an error message, without the drawing below it."""
+    """Return the first line of an error message, without the drawing that may follow."""
     return str(cause).splitlines()[0]
 
 
@@ -293,7 +293,7 @@ def _listed(values: Iterable[object]) -> str:
     return ", ".join(map(str, values))
 
 
-# The tables of a grid's file; `search` is read by `experiments.search.halving`.
+# The tables of a grid's file; `experiments.search.halving` reads the table "search".
 TABLES = ("grid", "search")
 
 Spec = TypeVar("Spec", bound="DataclassInstance")
@@ -302,13 +302,14 @@ Spec = TypeVar("Spec", bound="DataclassInstance")
 def load_grid(
     grid: GridSpec | str | os.PathLike[str], changes: Mapping[str, Any] | None = None
 ) -> tuple[GridSpec, list[str]]:
-    """Return a grid given as such, by its name or as a TOML file, with ``changes`` applied.
+    """Read a grid and apply ``changes``.
 
     Args:
-        changes: new values of some keys, or their text as on the command line; None leaves a key as it is.
+        grid: a `GridSpec`, the name of one of `GRIDS`, or the path of a TOML file.
+        changes: new values of keys, also as text of the command line; None leaves a key as it is.
 
     Returns:
-        the grid, and one sentence for each key or value that cannot be read; those are as in the paper's grid.
+        the grid, and a sentence for each key or value that cannot be read and is therefore ignored.
 
     Raises:
         ConfigError: for an unknown name, or a file that is missing or not TOML.
@@ -327,7 +328,7 @@ def load_grid(
 
 
 def grid_tables(path: str | Path) -> tuple[dict[str, Mapping[str, Any]], list[str]]:
-    """Return the tables of a grid's file by name, and one sentence for each that cannot be read; those are empty.
+    """Return the tables of a grid's file by name, and a sentence for each one that is unknown, missing or not a table.
 
     Raises:
         ConfigError: for a file that is missing or not TOML.
@@ -349,10 +350,10 @@ def grid_tables(path: str | Path) -> tuple[dict[str, Mapping[str, Any]], list[st
 
 
 def over(spec: Spec, table: Mapping[str, Any], where: str) -> tuple[Spec, list[str]]:
-    """Return a grid (or another spec) with the values of a table, and a message for each key or value that is wrong.
+    """Return ``spec`` with the values of ``table``, and a message for each wrong key or value.
 
-    Values may be text as on the command line, with commas between the items of a list; None leaves the value of the
-    grid. If one item of a list is wrong, the others are kept, so that further problems are found in them.
+    Values may be text as on the command line, with commas between the items of a list; None keeps the value of
+    ``spec``. If one item of a list is wrong, the others are kept, so that their problems are found as well.
     """
     kinds = get_type_hints(type(spec))
     parsed = {key: _from_text(key, value, kinds.get(key)) for key, value in table.items() if value is not None}
@@ -361,7 +362,7 @@ def over(spec: Spec, table: Mapping[str, Any], where: str) -> tuple[Spec, list[s
 
 
 def _from_text(key: str, value: Any, kind: Any) -> Any:
-    """Return a value of a table with texts converted to numbers and lists."""
+    """Convert a value of a table, if it is text, to the number or list that ``kind`` requires."""
     if key == "filters":
         return _filter_sets(value)
     if key == "classes" and isinstance(value, list | tuple) and all(isinstance(item, str) for item in value):
@@ -379,7 +380,7 @@ def _from_text(key: str, value: Any, kind: Any) -> Any:
 
 
 def _filter_sets(value: Any) -> Any:
-    """Return ``[[4, 6], [8, 12]]``, also from text: ``4,6,8,8`` is one set, ``4/6/8/8,8/12/16/16`` are two."""
+    """Parse filter sets as a list of lists; the text ``4,6,8,8`` is one set, ``4/6/8/8,8/12/16/16`` are two."""
     if isinstance(value, str):
         value = [part.strip() for part in value.split(",")] if "/" in value else [value]
     if not isinstance(value, list | tuple):

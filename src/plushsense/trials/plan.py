@@ -1,8 +1,8 @@
-"""The plan of a sweep (windows, folds, trials and trainings with their ids), its trainings and their scores.
+"""Plan a sweep (windows, folds, trials and trainings with their ids), run its trainings, and score them.
 
-A *trial* is a network with a number of epochs and a batch: a row of the grid. A *training* covers the trials that
-differ in their epochs only, with one seed on one fold: a `Job` of the journal with a `Task`. A *run* is a trial's part
-of one training.
+A *trial* is a network with a number of epochs and a batch. A *training* covers all trials that differ only in their
+epochs, with one seed on one fold; it is a `Job` of the journal with a `Task`. A *run* is the part of a trial in one
+training.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from plushsense.workflow.config import ALL
 from plushsense.workflow.preparation import Warn, choose_classes, silent, windows_for
 from plushsense.workflow.reporting import journal_of
 
-# Part of every id: raise it when the meaning of a stored training changes.
+# Part of every id: increase it when the meaning of a stored training changes.
 _VERSION = 1
-# Forward, and backward to the weights and to the layer before.
+# Passes of a training step: forward, and backward to the weights and to the previous layer.
 PASSES = 3
 
 
 class GridProblems(ConfigError):
-    """Error with all problems of a grid at once, one sentence each in ``problems``."""
+    """An error that lists all problems of a grid; ``problems`` has a sentence for each."""
 
     def __init__(self, problems: Sequence[str]) -> None:
         self.problems = tuple(problems)
@@ -53,8 +53,8 @@ class GridProblems(ConfigError):
 class Task:
     """One training on one fold, scored after each of ``epochs``; ``span`` selects the windows, ``id`` is the job's.
 
-    ``start`` (a `FitState`), after ``spent_s`` seconds of training, does not change the result. If ``stateful``, the
-    result holds the final state as well, from which another training can continue.
+    The training continues from ``start`` (a `FitState`), if given, which took ``spent_s`` seconds; the weights do not
+    depend on it. If ``stateful``, the result includes the final state, from which another training can continue.
     """
 
     arch: Arch
@@ -108,11 +108,11 @@ class Plan:
 
     @property
     def id(self) -> str:
-        """The same for the same data and settings, in whatever order a grid lists them."""
+        """Identifier, equal for equal data and settings in any order."""
         return job_id({"trials": sorted(t.id for t in self.trials), "runs": sorted(job.id for job in self.jobs)})
 
     def macs(self, job: Job, nested: bool = True) -> int:
-        """Return about how many multiply-accumulates a training takes; ``nested`` False: its trials one by one."""
+        """Estimate the multiply-accumulates of a training; with ``nested`` False, of a separate one for each trial."""
         task: Task = job.task
         epochs = task.epochs[-1] if nested else sum(task.epochs)
         return PASSES * task.arch.macs_per_window * len(self.folds[task.span][task.fold].train) * epochs
@@ -122,10 +122,10 @@ def plan(dataset: Dataset, grid: GridSpec, unreadable: Sequence[str] = (), warn:
     """Plan a sweep.
 
     Args:
-        unreadable: problems that were found in reading the grid (see `load_grid`), to be reported with the others.
+        unreadable: problems that `load_grid` found, to be reported together with the others.
 
     Raises:
-        GridProblems: with all problems of the grid on this data set at once, one a line.
+        GridProblems: with all problems of the grid on this data set.
     """
     return _planned(dataset, grid, _cut(dataset, grid, unreadable, warn))
 
@@ -147,7 +147,7 @@ def plans_by_epochs(
 
 def _cut(dataset: Dataset, grid: GridSpec, unreadable: Sequence[str], warn: Warn) -> _Cut:
     rate = dataset.layout.rate_hz
-    # Samples up to the end of each recording, in its stream where it lies in one.
+    # Number of samples up to the end of each recording, counted from the start of its stream if it lies in one.
     reaches = [
         (max(r.stream_row, 0) + r.stop - r.start) * (rate / r.rate_hz if r.rate_hz > 0 else 1.0) for r in dataset.used
     ]
@@ -159,7 +159,7 @@ def _cut(dataset: Dataset, grid: GridSpec, unreadable: Sequence[str], warn: Warn
         fewest = min(len(fold.train) for fold in cut.folds())
     except BadInput as cause:
         failures.append(first_line(cause))
-    # A problem of the grid may have the same message as the failure to cut windows.
+    # Remove duplicates: a failure to cut windows may have the same message as a problem of the grid.
     wrong = list(dict.fromkeys([*unreadable, *problems(grid, dataset.layout, past, fewest), *failures]))
     if wrong or cut is None:
         raise GridProblems(wrong)
@@ -180,7 +180,7 @@ def _warn_of_rare(dataset: Dataset, cut: _Cut, warn: Warn) -> None:
 
 @dataclass
 class _Cut:
-    """Windows and folds, cut once for each span."""
+    """The windows and folds of a plan, cut once for each span that its networks need."""
 
     dataset: Dataset
     grid: GridSpec
@@ -191,7 +191,7 @@ class _Cut:
 
     @classmethod
     def of(cls, dataset: Dataset, grid: GridSpec, warn: Warn) -> _Cut:
-        """Cut windows without further past, whose number is that of every grid."""
+        """Cut windows of ``window_s`` without earlier samples; other spans give as many windows."""
         gestures = choose_classes(dataset, grid.classes, warn)
         window = Arch.parse(
             "1", "1", channels=dataset.layout.n_inputs, padding="mirror", window=dataset.layout.samples(grid.window_s)
@@ -202,21 +202,21 @@ class _Cut:
 
     @property
     def split(self) -> Split:
-        """Split of the windows; ConfigError for an unknown one."""
+        """The split of the windows; raises ConfigError for an unknown one."""
         return parse_split(self.grid.split)
 
     @property
     def windows(self) -> WindowSet:
-        """Windows without further past."""
+        """The windows of ``window_s`` without earlier samples."""
         return self.sets[self.window.span]
 
     def folds(self) -> list[Fold]:
-        """Return the folds of the windows of a span."""
+        """Return the folds of `windows`."""
         return self.at(self.window)[1]
 
     def at(self, arch: Arch) -> tuple[WindowSet, list[Fold]]:
         """Return the windows that a network needs, and their folds."""
-        # A network with a span below a window reads the end of that window.
+        # A network whose span is shorter than a window reads the end of the window.
         span = max(arch.span, arch.window)
         if span not in self.sets:
             self.sets[span] = windows_for(self.dataset, arch, self.grid.windows, self.gestures)
@@ -229,7 +229,7 @@ class _Cut:
 def _planned(dataset: Dataset, grid: GridSpec, cut: _Cut, fits: Callable[[Arch], bool] = lambda arch: True) -> Plan:
     from plushsense.training.fit import resolve_device
 
-    # Resolve the device here: it is part of the id and must be the same in every worker.
+    # Resolve the device here, because it is part of the id and must be the same in every worker.
     spec = resolve_device(grid.training)
     prints: dict[int, tuple[str, list[str]]] = {}
     trials: list[PlannedTrial] = []
@@ -262,13 +262,13 @@ def _planned(dataset: Dataset, grid: GridSpec, cut: _Cut, fits: Callable[[Arch],
             trials.append(PlannedTrial(job_id({**base, **own}), trial, tuple(runs)))
     sets = {span: windows for span, windows in cut.sets.items() if span in used}
     made = Plan(grid, cut.split, cut.gestures, sets, {s: cut.by_span[s] for s in sets}, tuple(trials), ())
-    # The longest first, so that all workers finish at about the same time.
+    # Start with the longest trainings, so that all workers finish at about the same time.
     ordered = sorted(jobs.values(), key=made.macs, reverse=True)
     return replace(made, jobs=tuple(ordered))
 
 
 def processes(workers: int, threads: int) -> int:
-    """Return how many trainings run at a time; 0 stands for as many as the processors hold."""
+    """Return the number of trainings at a time: ``workers``, or for 0 as many as the processor cores allow."""
     if workers < 0:
         raise ConfigError(f"workers is {workers}: accepted are whole numbers from 0 up.")
     return workers or max(1, (os.cpu_count() or 1) // threads)
@@ -290,7 +290,7 @@ def train_all(
     on_report: Callable[[Job, Any], None] | None = None,
     on_failed: Callable[[Job, Exception], None] | None = None,
 ) -> dict[str, Result]:
-    """Train the ``jobs`` of a plan that the data set's journal does not hold; see `run_jobs`."""
+    """Run those ``jobs`` of a plan that are not in the data set's journal yet; see `run_jobs` for the arguments."""
     unfinished = journal_of(dataset, UNFINISHED)
 
     def done(job: Job, result: Result, resumed: bool) -> None:
@@ -299,7 +299,7 @@ def train_all(
 
     return run_jobs(
         jobs,
-        # Nodes of a cluster may not share a disk, so that they keep no unfinished states.
+        # Nodes of a cluster may not share a disk, so they do not save unfinished states.
         TrainAndScore(unfinished if cluster is None else None),
         shared=(planned.sets, planned.folds),
         workers=workers,
@@ -316,14 +316,14 @@ def train_all(
 
 @dataclass(frozen=True)
 class TrainAndScore:
-    """One training as a job: probabilities of the tested windows after each number of epochs that is scored.
+    """The work of one job: train a network and predict the test windows after each number of epochs to score.
 
-    Its result holds ``probabilities`` (E, N, K) float32, the ``validation`` scores (E, 2) and the ``curve``, with the
-    columns of `CURVE`.
+    The result has ``probabilities`` (E, N, K) float32 after each of the E numbers of ``epochs``, the ``validation``
+    scores (E, 2) and the ``curve``, with the columns of `CURVE`. ``at`` are the epochs whose weights were used.
 
-    A training that diverges does not stop the others: it is scored after the largest number of epochs that succeeds,
-    and ``failed`` holds the reason for the others. ``at`` is the epoch whose weights are scored. A long training saves
-    its state in ``unfinished`` once a minute, and continues from there after an interruption.
+    If a training diverges, it is repeated with the next smaller number of epochs; ``failed`` has the reason for each
+    number that failed. A long training saves its state in ``unfinished`` once a minute, and continues from there after
+    an interruption.
     """
 
     unfinished: Journal | None = None
@@ -354,7 +354,7 @@ class TrainAndScore:
             except DivergedError as cause:
                 failed[str(epochs_left[-1])] = str(cause)
                 epochs_left, start = epochs_left[:-1], None
-        # Where every training diverged, ``fitted`` is None and no epochs are left.
+        # If every training diverged, ``fitted`` is None and ``epochs_left`` is empty.
         tested, watched = [], []
         for epochs in epochs_left:
             assert fitted is not None
@@ -376,13 +376,13 @@ class TrainAndScore:
             "failed": failed,
         }
         state = fitted.state if fitted is not None and task.stateful and not failed else None
-        # The weights that were scored on the way are no longer needed.
+        # Another training does not need the intermediate weights in ``kept``.
         return result if state is None else {**result, **replace(state, kept={}).to_arrays()}
 
 
 @dataclass(frozen=True)
 class Scored:
-    """A trial's part of one training: its scores, and the confusion matrix of all tested windows."""
+    """The scores of one run, and the confusion matrix of all its test windows; ``windows`` is the number scored."""
 
     figures: dict[str, float | None]
     counts: Counts
@@ -392,7 +392,7 @@ class Scored:
 
 @dataclass(frozen=True)
 class TrainingOutcome:
-    """Outcome of one training: scores by number of epochs, the curve, and the reason for each number that failed."""
+    """Outcome of one training: scores by number of epochs, the learning curve, and the reason of each failure."""
 
     scored: dict[int, Scored]
     curve: NDArray[np.float64]
@@ -401,7 +401,7 @@ class TrainingOutcome:
 
 
 def outcome(plan: Plan, run: PlannedRun, result: Mapping[str, Any]) -> TrainingOutcome:
-    """Score the probabilities of a training; in splits by person, recordings of nobody do not count."""
+    """Score the probabilities of a training; in splits by person, recordings of `NOBODY` are not scored."""
     windows, fold = plan.sets[run.span], plan.folds[run.span][run.fold_index]
     truth, classes = windows.y[fold.test], len(windows.labels)
     counted = windows.subject[fold.test] != NOBODY if plan.split.apart else np.ones(len(truth), dtype=np.bool_)
@@ -416,7 +416,7 @@ def outcome(plan: Plan, run: PlannedRun, result: Mapping[str, Any]) -> TrainingO
             "validation_macro_f1": float(f1),
             "train_loss": float(result["curve"][result["at"][i] - 1, 0]),
         }
-        # The time of a training is shared among its trials, so that their sum is the time of the training.
+        # Divide the time of a training among its trials, so that their times add up to it.
         share = seconds * (epochs - before) / result["epochs"][-1]
         before = epochs
         scored[epochs] = Scored(

@@ -1,8 +1,8 @@
-"""The results folder of a sweep: tables of trials, runs and curves, and a summary; complete at any moment.
+"""Write the results folder of a sweep: tables of trials, runs and curves, and a summary.
 
-Everything in it follows from the plan and the journal, so that it can be deleted and made again. A column of the table
-of trials is a function and a line in `TRIAL_COLUMNS`: Parquet, CSV, ``sweep.json``, the page, the command line,
-notebooks and MLflow read that registry.
+All files are made from the plan and the journal, so that the folder can be deleted and written again. Each column of
+the table of trials is an entry of the registry `TRIAL_COLUMNS`, from which Parquet, CSV, ``sweep.json``, the page, the
+command line, notebooks and MLflow are made.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from plushsense.workflow.reporting import machine
 SUMMARY = "sweep.json"
 TRIALS, TRIALS_CSV, RUNS, CURVES = "trials.parquet", "trials.csv", "runs.parquet", "curves.parquet"
 BEST = 10
-# The files are updated at most so often.
+# Shortest time between two updates of the files.
 _EVERY_S = 5.0
 
 _RUN_COLUMNS: dict[str, type[Any]] = {
@@ -65,7 +65,7 @@ _CURVE_COLUMNS: dict[str, type[Any]] = {
 
 @dataclass(frozen=True)
 class TrialScores:
-    """A planned trial with the scores of its runs; ``head`` describes data and split, as in ``sweep.json``."""
+    """A planned trial with the scores of its runs; ``head`` has data and split, as in ``sweep.json``."""
 
     planned: PlannedTrial
     scored: tuple[Scored, ...]
@@ -74,39 +74,39 @@ class TrialScores:
 
     @classmethod
     def of(cls, planned: PlannedTrial, outcomes: Mapping[str, TrainingOutcome], head: Mapping[str, Any]) -> TrialScores:
-        """Return the scores of a trial from the outcomes of trainings by job."""
+        """Collect the scores of a trial from ``outcomes``, the outcomes of trainings by job id."""
         finished = [outcomes[run.job] for run in planned.runs if run.job in outcomes]
         epochs = planned.trial.epochs
         scored = tuple(outcome.scored[epochs] for outcome in finished if epochs in outcome.scored)
         if len(scored) < len(finished):
-            # The mean of the other runs would be biased.
+            # A run failed, and the mean of the other runs would be biased.
             return cls(planned, (), "failed", head)
         if not scored:
             return cls(planned, (), "waiting", head)
         return cls(planned, scored, "done" if len(scored) == len(planned.runs) else "partial", head)
 
     def mean(self, name: str) -> float | None:
-        """Return the mean of a figure over the runs; None where a run lacks it."""
+        """Return the mean of a figure over the finished runs; None if one of them lacks it."""
         values = [s.figures[name] for s in self.scored]
         return fmean(numbers) if (numbers := [v for v in values if v is not None]) and None not in values else None
 
     def sd(self, name: str) -> float | None:
-        """Return the standard deviation of a figure over the runs (n - 1); None for fewer than two."""
+        """Return the standard deviation (n - 1) of a figure; None for fewer than two runs, or if one lacks it."""
         values = [v for s in self.scored if (v := s.figures[name]) is not None]
         return stdev(values) if len(values) == len(self.scored) > 1 else None
 
 
 @dataclass(frozen=True)
 class TrialColumn:
-    """A column: the type of its values, the function that returns them, and how it is printed.
+    """A column of the table of trials: the type of its values, the function that returns them, and how it is printed.
 
     Args:
         type: str, int, float or bool.
-        value: called with the trial; returns None where there is no value yet.
-        name: the heading in lists of trials; without one the column is in the files only.
+        value: called with the trial; returns None if there is no value yet.
+        name: heading in lists of trials; a column without one is only in the files.
         kind: format in lists (see `plushsense.reports.table.Kind`).
-        score: whether the values depend on the split, so that a leaky split is marked.
-        terminal: whether the command line lists it as well as the page.
+        score: whether the values depend on the split, so that the heading marks a leaky one.
+        terminal: whether the command line lists the column too, and not only the page.
     """
 
     type: type[Any]
@@ -181,7 +181,7 @@ TRIAL_COLUMNS: dict[str, TrialColumn] = {
 
 
 def listed_columns(*, terminal: bool = False) -> list[Column]:
-    """Return the columns of a list of trials on a page, or on a terminal; the trial's id is the last."""
+    """Return the columns of a list of trials, for a page or with ``terminal`` the command line; the id is the last."""
     listed = {key: c for key, c in TRIAL_COLUMNS.items() if c.name and (c.terminal or not terminal)}
     return [
         Column(key, c.name[0].upper() + c.name[1:], c.kind, c.score, plain=c.name)
@@ -190,7 +190,7 @@ def listed_columns(*, terminal: bool = False) -> list[Column]:
 
 
 class Tables:
-    """The outcomes of the trainings so far, and the folder; ``writing`` guards the folder, as that of a `Journal`."""
+    """Collects the outcomes of trainings and writes the results folder, each time in the context ``writing()``."""
 
     def __init__(
         self,
@@ -221,12 +221,12 @@ class Tables:
         if resumed:
             self.resumed.add(job)
         elif time.monotonic() >= self._due:
-            # A file that another program holds open (Windows) is written again at the end.
+            # On Windows, a file that another program has open cannot be written; the update at the end will.
             with suppress(OSError):
                 self.write()
 
     def lose(self, job: str, why: str) -> None:
-        """Record a training that was given up; its trials stay without scores."""
+        """Record a training that failed for the reason ``why``; its trials stay without scores."""
         self.lost[job] = why
 
     def trial_rows(self) -> list[dict[str, Any]]:
@@ -234,7 +234,7 @@ class Tables:
         return [self._row(planned) for planned in self.plan.trials]
 
     def _row(self, planned: PlannedTrial) -> dict[str, Any]:
-        """Return the value of every column; None where there is none yet."""
+        """Return the row of a trial with every column; None where there is no value yet."""
         trial = TrialScores.of(planned, self.outcomes, self.head)
         return {key: column.value(trial) for key, column in TRIAL_COLUMNS.items()}
 
@@ -243,7 +243,7 @@ class Tables:
         rows = self.trial_rows()
         done = [row for row in rows if row["status"] == "done"]
         best = sorted(filter(_ranked, rows), key=_rank)
-        # Among equals the smallest, then the first of the grid: scores on the test part do not count.
+        # Choose by validation only; of equal trials the smallest network, then the first in the grid.
         chosen = min(
             filter(_ranked, rows),
             key=lambda row: (-(row["validation_macro_f1"] or 0.0), row["parameters"]),
@@ -279,7 +279,7 @@ class Tables:
         }
 
     def write(self) -> dict[str, Any]:
-        """Write all files, each in one step, and return the summary."""
+        """Write all files, each by replacing it in one step, and return the summary."""
         with self._writing():
             return self._write()
 
@@ -304,7 +304,7 @@ class Tables:
             self._curves(polars).write_parquet(part)
         summary = self.summary()
         write_file(self.out / SUMMARY, json.dumps(summary, ensure_ascii=False, indent=1, allow_nan=False))
-        # Writing takes at most a twentieth of the time.
+        # Limit writing to about a twentieth of the time.
         now = time.monotonic()
         self._due = now + max(_EVERY_S, 20 * (now - began))
         return summary
@@ -326,7 +326,7 @@ class Tables:
         }
 
     def _curves(self, polars: Any) -> Any:
-        """Return one row for each run and epoch (possibly millions), built by column."""
+        """Return the table of curves, a row for each training and epoch; it is built by column for speed."""
         parts = []
         for job in sorted(self.outcomes):
             curve = self.outcomes[job].curve
@@ -344,7 +344,7 @@ class Tables:
         return polars.concat(parts) if parts else _frame(polars, [], _CURVE_COLUMNS)
 
     def _with_confusions(self, best: Sequence[Mapping[str, Any]]) -> list[PlannedTrial]:
-        """Return the trials whose confusions are kept: the best, the best of each filter set, the paper's network."""
+        """Return the trials whose confusions are stored: the best, the best of each filter set, the paper's network."""
         picked = [row["trial"] for row in best[:BEST]]
         seen: set[str] = set()
         for row in best:
@@ -366,7 +366,7 @@ def _ranked(row: Mapping[str, Any]) -> bool:
 
 
 def _rank(row: Mapping[str, Any]) -> tuple[float, int]:
-    """Return a sort key: the most accurate first, of equal ones the smallest."""
+    """Return a sort key for rows: the most accurate trial first, of equal ones the smallest network."""
     return -row["accuracy"], row["parameters"]
 
 
@@ -391,7 +391,7 @@ def _frame(polars: Any, rows: Sequence[Mapping[str, Any]], columns: Mapping[str,
 
 
 def summary_head(dataset: Dataset, planned: Plan) -> dict[str, Any]:
-    """Return the part of a summary on data, grid and machine."""
+    """Return the part of a summary that describes data, grid and machine."""
     grid = planned.grid
     return {
         "name": grid.name,

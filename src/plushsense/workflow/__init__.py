@@ -1,1 +1,1 @@
-"""Offer the Python API: import, check, train, evaluate, report, export, and the configuration of a run."""
+"""The Python API: import, check, train, evaluate, report, export, and the configuration of a run."""

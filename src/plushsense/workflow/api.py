@@ -59,10 +59,10 @@ if TYPE_CHECKING:
     from plushsense.training.engine import FitState
 
 
-# Unfinished trainings that are older are deleted: most are never resumed, and they were trained on people.
+# Age at which unfinished trainings are deleted: most are never resumed, and they contain data on people.
 _KEPT_S = 30 * 24 * 3600.0
 _SAVE_EVERY_S = 0.5
-# Training warns when float and 8 bits agree on a smaller share of the validation windows.
+# Training warns if float and 8-bit predictions agree on a smaller share of the validation windows than this.
 _AGREEMENT = 0.95
 
 
@@ -75,7 +75,7 @@ def unfinished(dataset: Dataset | str | os.PathLike[str]) -> Journal:
 
 
 class ResumableTraining:
-    """The state of one training in a journal, stored under a key of everything that its outcome depends on."""
+    """The state of one training in a journal, under an id derived from everything that the outcome depends on."""
 
     def __init__(self, journal: Journal, network: Arch, spec: TrainSpec, train: WindowSet, watched: WindowSet) -> None:
         from plushsense.training.fit import resolve_device
@@ -88,7 +88,7 @@ class ResumableTraining:
         self._job = job_id({"what": "training", **settings, "windows": fingerprints})
 
     def load(self) -> FitState | None:
-        """Return the saved state; None without one."""
+        """Return the saved state, or None."""
         entry = self._journal.find(self._job)
         if entry is None:
             return None
@@ -98,7 +98,7 @@ class ResumableTraining:
         return FitState.from_arrays(entry)
 
     def save(self, state: FitState) -> None:
-        """Save the state, if the journal can be written."""
+        """Save the state; do nothing if the journal cannot be written."""
         spent = self.before_s + time.monotonic() - self._began
         keep_if_possible(self._journal, self._job, {**state.to_arrays(), "seconds": spent})
 
@@ -109,9 +109,9 @@ class ResumableTraining:
 
 @dataclass(frozen=True)
 class TrainAndPredict:
-    """The job of one fold of a cross-validation: train a network and predict the test windows.
+    """The work of one fold of a cross-validation: train a network and predict the test windows.
 
-    With ``int8`` the network is also quantized, with the value ranges of its training windows, and predicts them too.
+    With ``int8``, the network is also quantized with the value ranges of its training windows and predicts in 8 bits.
     """
 
     arch: Arch
@@ -137,8 +137,8 @@ class TrainAndPredict:
 class Trained:
     """A trained network: its ``bundle``, the ``history`` of its epochs, and its validation ``scores``.
 
-    ``seconds`` is the training time, with that before an interruption. It is not in the bundle: the same data, settings
-    and seed give the same file, byte for byte.
+    ``seconds`` is the training time, including that before an interruption. The bundle does not contain it, so that
+    equal data, settings and seed give the same file, byte for byte.
     """
 
     bundle: Bundle
@@ -175,22 +175,22 @@ def train(
 ) -> Trained:
     """Train one network on a data set.
 
-    Whole people are held out for validation (15 % of them, chosen by the seed), and the scores are theirs. With early
-    stopping they also decide when to stop, so the scores are slightly too high; `evaluate` scores all people. The
-    preset ``search`` splits windows as the paper does (70/15/15), which is leaky and marked so. ``context="anywhere"``
-    trains for live use (see `windows.anywhere`): idleness is a class, and whole gestures with their real past are
-    scored.
+    15 % of the people, chosen by the seed, are held out for validation, and the network is scored on them. With early
+    stopping they also determine when to stop, so that the scores are slightly too high; `evaluate` scores all people.
+    The preset ``search`` splits windows as the paper does (70/15/15), which is leaky and marked as such.
+    ``context="anywhere"`` trains for live use (see `windows.anywhere`): idleness is a class, and the scored windows are
+    those of whole gestures with the real signal before them.
 
     Args:
-        config: resolved settings; or give ``arch``, ``filters`` and settings such as ``preset="loso"``,
+        config: resolved settings; alternatively give ``arch``, ``filters`` and settings such as ``preset="loso"``,
             ``context="loop"``, ``epochs=20``, ``seed=1``, ``classes="all"``, ``padding``, ``norm``.
         quantize_aware: epochs of fine-tuning for 8 bits after the training (see `training.quantized`).
         fit_decisions: also fit the decision settings on the validation people (see `tuning.decisions`). Settings in
-            ``config.live`` that are not defaults are not changed.
-        journal: stores the progress of the training (see `unfinished`). An interrupted training resumes and gives the
-            same bundle; the steps after the training are repeated.
+            ``config.live`` that differ from the defaults are kept.
+        journal: stores the progress of the training (see `unfinished`), so that an interrupted one resumes and gives
+            the same bundle. The steps after the training are repeated.
         progress: called with (epoch, maximum of epochs, the epoch's row), first for the epochs before an interruption.
-        warn: called with a sentence for everything that is left out, and when 8 bits change many answers.
+        warn: called with a sentence for everything that is left out, and if 8-bit arithmetic changes many predictions.
     """
     dataset = as_dataset(dataset)
     config = config or from_settings(arch=arch, filters=filters, **settings)
@@ -207,7 +207,7 @@ def train(
     division = divide(windows, config, scored)
     train_at, test_at = division.train, division.fold.test
     if division.kind == WHOLE_PEOPLE:
-        # Decisions are fitted on the whole streams of the validation people.
+        # Decisions are fitted on whole streams of the validation people, which may contain recordings at rest.
         train_at = train_at[outside_streams(windows, dataset, division.fold.subjects)[train_at]]
     from plushsense.training.fit import fit, predict
 
@@ -285,13 +285,13 @@ def train(
         bundle = _with_decisions(bundle, dataset, config.live, warn)
     if state:
         state.discard()
-    # `forget` did not see this bundle: refuse it if a person was removed meanwhile.
+    # `forget` cannot find an unsaved bundle: raise an error if a person was removed during the training.
     dataset.generation.check()
     return Trained(bundle, fitted.history, scores, fitted.seconds + (state.before_s if state else 0.0))
 
 
 def _with_decisions(bundle: Bundle, dataset: Dataset, given: DecideSpec, warn: Warn) -> Bundle:
-    """Return the bundle with decision settings fitted on the validation people; unchanged without them."""
+    """Return the bundle with decision settings fitted on its validation people; unchanged if it has none."""
     if bundle.provenance["split"] != WHOLE_PEOPLE:
         warn("decision settings are the defaults: fitting them needs whole people held out for validation")
         return bundle
@@ -328,7 +328,7 @@ def evaluate(
 ) -> Evaluation:
     """Train and score one network for each fold of ``split``.
 
-    Finished folds are stored in the data set's ``cache`` folder; an interrupted evaluation resumes.
+    Finished folds are stored in the data set's ``cache`` folder, so that an interrupted evaluation can be resumed.
 
     Args:
         config, arch, filters, settings, warn: as for `train`; also ``train_context`` and ``workers``.
@@ -392,11 +392,11 @@ def simulate(
     dataset: str | os.PathLike[str] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Write recordings of virtual people as the authors' recorder writes them, by default as many as in the paper.
+    """Write recordings of virtual people in the format of the paper's recorder, by default as many as in the paper.
 
     Args:
         out: a new or empty folder.
-        dataset: a folder to import them to as a data set.
+        dataset: a folder in which to import the recordings as a data set; default: none.
         progress: called with ("recording" or "importing", done, total).
     """
     from plushsense.recording.simulate import simulate as run
@@ -419,7 +419,7 @@ def simulate(
 def import_simulation(
     source: str | os.PathLike[str], dest: str | os.PathLike[str], progress: Callable[[str, int, int], None]
 ) -> Dataset:
-    """Import the recordings of `simulate` as a data set that is marked as a simulation."""
+    """Import the recordings that `simulate` wrote as a data set, which is marked as a simulation."""
     return import_recordings(
         Path(source),
         Path(dest),

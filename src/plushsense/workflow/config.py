@@ -1,4 +1,4 @@
-"""Settings of one run: network, training, windows and split, which a TOML file may contain.
+"""Settings of one run, which a TOML file can contain: network, training, windows and split.
 
     [windows]     window_s, step_s, context, longest_factor
     [anywhere]    every_s, onset_s, after_s, settle_s, idle_share, busy_share
@@ -7,7 +7,7 @@
     [evaluation]  split, classes, train_context, workers, seed
     [live]        smoothing_s
 
-Options of the command line override the file; an unknown key is refused with the nearest known one.
+Options of the command line override the file. An unknown key is an error that names the most similar known key.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SHARED, ALL = "shared", "all"
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """Settings of the network in seconds. ``padding`` None: the preset's; ``pool_s`` None: the whole window."""
+    """Settings of the network, times in seconds. ``padding`` None: the preset's; ``pool_s`` None: the whole window."""
 
     arch: str = DEFAULT_SYMBOL
     filters: tuple[int, ...] = DEFAULT_FILTERS
@@ -111,12 +111,12 @@ class RunConfig:
 
     @property
     def scored_on(self) -> WindowSpec:
-        """Settings of the scored windows. With context "anywhere", gestures with their real past are scored."""
+        """Settings of the scored windows; the context "stream" (gestures with their real past) replaces "anywhere"."""
         return replace(self.windows, context="stream") if self.windows.context == ANYWHERE else self.windows
 
     @property
     def padding(self) -> str:
-        """The padding of the model, or else of the preset."""
+        """The padding of ``model``, or if that is None, of the preset."""
         return self.model.padding or PADDING[self.preset]
 
     def to_dict(self) -> dict[str, Any]:
@@ -155,7 +155,7 @@ _TABLES: dict[str, type[Any]] = {
 
 
 def _checked(name: str, given: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Return the values of a table; raise ConfigError for an unknown key or a value of another type."""
+    """Return the values of a table; raise ConfigError for an unknown key or a value of the wrong type."""
     if name == "windows" and "span_s" in given:
         raise ConfigError(
             f"In [windows]{source}, span_s cannot be set: it follows from the network; set arch, window_s or pool_s."
@@ -176,7 +176,7 @@ def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunCo
         flags: values of each table; None counts as not given. ``preset`` belongs to the table ``training``.
 
     Raises:
-        ConfigError: for an unknown table or key (with the nearest known one) or a value that does not fit.
+        ConfigError: for an unknown table or key (the message suggests the nearest known one) or an invalid value.
     """
     tables: dict[str, dict[str, Any]] = {name: {} for name in _TABLES}
     if path is not None:
@@ -213,7 +213,7 @@ def from_settings(**settings: Any) -> RunConfig:
     """Build a configuration from settings: ``arch="14d1_39d2_41d4", preset="loso"``; None counts as not given.
 
     Raises:
-        ConfigError: for an unknown setting, with the nearest known one.
+        ConfigError: for an unknown setting (the message suggests the nearest known one) or an invalid value.
     """
     known = [key for keys in _SETTINGS.values() for key in keys] + ["seed"]
     for key in settings:

@@ -36,7 +36,7 @@ from plushsense.models.bundle import Bundle
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Findings that a notebook displays.
+# Largest number of findings that a notebook displays.
 _MOST_FINDINGS = 50
 _KEY_BYTES = 32
 SUFFIX = ".plush"
@@ -44,16 +44,16 @@ SUFFIX = ".plush"
 
 @dataclass(frozen=True)
 class CheckResult(CheckReport):
-    """The findings of the checks as a result for notebooks, with figures and a report."""
+    """The findings of the checks, with figures, a report and a display for notebooks."""
 
     def figure(self, gesture: str) -> Figure:
-        """Draw all recordings of a gesture over each other, with outliers named, and their durations."""
+        """Draw all recordings of a gesture in one plot, with conspicuous ones named, and their durations."""
         from plushsense.reports.quality import gesture_figure
 
         return gesture_figure(self, self.dataset.gestures.get(gesture).label)
 
     def report(self, path: str | os.PathLike[str], progress: Progress | None = None) -> Path:
-        """Write one self-contained HTML page with plots; only an earlier report is replaced."""
+        """Write one self-contained HTML page with plots; of existing files only an earlier report is replaced."""
         from plushsense.reports.quality import write_report
 
         return write_report(Path(path), self, progress=progress)
@@ -116,7 +116,7 @@ def decide(
     """Mark decisions, then check the data set; return the result and the number of added marks.
 
     Args:
-        accept, unaccept: ``CHECK:PATTERN``, e.g. ``gaps:P26/*``; without a pattern, the data set as a whole.
+        accept, unaccept: ``CHECK:PATTERN``, e.g. ``gaps:P26/*``; ``CHECK`` alone means the data set as a whole.
         exclude, include: patterns of recordings, e.g. ``P19/*``.
         why: the reason, required to accept or exclude.
         who: the person who decides; default: the login name.
@@ -130,7 +130,7 @@ def decide(
         raise ConfigError('Accepting and excluding need a reason: give it with --why "…".')
     dataset = as_dataset(dataset)
     name = checking.author_name(who) if accept or unaccept or exclude or include else ""
-    # All patterns are resolved before anything is marked, so that a wrong one leaves no partial decision.
+    # Resolve all patterns before marking anything, so that a wrong one does not leave a partial decision.
     marks = checking.exclusions(dataset, exclude, include, who=name, why=why)
     marks += checking.withdrawals(dataset, unaccept, who=name, why=why)
     for acceptance in accept:
@@ -166,14 +166,14 @@ def publish_dataset(
 
     Args:
         out: a new or empty folder.
-        licence, contact, consent: an SPDX name, "Name <mail>", a statement; required where ``dataset.toml`` lacks them.
+        licence, contact, consent: an SPDX name, "Name <mail>", a statement; required if ``dataset.toml`` lacks them.
         save: also write these into the data set's ``dataset.toml``.
-        streams: publish whole sessions, with everything between the gestures.
-        excluded: publish excluded recordings too, marked.
+        streams: also publish the streams of whole sessions, with everything between the gestures.
+        excluded: also publish excluded recordings, marked as such.
         columns: columns of ``subjects.csv`` to publish besides age group and gender.
-        key: a file outside the data set, created if absent, that fixes the time shifts for later versions; without it
-            they are random.
-        bids: add a tree in the manner of Motion-BIDS.
+        key: a file outside the data set, created if absent. Packages made with the same key have the same time shifts;
+            without a key they are random.
+        bids: add a folder tree in the style of Motion-BIDS.
         reidentification: test whether people can be recognised, and report it in the package.
         published: ISO date of the publication (default: today).
         thorough: let the slow validators read every row of the streams.
@@ -219,7 +219,7 @@ def publish_dataset(
 
 
 def _read_key(path: Path, *beside: Path) -> bytes:
-    """Read the secret that seeds the time shifts; create it, readable by its owner only, where it does not exist."""
+    """Read the secret that seeds the time shifts; if the file does not exist, create it, readable only by its owner."""
     for folder in beside:
         if folder.resolve() in path.resolve().parents:
             raise DatasetError(f"The key '{path}' lies in '{folder}': store it elsewhere.")
@@ -279,8 +279,8 @@ def forget(
     """Remove a person from a data set permanently; without ``confirm``, only list what would be removed.
 
     Args:
-        bundles: folders or files to search for models trained on the person, besides the data set's folder. Models are
-            listed, not changed: train them again, and delete the old ones.
+        bundles: folders or files to search for models trained on the person, besides the data set's folder. The models
+            are only listed; the user must train them again and delete the old ones.
 
     Raises:
         DatasetError: when the person is not in the data set.
@@ -294,9 +294,9 @@ def forget(
 
 
 def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[TrainedOn]:
-    """Find the bundles in ``places`` that name the person among their training or validation people.
+    """Find the bundles in ``places`` that were trained, validated or adapted on the person.
 
-    Bundles that cannot be read, and exports of this data set, are listed too: whether they qualify is unknown.
+    Bundles that cannot be read, and exports of this data set, are listed too, because they may depend on the person.
     """
     name = DatasetHead.read(folder).name
     try:

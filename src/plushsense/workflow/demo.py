@@ -48,7 +48,7 @@ Progress = Callable[[str, int, int], None]
 
 
 def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress) -> dict[str, Any]:
-    """Run the demo into ``out``; a second run reuses the finished recordings and folds.
+    """Run the demo in the folder ``out``; a second run reuses the finished recordings and folds.
 
     Returns:
         the paths ``dataset``, ``bundle``, ``report`` and ``export``, the ``scores``, and the ``live`` decisions.
@@ -94,7 +94,7 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
 
 
 def _dataset(dest: Path, raw: Path, size: DemoSize, progress: Progress) -> Dataset:
-    """Simulate and import a data set of virtual people; open it where it exists."""
+    """Open the data set of virtual people; if it does not exist, simulate and import it."""
     if (dest / "dataset.toml").is_file():
         return open_dataset(dest)
     if not raw.exists():
@@ -103,7 +103,7 @@ def _dataset(dest: Path, raw: Path, size: DemoSize, progress: Progress) -> Datas
 
 
 def _export(bundle: Path, folder: Path) -> Path:
-    """Export the model; the folder of an earlier demo is replaced."""
+    """Export the model, replacing the export of an earlier demo."""
     if (folder / FACTS).is_file():
         shutil.rmtree(folder)
     return export(bundle, folder).folder

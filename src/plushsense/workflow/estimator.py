@@ -29,20 +29,20 @@ ANONYMOUS = "arrays"
 ANONYMOUS_RATE_HZ = 100.0
 
 _INT32 = np.iinfo(np.int32).max
-# Smallest number of steps in a channel's standard deviation, and largest number up to its peak: a later value may be
-# twice as large.
+# Smallest number of steps in a channel's standard deviation, and largest number of steps up to its peak, which leaves
+# room for later values.
 _STEPS_IN_SPREAD = 2.0**16
 _STEPS_IN_PEAK = 2.0**29
 # Relative standard deviation below which a channel is constant but for rounding errors.
 _CONSTANT = 1e-12
-# Windows in a batch of a prediction: a layer's output is in memory as a whole.
+# Number of windows to predict at once, which limits memory: the output of a layer is kept for all of them.
 _BATCH = 256
-# The settings that only the training reads.
+# The settings that are used only in training.
 _TRAINING = ("preset", "epochs", "batch", "learning_rate", "random_state")
 
 
 def rows_of(X: Any) -> tuple[Any, tuple[int, int] | None]:
-    """Return windows (N, C, T) as rows (N, C·T), as scikit-learn checks them, and (C, T); other input unchanged."""
+    """Return windows (N, C, T) as rows (N, C·T), which scikit-learn can check, and (C, T); other input and None."""
     shape = X.shape if hasattr(X, "shape") else np.asarray(X).shape
     if len(shape) < 3:
         return X, None
@@ -52,7 +52,7 @@ def rows_of(X: Any) -> tuple[Any, tuple[int, int] | None]:
 
 
 def shape_of(features: int, shape: tuple[int, int] | None, given: int | None) -> tuple[int, int]:
-    """Return (C, T) of the windows from their shape, else from the given number of channels, else for one channel."""
+    """Return (C, T) of windows with C·T = ``features``; C is that of ``shape``, or else ``given``, or else 1."""
     if given is not None and (not isinstance(given, int | np.integer) or given < 1):
         raise ArrayError(f"channels is {given!r}: accepted are None and whole numbers from 1 up.")
     if shape is not None and given is not None and shape[0] != given:
@@ -70,7 +70,7 @@ def shape_of(features: int, shape: tuple[int, int] | None, given: int | None) ->
 
 
 def people_of(groups: ArrayLike | None, n: int) -> NDArray[np.str_]:
-    """Return the person of each window, (N,); without groups each window is a person."""
+    """Return the person of each window, (N,); without ``groups`` each window counts as another person."""
     people = np.arange(n) if groups is None else np.asarray(groups)
     if people.shape != (n,):
         raise ArrayError(f"groups has the shape {people.shape}: expected ({n},), one a window.")
@@ -78,7 +78,7 @@ def people_of(groups: ArrayLike | None, n: int) -> NDArray[np.str_]:
 
 
 def watching_of(people: NDArray[np.str_], seed: int) -> NDArray[np.bool_]:
-    """Select the windows of the people who decide when training stops."""
+    """Return a mask (N,) of the windows of the people held out for early stopping; all False if there is one person."""
     names = np.unique(people)
     if len(names) < 2:
         return np.zeros(len(people), dtype=bool)
@@ -89,9 +89,9 @@ def watching_of(people: NDArray[np.str_], seed: int) -> NDArray[np.bool_]:
 def anonymous_layout(x: NDArray[Any]) -> Layout:
     """Build a layout for windows (N, C, T) without channel names.
 
-    Integers of up to 32 bits have the step 1. The step of floats is a power of two, at most 1/65536 of the channel's
-    standard deviation but at least 2⁻²⁹ of its largest value; the step of a constant channel is that value. The
-    unknown rate is set to 100 Hz.
+    Channels of integers of up to 32 bits have the step 1. The step of floats is a power of two, at most 1/65536 of the
+    channel's standard deviation but about 2⁻²⁹ of its largest value or more; for a constant channel, it is the power of
+    two at or below that value. The sampling rate is unknown and set to `ANONYMOUS_RATE_HZ`.
     """
     integers = x.dtype.kind in "biu"
     names = [f"channel {i}" for i in range(x.shape[1])]
@@ -123,13 +123,13 @@ def _step(values: NDArray[np.float64], integers: bool) -> float:
 
 
 def to_integers(x: NDArray[Any], layout: Layout) -> NDArray[np.int32]:
-    """Convert windows (N, C, T) to the integers that a network of ``layout`` reads.
+    """Convert windows (N, C, T) to the integers that are the input of a network with this layout.
 
     With an anonymous layout, values are rounded to its steps and clipped to 32 bits. With a real layout, windows must
-    be the integers of `cut_windows`.
+    have the integers of `cut_windows`.
 
     Raises:
-        ArrayError: for values that are not finite, or with a real layout not integers.
+        ArrayError: for values that are not finite; with a real layout, also for fractions or more than 32 bits.
     """
     refuse_holes(x)
     if layout.name == ANONYMOUS:
@@ -146,7 +146,7 @@ def to_integers(x: NDArray[Any], layout: Layout) -> NDArray[np.int32]:
 
 
 def refuse_holes(x: NDArray[Any]) -> None:
-    """Raise ArrayError for NaN and infinity, with the position of the first."""
+    """Raise ArrayError if there is NaN or infinity; the message has the position of the first."""
     if x.dtype.kind == "f" and not np.isfinite(x).all():
         bad = ~np.isfinite(x)
         window, channel, sample = (int(i) for i in np.argwhere(bad)[0])
@@ -188,7 +188,7 @@ def windows_of(
 def gestures_of(classes: NDArray[Any], known: GestureSet | None = None) -> GestureSet:
     """Build a gesture for each class, in class order, with affect and family where ``known`` has the label.
 
-    Labels that are empty, or equal in a gesture set (``a`` and ``A``), get their number as a prefix.
+    If labels are empty or equal in a gesture set (as ``a`` and ``A``), all labels get their class number as a prefix.
     """
     texts = [str(c) for c in classes.tolist()]
     plain = [plain_label(t) for t in texts]
@@ -200,7 +200,7 @@ def gestures_of(classes: NDArray[Any], known: GestureSet | None = None) -> Gestu
 
 
 def labels_table(classes: NDArray[Any]) -> dict[str, Any]:
-    """Return the labels of ``classes`` as a bundle stores them; `labels_from` restores them with their type."""
+    """Return the labels of ``classes`` in the form that a bundle stores and `labels_from` restores."""
     values = classes.tolist()
     if not all(isinstance(v, str | int | float) for v in values):
         return {"labels": [str(v) for v in values], "dtype": "O"}
@@ -208,7 +208,7 @@ def labels_table(classes: NDArray[Any]) -> dict[str, Any]:
 
 
 def labels_from(bundle: Bundle) -> NDArray[Any]:
-    """Restore the class labels of a bundle with their type; without a table, the gestures' labels."""
+    """Restore the class labels of a bundle with their type; without a stored table, return its gestures' labels."""
     table = bundle.provenance.get("estimator", {})
     if "labels" not in table:
         return np.array(bundle.gestures.labels)
@@ -216,8 +216,8 @@ def labels_from(bundle: Bundle) -> NDArray[Any]:
 
 
 if TYPE_CHECKING or importlib.util.find_spec("sklearn") is None:
-    # PlushClassifier must be importable without scikit-learn (`from plushsense import *`); creating one raises
-    # MissingExtraError. The type checker reads these declarations too.
+    # PlushClassifier must be importable without scikit-learn (`from plushsense import *`); constructing one then raises
+    # MissingExtraError. Type checkers use these declarations as well.
     class BaseEstimator:
         def __new__(cls, *_: Any, **__: Any) -> Self:
             need("sklearn", "baselines")
@@ -246,22 +246,22 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         cross_val_score(model, windows.x, y, groups=windows.subject, cv=LeaveOneGroupOut())
         model.fit(windows.x, y).save("model.plush", gestures=dataset.gestures)     # for ``plushsense live``
 
-    ``X`` is (N, C, T), N windows of C channels of T samples, or (N, C·T) as from ``X.reshape(N, -1)``, one channel
-    after the other; ``fit`` and ``predict`` may get different forms. Labels may be of any type that scikit-learn sorts.
-    Sample weights and ``partial_fit`` are not supported.
+    ``X`` has shape (N, C, T), N windows of C channels of T samples, or (N, C·T) as from ``X.reshape(N, -1)``, one
+    channel after the other; ``fit`` and ``predict`` may get different forms. Labels may be of any type that
+    scikit-learn can sort. Sample weights and ``partial_fit`` are not supported.
 
     Training needs the extra ``train`` (PyTorch); a trained or unpickled classifier predicts without it. A pickle
     contains the network as the bytes of a bundle, without objects of PyTorch.
 
     Args:
-        arch, filters, padding, norm: the network (see `Arch`). With padding None the preset's is used, for most
-            ``stream``, where T must be at least the receptive field; ``mirror`` works with any T from 2.
-        preset, epochs, batch, learning_rate: the training; None: the preset's number.
-        channels: number of channels in a row (N, C·T); default: that of ``layout``, else 1.
-        layout: a `Layout`, its name or its path, where ``X`` has the integers of `cut_windows`. Vectors are then
-            rotated in training as by `train`, and the bundle can read a toy. Without it, channels are anonymous (see
+        arch, filters, padding, norm: the network (see `Arch`). With padding None the preset's is used, which for most
+            presets is ``stream`` and requires T to be at least the receptive field; ``mirror`` works with any T from 2.
+        preset, epochs, batch, learning_rate: settings of the training; None: the value of the preset.
+        channels: number of channels C in rows (N, C·T); default: that of ``layout``, else 1.
+        layout: a `Layout`, its name or its path, if ``X`` has the integers of `cut_windows`. Vectors are then rotated
+            in training as by `train`, and the bundle can be used with a toy. Without it, channels are anonymous (see
             `anonymous_layout`).
-        random_state: an integer for the same weights each time, a RandomState, or None.
+        random_state: an integer for reproducible weights, a RandomState, or None.
 
     Attributes:
         classes_: the labels in class order, (K,).
@@ -273,7 +273,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         ArrayError: for arrays that do not fit; scikit-learn's own checks raise ValueError or NotFittedError.
     """
 
-    # With metadata routing, groups are passed to ``fit`` unless set_fit_request changes that.
+    # With metadata routing, ``groups`` is passed to ``fit`` unless set_fit_request changes that.
     __metadata_request__fit = {"groups": True}  # noqa: RUF012, RUF100
 
     classes_: NDArray[Any]
@@ -315,9 +315,9 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
     def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
         """Train on the windows ``X`` with the labels ``y`` (N,).
 
-        ``groups`` (N,) names the person of each window; the bundle stores the names, so that `forget` finds it. With a
-        preset that stops early (``loso``, ``paper``), 15 % of the people are held out for validation; without groups
-        15 % of the windows, which is leaky. Other presets train on all of X.
+        ``groups`` (N,) has the person of each window; the bundle stores these names, so that `forget` can find it. With
+        a preset that stops early (``loso``, ``paper``), 15 % of the people are held out for validation, or without
+        groups 15 % of the windows, which is leaky. Other presets train on all of ``X``.
         """
         from sklearn.utils.multiclass import check_classification_targets
         from sklearn.utils.validation import validate_data
@@ -393,7 +393,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         return self
 
     def decision_function(self, X: ArrayLike) -> NDArray[np.float64]:
-        """Return logits (N, K) in the order of ``classes_``; for two classes second minus first, (N,)."""
+        """Return logits (N, K) in the order of ``classes_``; for two classes the second minus the first, (N,)."""
         logits = self._logits(X)
         return logits[:, 1] - logits[:, 0] if logits.shape[1] == 2 else logits
 
@@ -421,7 +421,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
 
     @classmethod
     def from_bundle(cls, bundle: Bundle | str | os.PathLike[str]) -> Self:
-        """Build a trained classifier from a bundle; ``X`` must be as in its training."""
+        """Build a trained classifier from a bundle; ``X`` must have the same form and units as in its training."""
         bundle = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
         arch = bundle.arch
         settings: dict[str, Any] = {

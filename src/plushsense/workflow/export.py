@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from plushsense.runtime.decisions import DecideSpec
 
 
-_TRIED = 512  # windows that a converter compares
+_TRIED = 512  # maximum of windows on which a conversion is compared with the network
 
 
 def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], warn: Warn = silent) -> Bundle:
     """Return the bundle calibrated on its `training_windows`; a fine-tuned bundle keeps its calibration.
 
     Raises:
-        ArchError, BundleError: as `training_windows`.
+        ArchError, BundleError: as for `training_windows`.
     """
     refuse_undeployable(bundle.arch)
     if bundle.calibration and bundle.provenance.get("quantize_aware"):
@@ -48,14 +48,14 @@ def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], war
 def training_windows(
     bundle: Bundle, dataset: Dataset | str | os.PathLike[str], warn: Warn = silent
 ) -> NDArray[np.int32]:
-    """Cut the raw windows (N, C, T) of the people that a bundle was trained on, as for its training.
+    """Cut the raw windows (N, C, T) of the people on whom a bundle was trained, with the settings of the training.
 
     Args:
-        dataset: the data set of the training; `warn` is called when its content has changed since.
+        dataset: the data set of the training; ``warn`` is called if its content has changed since then.
 
     Raises:
         ArchError: for a network that cannot be deployed.
-        BundleError: when the training windows are missing, or cannot be distinguished from the validation windows.
+        BundleError: if the training windows are missing, or cannot be distinguished from the validation windows.
     """
     refuse_undeployable(bundle.arch)
     dataset = as_dataset(dataset)
@@ -65,7 +65,7 @@ def training_windows(
             "The bundle belongs to an export and does not name its training people, which calibration needs: give the "
             "bundle that plushsense train wrote."
         )
-    # Windows of nobody are in the training and in the validation part.
+    # Windows of `NOBODY` are used both for training and for validation.
     people = {str(s) for s in origin.get("subjects", ())} - {NOBODY}
     if origin.get("split") != WHOLE_PEOPLE or not people:
         raise BundleError(
@@ -108,13 +108,13 @@ def export(
     Args:
         bundle: a bundle with ``stream`` padding and batch normalisation.
         out: a new or empty folder.
-        dataset: the data set of the training, to calibrate on; required where the bundle has no calibration.
+        dataset: the data set of the training, to calibrate on; required if the bundle has no calibration.
         also: formats for other runtimes (`plushsense.deploy.convert.CONVERTERS`), such as ``onnx``.
         warn: called with a sentence for everything unusual.
 
     Raises:
-        ArchError: for a network that cannot be deployed, with the nearest that can.
-        BundleError: for a bundle without calibration, or a conversion that gives other answers than the network.
+        ArchError: for a network that cannot be deployed; the message suggests the nearest one that can.
+        BundleError: for a bundle without calibration, or a conversion whose output differs from the network's.
         ConfigError, MissingExtraError: for an unknown format, or one whose package is not installed.
         BadInput: for a folder that is not empty.
     """
@@ -148,7 +148,7 @@ def classifier_of(bundle: Bundle, decide: DecideSpec | None, engine: str) -> Str
     """Build the stream classifier of a bundle for one of the `ENGINES`.
 
     Raises:
-        BundleError: for ``int8`` and ``both``, where the network cannot be deployed.
+        BundleError: for ``int8`` and ``both``, if the network cannot be deployed.
     """
     from plushsense.deploy.quantize import integer_model
     from plushsense.runtime.classifier import BothEngines, IntegerClassifier, StreamClassifier

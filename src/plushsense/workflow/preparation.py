@@ -47,7 +47,7 @@ def choose_classes(dataset: Dataset, choice: str | Sequence[str], warn: Warn = s
 
 
 def classes_for(dataset: Dataset, choice: str | Sequence[str], context: str, warn: Warn = silent) -> GestureSet:
-    """Return the chosen gestures, with one for idleness where the context is "anywhere"."""
+    """Return the chosen gestures, and with context "anywhere" one for idleness."""
     gestures = choose_classes(dataset, choice, warn)
     if context != ANYWHERE:
         return gestures
@@ -65,7 +65,7 @@ def windows_for(
     warn: Warn = silent,
     anywhere: AnywhereSpec | None = None,
 ) -> WindowSet:
-    """Cut the windows of a network, as long as the span that a decision depends on."""
+    """Cut windows for a network, which are as long as the span that its decisions depend on."""
     span_s = arch.span / dataset.layout.rate_hz
     spec = replace(spec, span_s=span_s if span_s > spec.window_s else 0.0)
     if spec.context == ANYWHERE:
@@ -78,10 +78,10 @@ def windows_for(
 
 
 def outside_streams(windows: WindowSet, dataset: Dataset, people: Collection[str]) -> NDArray[np.bool_]:
-    """Return which windows are in no stream of ``people``, (N,).
+    """Return a mask (N,) of the windows that lie in no stream of ``people``.
 
-    Recordings of the toy at rest belong to nobody and train in every fold, but may lie in a person's session. People
-    whose whole streams are scored must not contribute any training window.
+    Recordings at rest belong to `NOBODY` and are used for training in every fold, but may lie in a person's stream.
+    Streams that are scored as a whole must not contribute any training window.
     """
     theirs = [s.id for s in dataset.streams if s.subject in people]
     return ~np.isin(windows.stream, np.array(theirs, dtype=np.str_))
@@ -92,10 +92,7 @@ WHOLE_PEOPLE = "validation-subjects"
 
 @dataclass(frozen=True)
 class TrainValidationSplit:
-    """The train/validation split of a single training.
-
-    ``train`` and ``watch`` are indices of training and validation windows.
-    """
+    """The train/validation split of a single training; ``train`` and ``watch`` are indices of the windows of each."""
 
     split: Split
     kind: str
@@ -106,10 +103,10 @@ class TrainValidationSplit:
 
 
 def divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = None) -> TrainValidationSplit:
-    """Hold out some people for validation, or some recordings where there are fewer than three people.
+    """Hold out people for validation; with fewer than three, recordings; with the preset ``search``, windows.
 
-    ``watch`` and the fold's ``test`` are indices into ``scored``: the same recordings, cut in another way (default:
-    ``windows``). No scored recording is trained on.
+    ``watch`` and the fold's ``test`` are indices into ``scored``, windows of the same recordings that may be cut with
+    other settings (default: ``windows``). Except with ``search``, no scored recording is trained on.
     """
     scored = windows if scored is None else scored
     seed = config.evaluation.seed

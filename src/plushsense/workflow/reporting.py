@@ -1,4 +1,4 @@
-"""Store evaluations in folders, and write reports of them."""
+"""Check folders for results, store evaluations in them, and write reports of evaluations."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ def check_folder(out: Path, what: str) -> None:
 
 
 def check_results(out: Path, what: str, summary: str, identity: str | None = None, *, replace: bool = False) -> None:
-    """Check that results can be written to the folder ``out``, before the work rather than after.
+    """Check before the work that its results can be written to the folder ``out``.
 
     Args:
-        what: names the results, as in "A sweep".
-        summary: the name of their JSON file, which holds the ``id`` of the results.
-        identity: the id of the new results; without one, any earlier results are refused.
-        replace: accept a folder that holds other results.
+        what: name of the results in messages, as in "A sweep".
+        summary: name of their JSON file, which contains the ``id`` of the results.
+        identity: the id of the new results; if None, any earlier results are an error.
+        replace: accept a folder with other results.
 
     Raises:
-        ConfigError: where ``out`` cannot be a folder, or holds results of other settings or other data.
+        ConfigError: if ``out`` cannot be a folder, or has results of other settings or other data.
     """
     check_folder(out, what)
     path = out / summary
@@ -64,7 +64,7 @@ def check_results(out: Path, what: str, summary: str, identity: str | None = Non
 def journal_of(dataset: Dataset, kind: str) -> Journal:
     """Return the journal of one kind of results in the data set's cache.
 
-    Its methods raise ForgottenError if a person was removed since ``dataset`` was opened (`dataset.generation`).
+    Writing to it raises ForgottenError if a person was removed since ``dataset`` was opened (`dataset.generation`).
     """
     return Journal(dataset.path / CACHE / kind, dataset.generation.writing)
 
@@ -84,7 +84,7 @@ SCORES, PREDICTIONS, PAGE = "evaluation.json", "predictions.parquet", "report.ht
 
 
 def evaluation_id(config: RunConfig, dataset: Dataset) -> str:
-    """Return 20 hexadecimal digits that are the same for the same settings and data."""
+    """Return an identifier of 20 hexadecimal digits, equal for equal settings and data."""
     return job_id({"settings": config.outcome(), "data": dataset.hash})
 
 
@@ -92,8 +92,8 @@ def check_place(out: Path, config: RunConfig, dataset: Dataset, *, replace: bool
     """Check before the training that an evaluation can be written to a folder.
 
     Raises:
-        ConfigError: when ``out`` is not a folder, has a ``report.html`` of something else, or (without ``replace``) an
-            evaluation of other settings or data.
+        ConfigError: if ``out`` is not a folder, has a ``report.html`` that is not a report of PlushSense, or (without
+            ``replace``) has an evaluation of other settings or data.
     """
     from plushsense.reports.page import check_page_path
 
@@ -116,7 +116,7 @@ def check_place(out: Path, config: RunConfig, dataset: Dataset, *, replace: bool
 def save_evaluation(result: Evaluation, dataset: Dataset, config: RunConfig, arch: Arch, out: Path) -> Path:
     """Write ``predictions.parquet`` and ``evaluation.json`` (scores, data set, network, settings) to a folder."""
     out.mkdir(parents=True, exist_ok=True)
-    # `forget` reads the people from the scores: never leave new predictions beside scores of other people.
+    # `forget` finds the people in the scores, so that new predictions must never lie beside scores of other people.
     (out / SCORES).unlink(missing_ok=True)
     result.write_predictions(out / PREDICTIONS)
     content = {
@@ -230,13 +230,13 @@ def _evaluation_table(source: Evaluation | Mapping[str, Any] | str | os.PathLike
             ) from None
         except (OSError, ValueError) as error:
             raise BadInput(f"'{path}' is not an evaluation ({error}): give a folder written by evaluate.") from None
-    # The title names the network, and the model card has its counts.
+    # The title names the network, and the model card shows its numbers.
     table.pop("model", None)
     return table
 
 
 def name_of(config: RunConfig, dataset: Dataset) -> str:
-    """Return a folder name for an evaluation: readable settings, and a hash of everything else."""
+    """Return a folder name for an evaluation: the main settings and the start of `evaluation_id`."""
     evaluation, model = config.evaluation, config.model
     context = config.windows.context
     if evaluation.train_context not in (None, context):

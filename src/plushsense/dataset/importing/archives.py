@@ -1,7 +1,7 @@
-"""Unpack zip archives of unknown origin safely, and make reproducible entries for our own.
+"""Unpack zip archives of unknown origin safely, and create reproducible entries for the zips that PlushSense writes.
 
-Every member is unpacked or refused with a reason: links, devices, paths that leave the folder, names that are ambiguous
-or reserved on some file system, encrypted or damaged members, and extreme expansion ratios are refused.
+Every member is unpacked or refused with a reason. Refused are links, devices, paths outside of the folder, names that
+are ambiguous or reserved on some file system, encrypted or damaged members, and extreme expansion ratios.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _WHEN = (1980, 1, 1, 0, 0, 0)
 _DEEPEST = 30
 _LONGEST_NAME = 200
 _LONGEST_PATH = 800
-# Small files are exempt from the ratio: a recording of zeros packs well.
+# Small files are exempt from the ratio, since a recording of zeros compresses well.
 _SMALL_BYTES = 4_000_000
 _FORBIDDEN = re.compile(r'[\x00-\x1f\x7f:*?"<>|]')
 DAMAGED: tuple[type[Exception], ...] = (
@@ -38,7 +38,7 @@ DAMAGED: tuple[type[Exception], ...] = (
     struct.error,
     ValueError,
 )
-"""Exceptions of zipfile for bytes that are no zip, or a damaged one."""
+"""Exceptions that zipfile raises for a damaged zip, or for bytes that are no zip."""
 try:
     import lzma
 
@@ -49,7 +49,7 @@ except ImportError:  # A Python that was built without lzma refuses such members
 
 @dataclass(frozen=True)
 class UnpackLimits:
-    """Limits of unpacking: bytes in total, files, and expansion ratio (for members over 4 MB)."""
+    """Limits of unpacking: total bytes, number of files, and expansion ratio (only for members over 4 MB)."""
 
     total_bytes: int = 8_000_000_000
     files: int = 200_000
@@ -62,7 +62,7 @@ class UnpackLimits:
 
 
 def zip_entry(name: str) -> zipfile.ZipInfo:
-    """Return a zip entry without times and modes of the disk, so that the same files give the same bytes."""
+    """Return a zip entry with constant time and mode, so that zips of the same files are equal byte by byte."""
     entry = zipfile.ZipInfo(name, _WHEN)
     entry.compress_type = zipfile.ZIP_DEFLATED
     entry.create_system = 3
@@ -93,7 +93,7 @@ def _target(name: str) -> PurePosixPath | str:
 
 
 def refusal(info: zipfile.ZipInfo, limits: UnpackLimits) -> str:
-    """Return why a member is refused by its directory entry; "" if it may be unpacked."""
+    """Return the reason to refuse a member by its directory entry; "" if it may be unpacked."""
     kind = stat.S_IFMT(info.external_attr >> 16)
     if kind == stat.S_IFLNK:
         return "a symbolic link is not followed"
@@ -112,7 +112,7 @@ def refusal(info: zipfile.ZipInfo, limits: UnpackLimits) -> str:
 def unpack_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path, limit: int) -> int:
     """Write one member to the new file ``target`` and return its size.
 
-    A member that holds more than its declared size, or than ``limit`` bytes, counts as damaged and is removed again.
+    If the member is longer than its declared size or than ``limit`` bytes, it is removed and BadZipFile raised.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
     written = 0
@@ -125,7 +125,7 @@ def unpack_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path,
                 out.write(chunk)
     except BaseException as cause:
         target.unlink(missing_ok=True)
-        # bzip2 raises OSError for damaged bytes, without a number, unlike the disk.
+        # For damaged bytes bzip2 raises OSError without an error number, unlike errors of the disk.
         if isinstance(cause, OSError) and cause.errno is None:
             raise zipfile.BadZipFile(str(cause)) from None
         raise
@@ -133,11 +133,11 @@ def unpack_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path,
 
 
 def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list[tuple[str, str]]:
-    """Unpack the zip ``path`` into the empty ``folder``; return the refused members with the reason.
+    """Unpack the zip ``path`` into the empty ``folder``; return the refused members, each with the reason.
 
     Raises:
-        DatasetError: for a file that is no zip, or one that holds more files or bytes than ``limits`` allow.
-        OSError: when the disk refuses.
+        DatasetError: for a file that is no zip, or one with more files or bytes than ``limits`` allow.
+        OSError: for errors of the disk.
     """
     limits = limits or UnpackLimits()
     refused: list[tuple[str, str]] = []

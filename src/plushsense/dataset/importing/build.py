@@ -1,4 +1,4 @@
-"""Create a data set from the files of a source: copy and read them, and account for each."""
+"""Create a data set from the files of a source: copy them, read the copies, and report the result for each file."""
 
 from __future__ import annotations
 
@@ -31,29 +31,29 @@ from plushsense.recording.session_files import SESSION_LOG
 
 TWICE = "the same file was already imported"
 ORPHAN = "belongs to '{}', which was not imported"
-# Files that the recorder only appends to.
+# Files to which the recorder only appends.
 APPENDED = (STREAM_NAME, SESSION_LOG)
 _LONGEST = 120
-# Names that Windows keeps for devices, with any suffix.
+# Names that Windows reserves for devices, with any suffix.
 DEVICE_NAME = re.compile(r"^(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³]|conin\$|conout\$)\s*(\.|$)", re.IGNORECASE)
 
 
 def folder_name(code: str, otherwise: str = UNKNOWN_SUBJECT) -> str:
-    """Return a code as a folder name that is valid on any system and cannot leave the data set."""
+    """Return a folder name for ``code`` that is valid on any system and inside the data set."""
     name = "".join(c if c.isalnum() or c in "-_. " else "_" for c in code).strip(" .")
     return f"{name}_" if DEVICE_NAME.match(name) else name or otherwise
 
 
 def session_folder(session: str) -> str:
-    """Return a session as a folder name, distinct from those that keep files of one name apart."""
+    """Return a folder name for ``session`` that differs from the folders for files of the same name (``again-2``)."""
     name = folder_name(session, "1")
     return f"session-{name}" if name.startswith(DUPLICATE_FOLDER) else name
 
 
 def refuse_merged(files: Sequence[SourceFile], there: Iterable[str] = ()) -> None:
-    """Refuse codes of people or sessions that would share a folder name.
+    """Raise DatasetError if codes of people or sessions are too long, or would get the same folder name.
 
-    ``there`` are the folders of people that a data set has already.
+    ``there`` are the folders of people in the existing data set.
     """
     codes = {(folder.casefold(), ""): folder for folder in there}
     not_met = set(codes)
@@ -65,7 +65,7 @@ def refuse_merged(files: Sequence[SourceFile], there: Iterable[str] = ()) -> Non
         key = (folder.casefold(), within)
         first = codes.setdefault(key, code)
         if key in not_met and first == folder:
-            # The code from which an existing folder was named is unknown.
+            # The code behind an existing folder is unknown: assume that it is the first one that matches.
             not_met.discard(key)
             codes[key] = code
         elif first != code:
@@ -76,11 +76,11 @@ def refuse_merged(files: Sequence[SourceFile], there: Iterable[str] = ()) -> Non
 
 @dataclass
 class Copier:
-    """Copies files below ``work``, which is or becomes (a part of) a data set.
+    """Copier of files into ``work``, which becomes a data set or part of one.
 
-    ``taken`` maps paths below the data set (case-folded; raw files without suffix, since these are ids) to SHA-256.
-    ``contents`` are the existing raw files by kind and SHA-256, which are not copied again. ``there`` is the folder of
-    the existing data set: a stream or log in it that has grown since is replaced by the longer one.
+    ``taken`` maps the files of the data set, by `key_of`, to SHA-256. ``contents`` maps kind and SHA-256 of existing
+    raw files, which are not copied again, to their paths. ``there`` is the folder of the existing data set, in which a
+    stream or log is replaced if the source has a longer version of it.
     """
 
     work: Path
@@ -94,10 +94,10 @@ class Copier:
     already: dict[Path, str] = field(default_factory=dict)
     """Path below the data set of each source that exists already."""
     companions: dict[str, list[Path]] = field(default_factory=dict)
-    """Sources of the companions of each copied file."""
+    """Sources of the companions of each copied file, by its new path."""
 
     def copy(self, file: SourceFile) -> str:
-        """Copy one file and return "", or the reason why not; companions come after the file that they belong to."""
+        """Copy a file and return "", or the reason why not; companions must come after the file they belong to."""
         try:
             raw = file.source.read_bytes()
         except OSError as cause:
@@ -136,9 +136,9 @@ class Copier:
         return ""
 
     def _continues(self, file: str, raw: bytes) -> bool | None:
-        """Return True if ``raw`` continues an existing append-only file, False if the existing file continues ``raw``.
+        """Return True if ``raw`` continues an existing append-only file, False for the reverse, None for neither.
 
-        None if neither is the case. An incomplete last line is ignored, since the recorder completes it.
+        An incomplete last line is ignored, since the recorder completes it.
         """
         if self.there is None or file.rpartition("/")[2] not in APPENDED or file in self.grown:
             return None
@@ -151,7 +151,7 @@ class Copier:
         return longer is raw if begins and longer.startswith(begins) else None
 
     def _folder(self, file: SourceFile) -> str | None:
-        """Return the folder of the data set that a file goes to; None for a companion whose file was not copied."""
+        """Return the destination folder of a file; None for a companion whose file was not copied."""
         if file.beside is not None:
             main = self.copied.get(file.beside) or self.already.get(file.beside)
             return None if main is None else main.rpartition("/")[0]
@@ -160,7 +160,7 @@ class Copier:
 
 
 def key_of(path: str, *, companion: bool) -> str:
-    """Return the key in `Copier.taken` of a file by its path below the data set."""
+    """Return the key of a path in `Copier.taken`: case-folded, for raw files without suffix, as their ids."""
     folder, _, name = path.casefold().rpartition("/")
     return f"{folder}/{name}/" if companion else f"{folder}/{name.rpartition('.')[0]}"
 
@@ -175,11 +175,11 @@ NO_PEOPLE = (
 
 @dataclass
 class ImportSummary:
-    """Result of an import; ``rejected``, ``left_out`` and ``warnings`` name each file.
+    """Result of an import; ``rejected``, ``left_out`` and ``warnings`` have an entry for each file or warning.
 
     ``recordings``, ``subjects``, ``gestures`` and ``streams`` describe the data set after the import; ``added`` counts
-    new recordings and streams, ``already_there`` files that were not copied again. ``companions`` counts sidecars,
-    session heads and logs.
+    new recordings and streams, ``already_there`` the files that existed already, ``companions`` the copied sidecars,
+    session heads and logs, ``excluded`` the new recordings that are excluded.
     """
 
     dataset: Dataset
@@ -208,7 +208,7 @@ class ImportSummary:
 
 
 class ImportedFiles:
-    """The files of a search, copied into the copier's work folder, and what happened to each."""
+    """Files of a search, copied into the work folder of ``copier``, with the result for each."""
 
     def __init__(self, search: SourceScan, copier: Copier):
         self.search = search
@@ -219,7 +219,7 @@ class ImportedFiles:
         # Raw files lie in recordings/<person>/ and streams/<person>/.
         people = {Path(file).parts[1] for file in copier.contents.values() if len(Path(file).parts) > 2}
         refuse_merged([f for f in search.found if f.kind in (RECORDINGS, STREAMS)], people)
-        # A companion goes where its file went.
+        # Companions come last, since they are copied beside their files.
         for found in sorted(search.found, key=lambda f: f.kind == COMPANIONS):
             if found.kind == LEFT_OUT:
                 self.left_out.append({"file": found.origin, "reason": found.reason})
@@ -234,7 +234,7 @@ class ImportedFiles:
         self.rejected.append({"file": file.origin, "reason": reason})
 
     def drop(self, unreadable: Mapping[str, str]) -> None:
-        """Remove unreadable files and their companions from the work folder."""
+        """Remove unreadable files and their companions from the work folder, and reject them."""
         for file, reason in unreadable.items():
             self.reject(self._origin[file], reason)
             self._remove(file)
@@ -249,7 +249,7 @@ class ImportedFiles:
 
     @property
     def kept(self) -> dict[str, SourceFile]:
-        """Files that were copied, by their path below the data set."""
+        """Copied files by their path below the data set."""
         return dict(self._origin)
 
     def count(self, kind: str) -> int:
@@ -257,12 +257,12 @@ class ImportedFiles:
         return sum(f.kind == kind for f in self._origin.values())
 
     def check(self) -> None:
-        """Assert that every file of the search is accounted for."""
+        """Assert that every file of the search was copied, exists already, or is rejected or left out."""
         accounted = len(self._origin) + len(self.copier.already) + len(self.rejected) + len(self.left_out)
         assert accounted == len(self.search.found), "every source file is imported, left out or rejected"
 
     def set_aside_reasons(self) -> dict[str, str]:
-        """Return by recording id why the recorder set it aside ("" if it did not), also for those already present."""
+        """Return for each recording id, also of existing files, why the recorder discarded it ("" if it did not)."""
         places = self.copier.copied | self.copier.already
         mine = (f for f in self.search.found if f.kind == RECORDINGS and f.source in places)
         return {recording_id(places[f.source]): f.set_aside for f in mine}
@@ -274,7 +274,7 @@ def recording_id(file: str) -> str:
 
 
 def extend_gestures(given: GestureSet | None, dataset: Dataset) -> GestureSet:
-    """Return the given set with every label that it lacks, or infer the set from the recordings."""
+    """Return ``given`` with the labels that it lacks, or infer a set from the recordings if it is None."""
     if given is None:
         return GestureSet.infer(r.gesture for r in dataset.recordings)
     unknown = sorted(r.gesture for r in dataset.recordings if given.find(r.gesture) is None)
@@ -286,7 +286,7 @@ def extend_gestures(given: GestureSet | None, dataset: Dataset) -> GestureSet:
 def merge_people(
     there: Mapping[str, PersonInfo], sessions: Iterable[PersonInfo], file: Mapping[str, PersonInfo], subjects: set[str]
 ) -> tuple[list[PersonInfo], list[str]]:
-    """Merge the people's table of the data set with the sessions (fill gaps) and the user's file (override)."""
+    """Merge the people ``there`` with ``sessions``, which fill gaps, and the user's ``file``, which overrides both."""
     keys = ("age_group", "gender", "consent")
     people, notes = dict(there), []
     for info in sessions:
@@ -327,7 +327,7 @@ def create_dataset(
     """Create the data set ``dest`` from a search, completely or not at all.
 
     Raises:
-        DatasetError: when nothing can be read, or ``dest`` is not empty.
+        DatasetError: if no recording can be read, or ``dest`` is not empty.
     """
     with new_folder(dest, DatasetError, last=HEAD) as work:
         account = ImportedFiles(search, Copier(work))
@@ -344,7 +344,7 @@ def create_dataset(
             )
         head = replace(head, gestures=extend_gestures(search.gestures, built.dataset))
         if {r.gesture for r in built.dataset.recordings} - set(head.gestures.labels):
-            # Spellings were merged: label the recordings again by the complete set.
+            # The set merges spellings of labels: build the index again with the complete set.
             built = build_index(work, head)
         listed, notes = merge_people({}, search.people, people, {r.subject for r in built.dataset.recordings})
         if listed:
@@ -360,7 +360,7 @@ def create_dataset(
 
 
 def read_copied(account: ImportedFiles, head: DatasetHead, progress: Progress | None) -> IndexBuild:
-    """Read what was copied and remove what cannot be read."""
+    """Build the index of the copied files, and remove those that cannot be read."""
     built = build_index(account.copier.work, head, progress)
     account.drop(built.unreadable)
     return built

@@ -1,7 +1,7 @@
-"""Import recordings into a new or existing data set: raw files are copied unchanged, and each is accounted for.
+"""Import recordings into a new or existing data set; raw files are copied unchanged.
 
-A file format is a function that scans a file and a line in ``FORMATS``; a structure of folders is a function in
-`importing.sources`.
+To support another file format, add a function that scans a file to ``FORMATS``; another folder structure is a function
+in `importing.sources`.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ from plushsense.dataset.store import (
 
 @contextmanager
 def _locked_work_folder(dest: Path) -> Iterator[Path]:
-    """Create a work folder on the data set's disk, locked for one import; leftovers of a killed import are removed."""
+    """Create a work folder on the disk of the data set for one import at a time; remove those of killed imports."""
     cache = dest / CACHE
     cache.mkdir(exist_ok=True)
     try:
@@ -90,12 +90,12 @@ def _locked_work_folder(dest: Path) -> Iterator[Path]:
 
 
 def _copier(dataset: Dataset, work: Path) -> Copier:
-    """Create a copier into ``work`` that knows the files of the data set."""
+    """Create a copier into ``work`` that does not copy files of the data set again."""
     taken: dict[str, str] = {}
     contents: dict[tuple[str, str], str] = {}
     for kind, infos in ((RECORDINGS, dataset.recordings), (STREAMS, dataset.streams)):
         for info in infos:
-            # Recordings that are rows of a stream are no files of their own.
+            # Recordings that are parts of a stream have no file of their own.
             if info.file.startswith(f"{kind}/"):
                 taken[key_of(info.file, companion=False)] = info.sha256
                 contents[(kind, info.sha256)] = info.file
@@ -106,10 +106,10 @@ def _copier(dataset: Dataset, work: Path) -> Copier:
 
 
 def _new_marks(folder: Path, set_aside: Mapping[str, str]) -> list[Mark]:
-    """Return marks for what the recorder decided since; decisions of people stay.
+    """Return marks for recordings that the recorder has discarded or kept since; marks of people take precedence.
 
     Args:
-        set_aside: the reason why the recorder discarded a recording by its id, "" if it did not.
+        set_aside: by recording id, the reason why the recorder discarded it, "" if it did not.
     """
     last: dict[str, tuple[str, str]] = {}
     for line in (folder / MARKS).read_bytes().split(b"\n") if (folder / MARKS).is_file() else ():
@@ -135,10 +135,10 @@ def add_to_dataset(
     people: Mapping[str, PersonInfo],
     progress: Progress | None,
 ) -> ImportSummary:
-    """Add the files of a search to the data set ``dest``; ``gestures`` may describe gestures that are new to it.
+    """Add the files of a search to the data set ``dest``; ``gestures`` may describe gestures that it lacks.
 
     Raises:
-        DatasetError: when the data set cannot be opened or written, or another import is at work.
+        DatasetError: if the data set cannot be opened, nothing can be added, or another import is running.
     """
     with _locked_work_folder(dest) as work:
         dataset = open_dataset(dest)
@@ -165,7 +165,7 @@ def add_to_dataset(
         there = read_people(dest)
         listed, notes = merge_people(there, search.people, people, subjects)
         account.check()
-        # The people's table is written as a whole, which would restore a person who was removed meanwhile.
+        # Writing the people's table would restore a person who was removed meanwhile.
         dataset.generation.check()
         new = set(account.kept)
         if head.gestures != dataset.head.gestures:
@@ -174,7 +174,7 @@ def add_to_dataset(
         append_marks(dest, marks)
         if {p.subject: p for p in listed} != there:
             write_people(dest, listed)
-        # Companions first, so that an existing recording always has its sidecar.
+        # Move companions first, so that a recording in the data set always has its sidecar.
         for file in sorted(new, key=lambda f: (f.lower().endswith(".csv"), f)):
             target = dest / file
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -187,7 +187,7 @@ def add_to_dataset(
 
 
 def _returning_people_warning(dest: Path, come: list[str]) -> list[str]:
-    """Return a warning if people are added to a data set from which people were removed, as they may be the same."""
+    """Return a warning if ``come`` were added to a data set from which people were removed: they may be the same."""
     gone = read_removals(dest)
     if not come or not gone:
         return []
@@ -207,8 +207,8 @@ SHOWN = 5
 class ImportOptions:
     """Options of an import; ``layout``, ``gestures`` and ``mapping`` (file to person) may be None.
 
-    ``layout_origin`` names the source of the layout in messages; ``columns`` maps roles to column names; ``new_folder``
-    makes a folder for unpacked or converted files.
+    ``layout_origin`` describes the layout in messages; ``columns`` maps roles to column names; ``new_folder`` creates
+    a temporary folder for unpacked or converted files.
     """
 
     layout: Layout | None
@@ -220,7 +220,7 @@ class ImportOptions:
     limits: UnpackLimits = field(default_factory=UnpackLimits)
 
     def known_layout(self, own: Layout | None = None) -> Layout:
-        """Return the layout that was found or requested; raise ConfigError if there is none."""
+        """Return the layout ``own`` of the source, else the given one; raise ConfigError if there is none."""
         if (layout := own or self.layout) is None:
             raise ConfigError(
                 f"--layout is needed, since only sessions of plushsense record name theirs: accepted are "
@@ -236,9 +236,9 @@ class ImportOptions:
 
 
 def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = None) -> SourceScan:
-    """Search a folder: sessions of our recorder, XDF files, and recordings by the structure of the folders.
+    """Search a folder for sessions of PlushSense's recorder, XDF files, and recordings by the folder structure.
 
-    ``around`` is the folder in which to search for the mark of a simulation, by default ``source``.
+    ``around`` is the folder of the zip if ``source`` was unpacked from one; a mark of a simulation counts there too.
     """
     all_files = source_files(source)
     simulated = is_simulation(around or source, all_files)
@@ -278,8 +278,8 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
 
 
 def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
-    """Search a zip, unpacked beside the new data set."""
-    # As if the user had unpacked it: recordings at the top belong to the person named by the folder.
+    """Unpack a zip beside the new data set and search it."""
+    # As if the user had unpacked it: recordings at the top belong to the person with the name of the zip.
     folder = options.new_folder("unpacked") / folder_name(path.stem)
     folder.mkdir()
     refused = unpack(path, folder, options.limits)
@@ -291,7 +291,7 @@ def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
 
 
 def scan_xdf(path: Path, options: ImportOptions) -> SourceScan:
-    """Search one XDF file."""
+    """Convert and search an XDF file."""
     search = _scan_of_file(path, "xdf", options)
     _add_xdf(path, path.name, (options.mapping or {}).get(path.name), options, search)
     return search
@@ -319,7 +319,7 @@ def _add_xdf(path: Path, name: str, person: str | None, options: ImportOptions, 
 
 
 def scan_table(path: Path, options: ImportOptions) -> SourceScan:
-    """Search one table with a row per sample."""
+    """Convert and search a table with one row per sample."""
     if parse_name(path.name) is not None:
         raise DatasetError(f"'{path}' is one recording: give the folder that holds the people's folders.")
     check_roles(options.columns, options.known_layout())
@@ -330,7 +330,7 @@ def scan_table(path: Path, options: ImportOptions) -> SourceScan:
 
 
 def _add(entries: Iterable[SourceFile | str], search: SourceScan) -> None:
-    """Add files and notes to ``search``."""
+    """Add ``entries`` to ``search``: files to its files, texts to its notes."""
     for entry in entries:
         if isinstance(entry, str):
             search.notes.append(entry)
@@ -348,7 +348,7 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], SourceScan]] = {
 
 @contextmanager
 def _temporary_folders(dest: Path) -> Iterator[Callable[[str], Path]]:
-    """Yield a function that creates folders beside ``dest`` for unpacked and converted files; remove all at the end."""
+    """Yield a function that creates folders beside ``dest`` for unpacked or converted files; remove them at the end."""
     with ExitStack() as stack:
 
         def create(what: str) -> Path:
@@ -362,10 +362,10 @@ def _temporary_folders(dest: Path) -> Iterator[Callable[[str], Path]]:
 
 
 def scan_source(source: Path, options: ImportOptions) -> SourceScan:
-    """Search ``source``: a folder, or a file of one of the ``FORMATS``.
+    """Search ``source``: a folder, or a file in one of the ``FORMATS``.
 
     Raises:
-        DatasetError: when it is neither, cannot be read, or holds nothing to import.
+        DatasetError: if it is neither, cannot be read, or contains nothing to import.
     """
     try:
         if source.is_dir():
@@ -418,21 +418,21 @@ def import_recordings(
     Args:
         source: a folder that a recorder wrote (sessions, a folder per person or per label), a zip of one, an XDF file,
             or one table (.csv, .parquet).
-        dest: the new data set, which must not exist or be empty; with ``add_to`` the data set to add to.
-        layout: the sensor layout or its name or path; not needed for sessions of our recorder, and with ``add_to``.
+        dest: a new or empty folder for the data set; with ``add_to`` the existing data set.
+        layout: the sensor layout, its name or path; not needed with ``add_to`` and for sessions of PlushSense.
         gestures: the gesture set; by default ``plush-18`` for plush layouts, else inferred from the labels.
         subjects: "folder" (the folder is the person) or the path of a mapping file ``file,subject``.
-        simulated: the virtual toy made the recordings; detected in folders that `plushsense simulate` wrote.
-        progress: called with (files done, files in all).
+        simulated: whether the virtual toy made the recordings; detected in folders that `plushsense simulate` wrote.
+        progress: called with (files done, number of files).
         people: the path of a people's table, see `dataset.store.read_people`.
         columns: the column of a table by role (``{"label": "activity"}``), or the ``stream`` of an XDF file.
         limits: limits of unpacking a zip.
 
     Returns:
-        The summary; every source file is imported, imported with a warning, left out or rejected with a reason.
+        The summary. Every source file is imported (possibly with warnings), left out, or rejected with a reason.
 
     Raises:
-        DatasetError: when there is nothing to import, or ``dest`` is not empty.
+        DatasetError: if there is nothing to import, or ``dest`` is not empty.
     """
     began = time.perf_counter()
     source, dest = Path(source), Path(dest)
@@ -452,7 +452,7 @@ def import_recordings(
             raise DatasetError(f"'{dest}' has the layout '{head.layout.name}', not '{given.name}': leave --layout out.")
         if name or licence or consent:
             raise ConfigError("--add keeps the name, licence and consent statement of the data set: leave them out.")
-    # An inferred set does not tell which markers of an XDF file are gestures.
+    # An inferred set cannot decide which markers of an XDF file are gestures.
     known = gestures if head is None or head.gestures.inferred else head.gestures
     with _temporary_folders(dest) as new_folder:
         options = ImportOptions(

@@ -1,8 +1,8 @@
 """Find the recordings in a source folder: kind, person and session of each file.
 
-Three folder layouts are read: sessions of our own recorder, folders of the GestureRecorder (by person, or by label
-after the authors' anonymising step), and folders of CSVs with a label on every row. Outside a session, the nearest
-folder names the person.
+Three folder structures are supported: sessions of PlushSense's recorder, folders of the GestureRecorder (by person, or
+by label after the authors' anonymising step), and folders of CSVs with a label on every row. Outside a session, the
+name of the nearest folder is the person.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _ASK = (
 
 @dataclass(frozen=True)
 class SourceFile:
-    """A source file and where it goes.
+    """File of a source, and its destination in the data set.
 
-    ``kind`` is recordings, streams, companions (copied beside another file, never read), left out (not needed), or ""
+    ``kind`` is recordings, streams, companions (copied beside another file but not read), left out (not needed), or ""
     for a refused file with its ``reason``. ``origin`` is its name in messages. ``beside`` is the file that a companion
-    belongs to, by default its session's stream. ``set_aside`` is the reason why the recorder discarded the recording.
+    belongs to, None for its session's folder. ``set_aside`` is the reason why the recorder discarded the recording.
     """
 
     source: Path
@@ -50,7 +50,7 @@ class SourceFile:
 
 @dataclass
 class SourceScan:
-    """Result of searching a source: every file once, and what its sessions state."""
+    """Result of searching a source: every file once (``found``), and layout, gestures and people of its sessions."""
 
     layout: Layout
     gestures: GestureSet | None
@@ -62,17 +62,17 @@ class SourceScan:
 
 
 def printable_path(path: Path) -> str:
-    """Return a path as text; characters that are not printable, or that would act on a terminal, are escaped."""
+    """Return a path as text in which characters that are not printable, such as control characters, are escaped."""
     text = os.fsencode(path).decode("utf-8", "backslashreplace").replace(os.sep, "/")
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def source_files(source: Path) -> list[Path]:
-    """Return every file below ``source`` in name order, and every link to a folder.
+    """Return every file and every link to a folder below ``source``, sorted by name in each folder.
 
     Raises:
-        DatasetError: when it contains a data set, which would be imported again.
-        OSError: when a folder cannot be listed.
+        DatasetError: if ``source`` is or contains a data set.
+        OSError: if a folder cannot be listed.
     """
 
     def refuse(cause: OSError) -> None:
@@ -94,7 +94,7 @@ def source_files(source: Path) -> list[Path]:
 
 
 def is_simulation(source: Path, files: Iterable[Path]) -> bool:
-    """Return whether the virtual toy made ``files``: its mark, or a simulated data set, is in or above the folder."""
+    """Return whether ``files`` are of the virtual toy: its mark or a simulated data set is in or above ``source``."""
     if any(f.name == SIMULATION_MARK for f in files):
         return True
     for place in (source.resolve(), *source.resolve().parents):
@@ -109,7 +109,7 @@ def is_simulation(source: Path, files: Iterable[Path]) -> bool:
 
 
 def split_regular_files(files: Iterable[Path]) -> tuple[list[Path], list[SourceFile]]:
-    """Split files into those that can be read and those refused: links, devices, names that are not text."""
+    """Split files into those to import and those refused: links, devices, unusable names."""
     good, refused = [], []
     for path in files:
         if reason := _refusal(path):
@@ -120,7 +120,7 @@ def split_regular_files(files: Iterable[Path]) -> tuple[list[Path], list[SourceF
 
 
 def _refusal(path: Path) -> str:
-    """Return why a file is refused by its kind or name; "" if it is not."""
+    """Return the reason to refuse a file by its kind or name; "" if there is none."""
     if path.is_symlink():
         return "a symbolic link is not followed"
     if not path.is_file():
@@ -137,7 +137,7 @@ def _refusal(path: Path) -> str:
 
 
 def _nobodys_folders(files: Iterable[Path], gestures: GestureSet | None) -> set[Path]:
-    """Return the folders in which every recording is of a gesture that nobody makes (the toy at rest)."""
+    """Return the folders in which every recording is of a gesture without a person (the toy at rest)."""
     with_nobody: set[Path] = set()
     with_people: set[Path] = set()
     for path in files:
@@ -149,9 +149,9 @@ def _nobodys_folders(files: Iterable[Path], gestures: GestureSet | None) -> set[
 
 
 def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested: bool) -> None:
-    """Refuse folders that do not identify the person, so that people are neither merged nor split.
+    """Raise DatasetError if two folders have the same name, so that people are neither merged nor split.
 
-    With ``nested``, also refuse a folder of recordings inside another one.
+    With ``nested``, also raise it for a folder of recordings inside another one.
     """
     folders: dict[str, Path] = {}
     for f in files:
@@ -171,19 +171,19 @@ def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested:
 
 
 def _mapped(path: Path, source: Path, subjects: dict[str, str]) -> str | None:
-    """Return the person of a file by the mapping, from its path below ``source`` or its name."""
+    """Return the person that ``subjects`` has for the path of a file below ``source``, or for its name."""
     return subjects.get(path.relative_to(source).as_posix(), subjects.get(path.name))
 
 
 def classify_gesture_recorder(
     source: Path, files: list[Path], subjects: dict[str, str] | None, gestures: GestureSet | None
 ) -> Iterator[SourceFile]:
-    """Yield recordings and streams in the folders of the GestureRecorder.
+    """Classify the files in the folders of the GestureRecorder.
 
     ``subjects`` maps file names (or paths below ``source``) to people; without it the nearest folder is the person,
-    or nobody if it holds only gestures that nobody makes.
+    or nobody if all its recordings are of the toy at rest.
     """
-    # Folders are gestures, not people, if every recording's label is its folder's name.
+    # Folders are gestures, not people, if the label of every recording is the name of its folder.
     named = [(path, name) for path in files if (name := parse_name(path.name)) is not None]
     named = [(path, name) for path, name in named if path.parent != source] or named
     by_label = subjects is None and bool(named)
@@ -215,7 +215,7 @@ def classify_gesture_recorder(
 def classify_labelled_rows(
     source: Path, files: list[Path], subjects: dict[str, str] | None, gestures: GestureSet | None
 ) -> Iterator[SourceFile]:
-    """Yield CSVs with a label on every row: each file is a stream, runs of equal labels are recordings."""
+    """Classify CSVs with a label on every row: each file is a stream, and runs of equal labels are recordings."""
     one_person = all(path.parent == source for path in files)
     for path in files:
         if subjects is not None:
@@ -240,10 +240,10 @@ CLASSIFIERS: dict[str, Callable[[Path, list[Path], dict[str, str] | None, Gestur
 def classify_files(
     shape: str, source: Path, files: list[Path], subjects: dict[str, str] | None, gestures: GestureSet | None
 ) -> list[SourceFile]:
-    """Classify ``files`` (regular ones); each is returned once.
+    """Classify regular files by the folder structure ``shape`` (a key of `CLASSIFIERS`); each is returned once.
 
     Raises:
-        DatasetError: when the folders do not identify the person.
+        DatasetError: if the folders do not identify the people.
     """
     classified = list(CLASSIFIERS[shape](source, files, subjects, gestures))
     if subjects is None:
@@ -273,7 +273,7 @@ def read_mapping(path: Path) -> dict[str, str]:
     return mapping
 
 
-# Files that the recorder leaves when it is killed, or is still running.
+# Suffixes of files that the recorder leaves behind if it is killed, or is still running.
 LEFT_OVER = {
     ".part": "not finished when the recorder stopped; its rows are in the session's stream",
     ".new": "not finished when the recorder stopped; its rows are in the session's stream",
@@ -285,7 +285,7 @@ Sessions = dict[Path, SessionHead | str]
 
 
 def read_sessions(files: Iterable[Path]) -> Sessions:
-    """Read the head of every session folder among ``files``, or the reason why it is unreadable."""
+    """Return for each session folder among ``files`` its head, or the reason why that cannot be used."""
     sessions: Sessions = {}
     for path in files:
         if path.name != SESSION_HEAD:
@@ -308,10 +308,10 @@ def session_of(path: Path, sessions: Mapping[Path, object]) -> Path | None:
 
 
 def common_layout(sessions: Sessions, given: Layout | None, of: str) -> Layout | None:
-    """Return the layout that all sessions and the given one share; ``of`` names the source of the given one.
+    """Return the layout that all sessions and ``given`` share; ``of`` describes ``given`` in messages.
 
     Raises:
-        DatasetError: when two sessions, or a session and the given layout, do not agree.
+        DatasetError: if two layouts differ, or sessions have a layout with a label on every row.
     """
     agreed = given
     for place, head in sessions.items():
@@ -334,7 +334,7 @@ def common_layout(sessions: Sessions, given: Layout | None, of: str) -> Layout |
 
 
 def classify_session_files(sessions: Sessions, files: Iterable[Path]) -> Iterator[SourceFile]:
-    """Classify ``files`` that are in session folders."""
+    """Classify those of ``files`` that are in session folders."""
     by_session: dict[Path, list[Path]] = {}
     for path in files:
         place = session_of(path, sessions)
@@ -352,7 +352,7 @@ def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceF
     try:
         discarded = discarded_recordings(place)
     except (BadInput, OverflowError, RecursionError) as cause:
-        # Only the log states which takes were repeated.
+        # Without the log it is unknown which recordings were discarded.
         yield from (SourceFile(path, "", reason=f"its {SESSION_LOG} cannot be used: {cause}") for path in files)
         return
     stream = place / STREAM_NAME
@@ -379,7 +379,7 @@ def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceF
 
 
 def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:
-    """Return the people of the sessions, the latest session first, and a note for each value that changed."""
+    """Return the people of the sessions, with the latest value of each field, and a note for each changed value."""
     people: dict[str, PersonInfo] = {}
     notes = []
     heads = sorted((h for h in sessions.values() if isinstance(h, SessionHead)), key=lambda h: h.started_ms)
@@ -399,6 +399,6 @@ def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:
 
 
 def _plain(text: str) -> str:
-    """Return a text as one printable line."""
+    """Return ``text`` as one printable line."""
     text = text.encode("utf-8", "replace").decode("utf-8")
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())

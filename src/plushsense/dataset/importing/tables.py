@@ -1,8 +1,8 @@
-"""Import a table with a row per sample: ``subject, [session], [recording], label, time`` and the channels.
+"""Import a table with one row per sample: ``subject, [session], [recording], label, time`` and the channels.
 
-Rows are read by person and session, in the order of the file. A recording is a run of rows with one label (and one
-``recording``, if there is such a column); without that column it also ends where the time runs backwards or pauses for
-more than a second. Rows without a label belong to no recording; a session with such rows is also written as a stream.
+Rows are grouped by person and session, in the order of the file. A recording is a run of rows with the same label (and
+the same ``recording``, if there is such a column); without that column it also ends where the time decreases or pauses
+for more than a second. Rows without a label belong to no recording; a session with such rows is also written as stream.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from plushsense.dataset.store import RECORDINGS, STREAMS
 
 ORIGIN = "origin.json"
 LARGEST = 2.0**53
-# A channel with values between few steps of its layout has another scale.
+# A channel with values between the steps of its layout, and a spread of few steps, probably has another scale.
 _FEW_STEPS = 10.0
 _BETWEEN = 0.05
 
 
 @dataclass(frozen=True)
 class LabelledSegment:
-    """A labelled part of a session: the rows ``start`` to ``stop`` of its frames."""
+    """Labelled part of a session: the rows from ``start`` to before ``stop`` of its frames."""
 
     label: str
     start: int
@@ -54,7 +54,7 @@ class LabelledSegment:
 
 @dataclass(frozen=True)
 class ConvertedSource:
-    """The file that recordings were converted from; ``more`` are further values of ``origin.json``."""
+    """File from which recordings were converted; ``more`` are additional values for ``origin.json``."""
 
     path: Path
     display_name: str
@@ -62,13 +62,13 @@ class ConvertedSource:
 
     @cached_property
     def text(self) -> str:
-        """The text of ``origin.json``."""
+        """Text of ``origin.json``: the source, its SHA-256 and ``more``."""
         table = {"source": self.display_name, "sha256": sha256_of(self.path)} | self.more
         return json.dumps(table, ensure_ascii=False, indent=1) + "\n"
 
 
 def whole_steps(values: NDArray[np.float64], layout: Layout) -> tuple[NDArray[np.int64], str]:
-    """Round values (T, C) to integer steps of the layout; also returns a warning if the steps are too coarse."""
+    """Round values (T, C) to integer steps of the layout; return them and a warning, "" unless steps are too coarse."""
     scaled = values / np.array([c.step for c in layout.channels])
     rounded = np.round(scaled)
     warning = ""
@@ -84,8 +84,8 @@ def whole_steps(values: NDArray[np.float64], layout: Layout) -> tuple[NDArray[np
 
 
 def usable_rows(*columns: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return rows (T,) in which every value of every column is a number that a file can hold."""
-    # NaN compares as false.
+    """Return for each row (T,) whether every value in every column is a number below `LARGEST` in magnitude."""
+    # Comparisons with NaN are false.
     return np.asarray(np.all(np.abs(np.column_stack(columns)) < LARGEST, axis=1))
 
 
@@ -100,9 +100,9 @@ def write_session(
     *,
     with_stream: bool,
 ) -> Iterator[SourceFile]:
-    """Write one session into the new ``folder``: recordings, the stream if requested, and ``origin.json``.
+    """Write one session into the new ``folder``: recordings, with ``with_stream`` the stream, and ``origin.json``.
 
-    With a layout that has a label on every row, one stream with labels is written instead of recordings.
+    For a layout with a label on every row, one labelled stream is written instead of recordings. Yields the files.
     """
     folder.mkdir(parents=True)
     where = f"{original.display_name}: {subject}{f', session {session}' if session else ''}"
@@ -128,7 +128,7 @@ def write_session(
     for cut in cuts:
         name = f"{where}, rows {cut.start + 1} to {cut.stop} ('{cut.label[:40]}')"
         at_ms = abs(int(clock[cut.start]))
-        # Recordings of one label and length whose clocks all begin at 0 would share a name.
+        # Recordings of the same label and length would have the same name if their clocks all begin at 0.
         while (path := folder / recording_filename(cut.label, at_ms, cut.stop - cut.start)) in written_paths:
             at_ms += 1
         written_paths.add(path)
@@ -159,18 +159,18 @@ _UNITS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1000.0}
 
 @dataclass(frozen=True)
 class ImportedColumns:
-    """The columns that are used, by role or channel: texts as lists, numbers (T,) with NaN where there is none."""
+    """Columns of a table by role or channel: their ``names``, texts, and numbers (T,) with NaN for missing ones."""
 
     names: dict[str, str]
     texts: dict[str, list[str]]
     numbers: dict[str, NDArray[np.float64]]
     malformed: int = 0
     in_ms: bool = False
-    """Whether the time column had a type with a unit, so that the numbers are milliseconds."""
+    """Whether the time column had a temporal type and was converted to milliseconds."""
 
 
 def check_roles(columns: Mapping[str, str], layout: Layout) -> None:
-    """Refuse a ``--column`` with an unknown role."""
+    """Raise ConfigError for an unknown role in ``columns`` (the option ``--column``)."""
     known = (*ROLES, STREAM_ROLE, *layout.names)
     for role in columns:
         if role not in known:
@@ -178,10 +178,10 @@ def check_roles(columns: Mapping[str, str], layout: Layout) -> None:
 
 
 def choose_columns(there: list[str], layout: Layout, given: Mapping[str, str], display_name: str) -> dict[str, str]:
-    """Return the column of ``there`` for each role and channel.
+    """Return the name in ``there`` (the table's columns) for each role and channel; ``given`` overrides the defaults.
 
     Raises:
-        FileFormatError: for a missing column, or two of one name.
+        FileFormatError: for a missing column, or two columns of the same name.
     """
     plain = [name.strip().casefold() for name in there]
     candidates: dict[str, tuple[str, ...]] = dict(ROLES)
@@ -210,7 +210,7 @@ def choose_columns(there: list[str], layout: Layout, given: Mapping[str, str], d
 
 
 def read_csv(path: Path, display_name: str, layout: Layout, given: Mapping[str, str]) -> ImportedColumns:
-    """Read a CSV table: ``,``, ``;`` or tab, a header, UTF-8; lines of another width are skipped."""
+    """Read a CSV table in UTF-8 with a header and ``,``, ``;`` or tab as separator; skip lines of another width."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             first = file.readline()
@@ -244,7 +244,7 @@ def read_csv(path: Path, display_name: str, layout: Layout, given: Mapping[str, 
 
 def _number(text: str) -> float:
     try:
-        # Only Python reads 1_000 as a number.
+        # Python would accept 1_000 as a number.
         return float(text) if "_" not in text else float("nan")
     except ValueError:
         return float("nan")
@@ -275,7 +275,7 @@ def read_parquet(path: Path, display_name: str, layout: Layout, given: Mapping[s
     except FileFormatError:
         raise
     except BaseException as cause:
-        # A panic of polars on damaged bytes is a BaseException.
+        # A panic of polars on damaged bytes is a BaseException but no Exception.
         if not isinstance(cause, Exception) and type(cause).__name__ != "PanicException":
             raise
         message = " ".join(str(cause).split())[:120] or type(cause).__name__
@@ -291,9 +291,9 @@ def _parquet_numbers(pl: Any, column: Any) -> NDArray[np.float64]:
 
 
 def milliseconds(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple[float, str]:
-    """Return milliseconds per unit of the time column, and a note if its name does not state the unit.
+    """Return the milliseconds per unit of the time column, and a note if its name does not state the unit.
 
-    Then it is the unit that matches the layout's rate best.
+    In that case, the unit is the one that agrees best with the layout's rate.
     """
     plain = name.strip().casefold().rstrip(")")
     for unit, factor in _UNITS.items():
@@ -309,7 +309,7 @@ def milliseconds(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple
 
 
 def _codes(texts: Iterable[str]) -> tuple[NDArray[np.int64], list[str]]:
-    """Return texts as numbers by first appearance, and the texts."""
+    """Number ``texts`` by first appearance; return the number of each, and the distinct texts."""
     known: dict[str, int] = {}
     numbers = [known.setdefault(text, len(known)) for text in texts]
     return np.array(numbers, dtype=np.int64), list(known)
@@ -318,12 +318,12 @@ def _codes(texts: Iterable[str]) -> tuple[NDArray[np.int64], list[str]]:
 def read_table(
     path: Path, display_name: str, folder: Path, subject: str | None, layout: Layout, given: Mapping[str, str]
 ) -> Iterator[SourceFile | str]:
-    """Write a table's recordings into the new ``folder``; yield the files, and warnings.
+    """Write the recordings of a table into the new ``folder``; yield the files, and warnings as text.
 
     ``subject`` is the person if the table has no such column.
 
     Raises:
-        FileFormatError: for a table that cannot be read, or lacks a column.
+        FileFormatError: for a table that cannot be read, lacks a column, or has no usable row.
         MissingExtraError: for Parquet without polars.
     """
     read = read_parquet if path.suffix.lower() == ".parquet" else read_csv

@@ -1,8 +1,8 @@
-"""Import XDF files (LabRecorder): the stream that fits the layout, cut into recordings by markers.
+"""Import XDF files (LabRecorder): the stream that matches the layout, cut into recordings by markers.
 
-A marker that names a gesture begins a recording; any next marker, or the end of the stream, ends it (``end`` and
-``stop`` do only that). ``start Tail pull``, ``Tail pull/begin``, ``end Tail pull`` and the like
-are understood. Without a gesture set every marker but ``end`` and ``stop`` is a gesture.
+A marker that names a gesture begins a recording, which ends at the next marker of any kind or the end of the stream.
+``start Tail pull`` and ``Tail pull/begin`` begin one too; ``end``, ``stop``, ``end Tail pull`` and the like only end
+one. Without a gesture set, every other marker is the name of a gesture.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from plushsense.dataset.importing.tables import (
 
 _MAGIC = b"XDF:"
 _HEADER, _SAMPLES = 2, 3
-# Clock synchronisation leaves differences of this size between equal times.
+# After clock synchronisation, equal times may differ by this much.
 _SAME_S = 1e-6
 _SIZES = {"string": 1, "int8": 1, "int16": 2, "int32": 4, "float32": 4, "int64": 8, "double64": 8}
 _BEGIN = re.compile(r"^(?:start|begin)[\s_:/-]+(?P<a>.+)$|^(?P<b>.+)[\s_:/-]+(?:start|begin)$", re.IGNORECASE)
@@ -45,16 +45,16 @@ _BIDS = re.compile(r"(?:^|_)(sub|ses|run)-([^_]+)")
 
 @dataclass(frozen=True)
 class Marker:
-    """A marker and its time in seconds."""
+    """Text of a marker, and its time in seconds."""
 
     time_s: float
     text: str
 
 
 def person_and_session(path: Path, folder: str | None) -> tuple[str | None, str]:
-    """Return person and session from LabRecorder's names (``sub-P001_ses-S001_task-x_run-001_eeg.xdf``).
+    """Return person and session by a file name of LabRecorder (``sub-P001_ses-S001_task-x_run-001_eeg.xdf``).
 
-    Otherwise the person is ``folder`` (None if unknown) and the session is the file's name.
+    If the name lacks them, the person is ``folder`` (None if unknown), and the session the name of the file.
     """
     entities = dict(_BIDS.findall(path.stem))
     session = "-".join(entities[key] for key in ("ses", "run") if key in entities) or path.stem
@@ -64,7 +64,7 @@ def person_and_session(path: Path, folder: str | None) -> tuple[str | None, str]
 def segments_of(
     markers: list[Marker], times_s: NDArray[np.float64], gestures: GestureSet | None
 ) -> tuple[list[LabelledSegment], list[str]]:
-    """Cut recordings by the markers, as rows of ``times_s`` (T,); also returns markers that name no gesture."""
+    """Return the recordings that the markers delimit, as rows of ``times_s`` (T,), and markers that name no gesture."""
     rising = np.maximum.accumulate(times_s)
     cuts: list[LabelledSegment] = []
     unknown: list[str] = []
@@ -82,7 +82,7 @@ def segments_of(
 
 
 def _named(text: str, gestures: GestureSet | None) -> str:
-    """Return the gesture that a marker begins, "" if it begins none."""
+    """Return the gesture that a marker begins; "" if it begins none."""
     text = " ".join(text.split())
     begin = _BEGIN.match(text)
     named = (begin["a"] or begin["b"]) if begin else text
@@ -104,12 +104,12 @@ def _varlen(file: BinaryIO) -> int:
 
 
 def complete_chunks(path: Path) -> tuple[int, int]:
-    """Return how many bytes of the file are complete, plausible chunks, and the size of the file.
+    """Return the number of leading bytes that are complete, plausible chunks, and the size of the file.
 
-    pyxdf trusts the sample count of a chunk; here it is compared with the available bytes.
+    The sample count of a chunk, which pyxdf does not check, is compared with its length.
 
     Raises:
-        FileFormatError: for a file that is no XDF.
+        FileFormatError: for a file that is not XDF.
     """
     size = path.stat().st_size
     widths: dict[int, int] = {}
@@ -142,7 +142,7 @@ def complete_chunks(path: Path) -> tuple[int, int]:
 
 
 def _sample_bytes(header: bytes) -> int:
-    """Return the minimum size of a sample by the header of its stream: time stamp flag and values."""
+    """Return the minimum size in bytes of a sample (time stamp flag and values) by the header of its stream."""
     count = re.search(rb"<channel_count>\s*(\d{1,6})\s*</", header)
     kind = re.search(rb"<channel_format>\s*(\w+)\s*</", header)
     size = _SIZES.get(kind[1].decode("ascii", "replace")) if kind else None
@@ -152,7 +152,7 @@ def _sample_bytes(header: bytes) -> int:
 
 
 class _FirstBytes(io.FileIO):
-    """The first bytes of a file, as if it ended there."""
+    """File that ends after its first ``length`` bytes."""
 
     def __init__(self, path: Path, length: int):
         super().__init__(path)
@@ -173,7 +173,7 @@ def _load(path: Path, length: int) -> list[dict[str, Any]]:
     logging.getLogger("pyxdf").addHandler(logging.NullHandler())
     with io.BufferedReader(_FirstBytes(path, length)) as file, np.errstate(all="ignore"):
         try:
-            # Original time stamps, since dejittering would hide jitter and loss.
+            # Keep the original time stamps, since dejittering would hide jitter and lost samples.
             streams, _ = pyxdf.load_xdf(file, dejitter_timestamps=False)
         except Exception as cause:  # noqa: BLE001, RUF100
             message = " ".join(str(cause).split())[:120] or type(cause).__name__
@@ -182,7 +182,7 @@ def _load(path: Path, length: int) -> list[dict[str, Any]]:
 
 
 def _text(stream: dict[str, Any], *keys: str) -> str:
-    """Return a text of a stream's header; "" if there is none."""
+    """Return the text at the path ``keys`` in a stream's header; "" if there is none."""
     at: Any = stream["info"]
     for key in keys:
         at = (at.get(key) or [None])[0] if isinstance(at, dict) else None
@@ -197,10 +197,10 @@ def _labels(stream: dict[str, Any]) -> list[str]:
 
 
 def match_columns(layout: Layout, labels: list[str], width: int) -> tuple[list[int], int | None] | str:
-    """Return the positions of the channels and of the device clock in a sample, or why they do not match.
+    """Return the positions of the layout's channels and of the device clock in a sample, or why there is no match.
 
-    Channels match by label (or the header text of the layout's CSV) in any order, or by position if no label matches
-    and the stream has as many channels as the layout or its wire format.
+    Channels are matched by label (or header text of the layout's CSV) in any order; if no label matches, by position,
+    provided that the stream has as many channels as the layout or its wire format.
     """
     texts = dict(zip((h.casefold() for h in layout.csv.header), layout.csv.columns, strict=True))
     texts |= {n.casefold(): n for n in (*layout.names, DEVICE_MS)}
@@ -221,7 +221,7 @@ def match_columns(layout: Layout, labels: list[str], width: int) -> tuple[list[i
 def _frames(
     stream: dict[str, Any], layout: Layout, channels: list[int], clock: int | None
 ) -> tuple[Frames, NDArray[np.float64], list[str]]:
-    """Return the frames of a stream, the time of each in seconds, and warnings."""
+    """Return the frames of a stream, the time of each frame in seconds, and warnings."""
     series = np.asarray(stream["time_series"], dtype=np.float64).reshape(len(stream["time_stamps"]), -1)
     times = np.asarray(stream["time_stamps"], dtype=np.float64)
     device = times * 1000.0 if clock is None else series[:, clock]
@@ -243,12 +243,12 @@ def read_xdf(
     gestures: GestureSet | None,
     stream_name: str = "",
 ) -> Iterator[SourceFile | str]:
-    """Write the recordings of an XDF file into the new ``folder``; yield the files, and warnings.
+    """Write the recordings of an XDF file into the new ``folder``; yield the files, and warnings as text.
 
-    ``stream_name`` selects one of several streams that fit the layout.
+    ``stream_name`` selects one of several streams that match the layout.
 
     Raises:
-        FileFormatError: for a file that is damaged, or in which no stream, or more than one, fits.
+        FileFormatError: for a damaged file, or if not exactly one stream matches.
         MissingExtraError: without pyxdf.
     """
     good, size = complete_chunks(path)

@@ -2,8 +2,8 @@
 
 This is the only operation that rewrites append-only files. The intent is written first (``forgetting.json``), so that
 the same call finishes an interrupted run. Only a line in ``forgotten.jsonl`` remains, with the day and the number of
-files but not the person: there are so few codes that even a hash would reveal one. Programs that run on the data set
-meanwhile can no longer write results (`dataset.store.Generation`).
+files but not the person, not even as a hash, which could be reversed since there are few codes. Programs that use the
+data set at the same time can no longer write results (`dataset.store.Generation`).
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class RemovalRecord:
 
 @dataclass(frozen=True)
 class _Intent:
-    """A removal that has begun; ``before`` is the number of records before it."""
+    """Removal that has begun; ``before`` is the number of earlier removal records."""
 
     subject: str
     files: int
@@ -71,12 +71,13 @@ class _Intent:
 
 @dataclass(frozen=True)
 class RemovalPlan:
-    """Everything in a data set that belongs to a person, by paths in its folder.
+    """Everything in a data set that belongs to a person, as paths in its folder.
 
-    ``files`` are the person's, ``marks`` counts the lines about them, ``listed`` is whether the people's table has
-    them. ``caches`` and ``evaluations`` used their data; ``mentions`` are files that stay and name them; ``published``
-    is the data set's DOI. ``leftovers`` are unfinished files of killed programs in the data set or beside it (``../``).
-    With ``absent`` the data set does not contain the person (any more), and only derived files are removed.
+    ``files`` are the person's files, of which ``raw`` are raw; ``marks`` counts the marks about the person, ``listed``
+    is whether the people's table contains them. ``caches`` and ``evaluations`` may derive from their data; ``mentions``
+    are files that stay and contain the code; ``published`` is the DOI of the data set. ``leftovers`` are unfinished
+    files of killed programs in the data set or beside it (``../``). If ``absent``, the data set does not contain the
+    person (any more), and only derived files are removed.
     """
 
     subject: str
@@ -97,7 +98,7 @@ class RemovalPlan:
 
 
 def read_removals(folder: Path) -> list[RemovalRecord]:
-    """Return the removals of people from a data set, without names."""
+    """Return the records of earlier removals from a data set; they do not identify people."""
     try:
         lines = _record_lines(folder)
     except (OSError, UnicodeDecodeError) as cause:
@@ -113,10 +114,10 @@ def read_removals(folder: Path) -> list[RemovalRecord]:
 
 
 def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
-    """Return what `forget` would remove; nothing is changed.
+    """Return what `forget` would remove, without changing anything.
 
     Raises:
-        DatasetError: when the data set does not know the person, and nobody was ever removed from it.
+        DatasetError: if ``subject`` is unknown, another removal was interrupted, or files of other people are missing.
     """
     folder = Path(dataset)
     DatasetHead.read(folder)
@@ -136,7 +137,7 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
             f"The removal of another person from '{folder}' was interrupted: finish it first, with  "
             f"plushsense forget {folder} {intent.subject} --yes"
         )
-    # A torn line or another spelling is no proof of a person: what is removed for good must be named exactly.
+    # An incomplete line or another spelling is not enough: the code must be exact, since the removal is permanent.
     marked = any(_parsed(line) is not None for line in about)
     absent = not own and not marked and subject not in table and intent is None
     if absent:
@@ -173,7 +174,7 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
 
 
 def _mentions(folder: Path, files: Iterable[DatasetFile], subject: str, leftovers: tuple[str, ...]) -> Iterator[str]:
-    """Yield the files that name a person and are not removed with them."""
+    """Yield the files that contain the code of a person and are not removed."""
     names = NamePatterns({subject: ""})
     for file in files:
         path = file.path.as_posix()
@@ -188,20 +189,20 @@ def _mentions(folder: Path, files: Iterable[DatasetFile], subject: str, leftover
 def forget(dataset: str | Path, subject: str) -> RemovalPlan:
     """Remove a person from a data set; this cannot be undone. The same call finishes an interrupted run.
 
-    Other people's files and marks stay as they are, byte for byte. Backups, published copies and trained models are
-    not changed. For a person who was removed before, files that may be derived from them are removed again.
+    Other people's raw files and marks stay the same byte for byte. Backups, published copies and trained models are
+    not changed. For a person who was removed before, files that may be derived from their data are removed again.
 
     Returns:
         What was removed.
 
     Raises:
-        DatasetError: when the data set does not know the person, or a file cannot be removed.
+        DatasetError: as in `plan_removal`, or if a file cannot be removed.
     """
     folder = Path(dataset)
     plan_removal(folder, subject)  # Refuse before the lock is taken.
     try:
         with FileLock(folder / LOCK):
-            # Again under the lock, since other programs may have written until now.
+            # Plan again under the lock, since other programs may have written until now.
             plan = plan_removal(folder, subject)
             intent = None if plan.absent else _begin(folder, plan)
             _remove_derived(folder, plan)
@@ -220,7 +221,7 @@ def forget(dataset: str | Path, subject: str) -> RemovalPlan:
 
 
 def _begin(folder: Path, plan: RemovalPlan) -> _Intent:
-    """Write down what will be removed, unless an interrupted run already did, and return it."""
+    """Write the intent of the removal, or continue that of an interrupted run, and return it."""
     today = datetime.now(timezone.utc).date().isoformat()
     intent = _read_intent(folder) or _Intent(plan.subject, plan.raw, today, len(_record_lines(folder)))
     write_file(folder / UNDER_WAY, json.dumps(asdict(intent)) + "\n")
@@ -228,7 +229,7 @@ def _begin(folder: Path, plan: RemovalPlan) -> _Intent:
 
 
 def _remove_derived(folder: Path, plan: RemovalPlan) -> None:
-    # Temporary files of killed programs may hold the person's data.
+    # Temporary files of killed programs may contain the person's data.
     for part in folder.glob(f"*{PART}"):
         part.unlink()
     # Remove the index before the files it lists. For an absent person it stays if it is the only record of other
@@ -259,7 +260,7 @@ def _rewrite_marks(folder: Path, subject: str) -> None:
 
 
 def _leftovers(folder: Path, files: Iterable[DatasetFile]) -> tuple[str, ...]:
-    """Return what killed programs left in the data set, or beside it while creating it."""
+    """Return unfinished files and folders that killed programs left in the data set or beside it."""
     out = {f"../{entry.name}" for entry in folder.resolve().parent.glob(f"{glob.escape(unfinished(folder))}*")}
     for file in files:
         parts = file.path.parts
@@ -272,7 +273,7 @@ def _leftovers(folder: Path, files: Iterable[DatasetFile]) -> tuple[str, ...]:
 
 
 def _row_of(subject: str, table: Iterable[str]) -> str:
-    """Return the code under which the people's table has a person; "" if it has not."""
+    """Return the spelling of a person's code in the people's table; "" if it is missing."""
     codes = list(table)
     return subject if subject in codes else match_code(subject, codes)
 
@@ -285,7 +286,7 @@ def _mark_lines(folder: Path) -> list[bytes]:
 
 
 def _is_about(line: bytes, subject: str) -> bool:
-    """Return whether a mark is about a person's recording; a torn line is if it names the person."""
+    """Return whether a mark is about a person or their recording; an incomplete line is if it contains the code."""
     table = _parsed(line)
     if table is None:
         text = line.decode("utf-8", "replace")
@@ -295,7 +296,7 @@ def _is_about(line: bytes, subject: str) -> bool:
 
 
 def _parsed(line: bytes) -> Any:
-    """Return the JSON value of a line; None if it is torn."""
+    """Return the JSON value of a line; None if the line is incomplete."""
     try:
         return json.loads(line.decode("utf-8"))
     except ValueError:
@@ -303,7 +304,7 @@ def _parsed(line: bytes) -> Any:
 
 
 def _text_of(path: Path, skip: str = "") -> str:
-    """Return the text of a file of the data set (not of big or foreign ones) without the marks about ``skip``."""
+    """Return the content of a text file without the marks about ``skip``; "" for other kinds of files."""
     if path.suffix.lower() not in (".toml", ".json", ".jsonl", ".csv", ".md", ".txt", ".html"):
         return ""
     try:
@@ -337,7 +338,7 @@ def _ignore_missing(_: object, path: str, cause: Any) -> None:
 
 
 def _remove_empty(folder: Path, files: Iterable[str]) -> None:
-    """Remove folders without files; also those of a run that was interrupted after the last file."""
+    """Remove those folders of ``files`` that are empty now."""
     places = {parent for f in files for parent in PurePosixPath(f).parents if len(parent.parts) > 1}
     for place in sorted(places, key=lambda p: len(p.parts), reverse=True):
         if (folder / place).is_dir() and not any((folder / place).iterdir()):
@@ -357,9 +358,9 @@ def _read_intent(folder: Path) -> _Intent | None:
 
 
 def _finish(folder: Path, intent: _Intent) -> None:
-    """Append the permanent record and then remove the note that a removal has begun."""
+    """Append the permanent record of the removal, then delete its intent."""
     line = json.dumps({"day": intent.day, "files": intent.files}) + "\n"
-    # A run that was interrupted just here has written its record already.
+    # An interrupted run may have written its record already: replace it.
     write_file(folder / FORGOTTEN, "".join([*_record_lines(folder)[: intent.before], line]))
     (folder / UNDER_WAY).unlink()
 

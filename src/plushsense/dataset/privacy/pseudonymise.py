@@ -1,7 +1,7 @@
-"""Copy a data set with random codes and shifted dates; the key stays outside of the copy.
+"""Copy a data set with random codes of people and shifted dates; the key file stays outside of the copy.
 
 Sensor values stay the same byte for byte. `pseudonyms` shifts the dates in the rows, `redaction` rewrites texts, and
-`find_traces` searches the result for remains of the originals. Caches, evaluations and unknown files are not copied.
+`find_traces` searches the copy for original codes, words and times. Caches, evaluations and unknown files are left out.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ _SHOWN = 5
 
 @dataclass
 class PseudonymisationResult:
-    """Result of pseudonymising; ``findings`` are for a person to review: {file, line, message}, with new file names."""
+    """Result of pseudonymising; ``findings`` {file, line, message}, with new file names, need review by a person."""
 
     dataset: Dataset
     files: int
@@ -104,12 +104,12 @@ def pseudonymise(
     Args:
         key: the key file ``original,code,shift_s``, outside of both data sets. An existing one is extended, so that a
             person keeps the code of an earlier run.
-        words: more words to replace everywhere by ``[name]``, such as first names.
-        drop_notes: leave out free text (notes, the reasons of marks).
-        progress: called with (raw files done, raw files in all).
+        words: additional words to replace everywhere by ``[name]``, such as first names.
+        drop_notes: whether to leave out free text (notes, the reasons of marks).
+        progress: called with (raw files done, number of raw files).
 
     Raises:
-        DatasetError: for a key or an ``out`` in a wrong place, or when the result still contains an old code or time;
+        DatasetError: if ``key`` or ``out`` is in a data set, or the copy would still contain an original code or time;
             then nothing is left at ``out``.
     """
     folder, dest, key = Path(dataset), Path(out), Path(key)
@@ -139,7 +139,7 @@ def _refuse_places(folder: Path, dest: Path, key: Path) -> None:
 
 
 class _Pseudonymisation:
-    """A run of `pseudonymise`: holds the codes of all people and rewrites the files one by one."""
+    """One run of `pseudonymise`, with the codes of all people; rewrites the files one by one."""
 
     def __init__(
         self,
@@ -175,7 +175,7 @@ class _Pseudonymisation:
             p.original: Redactor(self.names, roles, p.code, p.shift_ms, self.notes, drop_notes)
             for p in self.codes.values()
         }
-        # Write in the order of the codes, so that times on the disk do not reveal the old order.
+        # Write in the order of the new codes, so that the times of files do not reveal the old order.
         self.files = sorted(files, key=lambda c: (self._pseudonym(c.person).code if c.person else "", c.path))
         if self.names.too_short:
             self.notes.add("", f"too short to be searched in texts: {_listed(self.names.too_short)}; read the notes")
@@ -216,7 +216,7 @@ class _Pseudonymisation:
         return PseudonymisationResult(result, files, self.notes.merged(), self.key)
 
     def _raw_files(self, work: Path) -> NDArray[np.int64]:
-        """Rewrite the raw files, each verified against its original; returns every time found in them."""
+        """Rewrite the raw files and compare each with its original; return every original time in them."""
         raw = [c for c in self.files if c.kind == "raw"]
         times = [np.array([r.epoch_ms for r in self.source.recordings], dtype=np.int64)]
         for done, content in enumerate(raw, 1):
@@ -244,7 +244,7 @@ class _Pseudonymisation:
         words = self._words(content.person)
         top, _, *between, name = content.path.parts
         inner = [words.text(part) for part in between]
-        # A recording's label names a gesture, which is the same for everybody.
+        # The label of a recording is a gesture, which is no personal data.
         named = words.name(name) if parse_name(PurePosixPath(name).stem + ".csv") else words.text(name)
         return PurePosixPath(top, words.code, *inner, named)
 
@@ -279,7 +279,7 @@ class _Pseudonymisation:
         return self._words(person) if match_code(person, self.people) else None
 
     def _renamed(self, identity: str) -> str:
-        """Return the new id of a recording or a stream; "" is the data set."""
+        """Return the new id of a recording or stream; "" for the data set."""
         if not identity:
             return ""
         for kind in (RECORDINGS, STREAMS):
@@ -292,7 +292,7 @@ class _Pseudonymisation:
         return "/".join([words.code, *(words.text(part) for part in between), words.name(name)])
 
     def _compare(self, made: Dataset) -> None:
-        """Check that the new index equals the old one except for names and dates."""
+        """Raise DatasetError unless the new index equals the old one except for names and dates."""
         old = {self._renamed(r.id): r for r in self.source.recordings}
         new = {r.id: r for r in made.recordings}
         wrong = sorted(old.keys() ^ new.keys()) or [i for i in old if not self._agrees(old[i], new[i])]
@@ -317,7 +317,7 @@ class _Pseudonymisation:
 
 
 def _in_words(session: str) -> bool:
-    """Return whether a session's name is more than a number or a date and was not made by the importer."""
+    """Return whether a session's name contains a word and was not made by the importer."""
     return (
         not session.startswith(DUPLICATE_FOLDER)
         and re.search(r"[^\W\d_]{2}", session.removeprefix("session")) is not None
@@ -331,14 +331,14 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _dated_columns(read: ReadResult, layout: Layout) -> dict[str, NDArray[np.int64]]:
-    """Return the time columns of a file that hold dates, by name."""
+    """Return the time columns of a file that contain dates, by name."""
     device_ms = None if read.integrated or DEVICE_MS not in layout.csv.columns else read.frames.device_ms
     columns = {HOST_MS: read.frames.host_ms, DEVICE_MS: device_ms}
     return {name: column for name, column in columns.items() if column is not None and holds_dates(column)}
 
 
 def _same(before: ReadResult, after: ReadResult, columns: Collection[str], shift_ms: int) -> bool:
-    """Return whether two readings differ only in the shifted dates."""
+    """Return whether two files, as read, differ only in the shifted dates of ``columns``."""
     a, b = before.frames, after.frames
     if len(a) != len(b) or before.warnings != after.warnings or not np.array_equal(a.values, b.values):
         return False
@@ -363,7 +363,7 @@ _PLAIN = b"0123456789;,.+- \t\r\n"
 
 
 def _words(data: bytes) -> str:
-    """Return the cells of a raw file that are not numbers, each once: header, labels, garbled pieces."""
+    """Return the distinct cells of a raw file that are not numbers, one a line: header, labels, garbled text."""
     cells: set[bytes] = set()
     if data.translate(None, _PLAIN):
         for line in data.splitlines():
@@ -375,18 +375,18 @@ def _words(data: bytes) -> str:
 def find_traces(
     folder: Path, originals: Iterable[str], names: NamePatterns, times: NDArray[np.int64]
 ) -> Iterator[tuple[str, str]]:
-    """Find remains of the originals, each as (file, text).
+    """Find original codes, words, times and dates that are still in ``folder``; yield (file, text) for each.
 
     Args:
-        originals: the old codes, which must not be folders of people.
-        names: the words that no file may contain.
-        times: every time of the original files, in ms since 1970.
+        originals: the original codes, which must not be folders of people.
+        names: patterns of the words that no file may contain.
+        times: every time in the original files, in ms since 1970.
     """
     old = set(originals)
     known = np.unique(times)
     for content in list_files(folder):
         path = content.path.as_posix()
-        # A layout's title can resemble a code; names and ids must not contain one.
+        # The title of a layout may resemble a code, so compare codes with folders only.
         if content.person in old:
             yield path, content.person
         for trace in (*names.find_in(path), *dates_in(path)):
@@ -400,7 +400,7 @@ def find_traces(
             found_in = names.find_in(_words(data))
         else:
             text = data.decode("utf-8", "replace")
-            # The index's stamp holds the time at which the new files were written.
+            # The stamp of the index contains the times at which the new files were written.
             found_in = [*names.find_in(text), *(() if content.path.name == STAMP else dates_in(text))]
         for trace in dict.fromkeys(found_in):
             yield path, trace

@@ -1,7 +1,7 @@
-"""Keep the key file of pseudonyms, and shift dates in numbers, in text and in the time columns of raw files.
+"""Read and write the key file of pseudonyms, and shift dates in numbers, in text and in time columns of raw files.
 
-A number is a date if, as milliseconds since 1970, it is after 1990; the counter of a toy since it was switched on never
-reaches that.
+A number counts as a date if, read as milliseconds since 1970, it is after 1990; a toy's counter since it was switched
+on never gets that high.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from plushsense.dataset.store import UNKNOWN_SUBJECT
 FIRST_MS = 631_152_000_000
 """1990-01-01."""
 LAST_MS = 4_102_444_800_000
-"""2100-01-01: whatever was recorded lies before."""
+"""2100-01-01: all recordings are earlier."""
 _BEYOND_MS = 10**14
-# So many digits in a time column can be a fragment of a date.
+# At least this many digits in a time column may be a fragment of a date.
 _PIECE = 5
 _LONGEST = 40
 
@@ -50,7 +50,7 @@ NO_DATE = "[date]"
 
 
 def shifted_number(value: int, shift_ms: int) -> int:
-    """Shift a date in ms, µs or ns since 1970; other numbers stay."""
+    """Shift a date in ms, µs or ns since 1970 by ``shift_ms``; return other numbers unchanged."""
     for scale in (1, 10**3, 10**6):
         if FIRST_MS * scale <= value < _BEYOND_MS * scale:
             return value + shift_ms * scale
@@ -69,7 +69,7 @@ def _iso(text: str, shift_ms: int) -> str:
     if len(text) == 10:
         return (when + _whole_days(shift_ms)).date().isoformat()
     moved = when + timedelta(seconds=shift_ms // 1000)
-    # Written as it was: the same separator, the same precision, the same zone.
+    # Keep the separator, precision and time zone.
     tail = re.search(r"(?::\d\d[.,](\d+))?(Z|[+-]\d\d:?\d\d)?$", text[11:])
     zone = (tail.group(2) if tail else "") or ""
     clock = text[11 : len(text) - len(zone)]
@@ -91,7 +91,7 @@ def _compact(match: re.Match[str], shift_ms: int) -> str:
 def shifted_text(text: str, shift_ms: int) -> str:
     """Shift every date in a text: numbers since 1970, ``2026-05-01``, ``2026-05-01T10:15:00+02:00``, ``20260501``.
 
-    Dates in other notations (``1.5.2026``) become ``[date]``; those in plain language are not found.
+    Dates in other notations (``1.5.2026``) become ``[date]``; dates in words are not found.
     """
     text = _DIGITS.sub(lambda m: str(shifted_number(int(m.group()), shift_ms)), text)
     text = _ISO.sub(lambda m: _iso(m.group(), shift_ms), text)
@@ -100,7 +100,7 @@ def shifted_text(text: str, shift_ms: int) -> str:
 
 
 def dates_in(text: str) -> list[str]:
-    """Return the dates from 1990 to 2100 in a text; eight digits alone are ambiguous and not counted."""
+    """Return the dates in a text (numbers only from 1990 to 2100), without ambiguous ones such as ``20260501``."""
     numbers = [m.group() for m in _DIGITS.finditer(text)]
     real = [n for n in numbers if any(FIRST_MS * s <= int(n) < LAST_MS * s for s in (1, 10**3, 10**6))]
     real += [w for m in _ISO.finditer(text) if (w := m.group())[:2] in ("19", "20") and _is_day(w)]
@@ -129,7 +129,7 @@ _BETWEEN = rb"[;,\t ]+"
 
 
 def _cell(token: bytes, shift_ms: int) -> bytes:
-    """Shift a cell of a dated column, or zero it if it is a fragment of a date."""
+    """Shift the date in a cell of a dated column; replace digits that may be a fragment of a date by zeros."""
     try:
         value = Decimal(token.decode("ascii") if len(token) <= _LONGEST else "NaN")
         if FIRST_MS <= value < _BEYOND_MS:
@@ -140,7 +140,7 @@ def _cell(token: bytes, shift_ms: int) -> bytes:
 
 
 def _stray(token: bytes, shift_ms: int) -> bytes:
-    """Shift dates in a cell of a malformed line, where they can be anywhere."""
+    """Shift all dates in a cell of a malformed line, in which the columns are unknown."""
 
     def one(match: re.Match[bytes]) -> bytes:
         digits = match.group()
@@ -152,7 +152,7 @@ def _stray(token: bytes, shift_ms: int) -> bytes:
 
 
 def _replaced(text: bytes, changes: Iterable[tuple[int, int, bytes]]) -> bytes:
-    """Replace pieces of a text: (start, end, new bytes) in ascending order."""
+    """Replace parts of a text, given as (start, end, new bytes) in ascending order."""
     parts, done = [], 0
     for start, end, new in changes:
         parts += [text[done:start], new]
@@ -161,13 +161,13 @@ def _replaced(text: bytes, changes: Iterable[tuple[int, int, bytes]]) -> bytes:
 
 
 def shifted_rows(data: bytes, layout: Layout, columns: Collection[str], shift_ms: int, path: Path) -> bytes:
-    """Return a raw file's bytes with the dates in ``columns`` (of ``host_ms``, ``device_ms``) shifted.
+    """Return the bytes of a raw file with the dates in ``columns`` (of ``host_ms``, ``device_ms``) shifted.
 
-    Everything else stays the same byte for byte: separators, header, line ends, other columns. In a malformed line
-    dates are shifted wherever they are, and a fragment of a date becomes zeros.
+    All other bytes stay the same: separators, header, line endings, other columns. In a malformed line, all dates are
+    shifted; a fragment of a date becomes zeros.
 
     Raises:
-        FileFormatError: when the columns are not those of the layout.
+        FileFormatError: if the columns of the file are not those of the layout.
     """
     if not columns:
         return data
@@ -209,15 +209,15 @@ COLUMNS = ["original", "code", "shift_s"]
 # Without letters and digits that are easily confused. A code is an S and four of these.
 _SIGNS = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
 _DAY_S = 86_400
-# Shift by 120 to 220 years, so that shifted dates are recognisable and a present date is seen to be a mistake.
+# Shift by 120 to 220 years, so that shifted dates are recognisable, and an unshifted one is seen to be a mistake.
 _FIRST_DAY, _DAYS = 120 * 365, 100 * 365
 KEPT = (NOBODY, UNKNOWN_SUBJECT)
-"""Folders that are no person: their name stays, their dates are moved."""
+"""Folders that are no person: they keep their names, but their dates are shifted."""
 
 
 @dataclass(frozen=True)
 class Pseudonym:
-    """A person's code and the random shift of their dates in seconds (days and seconds)."""
+    """Random code of a person, and the random shift of the person's dates in seconds."""
 
     original: str
     code: str
@@ -230,15 +230,15 @@ class Pseudonym:
 
 
 def is_drawn(code: str) -> bool:
-    """Return whether a code has the form of those that are drawn here."""
+    """Return whether a code has the form of a random code of `extend_key`."""
     return len(code) == 5 and code[0] == "S" and all(sign in _SIGNS for sign in code[1:])
 
 
 def read_key(path: Path) -> dict[str, Pseudonym]:
-    """Read the pseudonyms of a key file by original; empty if there is no such file.
+    """Read the pseudonyms of a key file by original code; empty if there is no such file.
 
     Raises:
-        DatasetError: for a file that is no key, or names a person or a code twice.
+        DatasetError: for a file that is no key, or contains a person or a code twice.
     """
     try:
         rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig")), strict=True))
@@ -266,9 +266,9 @@ def read_key(path: Path) -> dict[str, Pseudonym]:
 
 
 def extend_key(key: dict[str, Pseudonym], people: Iterable[str]) -> dict[str, Pseudonym]:
-    """Return the key with everybody in ``people``: known people keep their codes, new ones get random codes."""
+    """Return ``key`` with a pseudonym for each of ``people``: those in ``key`` keep theirs, others get random ones."""
     out = dict(key)
-    # A new code is no old code or name, in any spelling.
+    # A new code must differ from every existing code and name, in any spelling.
     taken = {normalize_code(w) for p in out.values() for w in (p.original, p.code)} | {
         normalize_code(p) for p in people
     }
@@ -288,7 +288,7 @@ def write_key(path: Path, key: dict[str, Pseudonym]) -> None:
     """Write the key file, completely or not at all, readable by its owner only (mode 600 where supported).
 
     Raises:
-        DatasetError: when the place cannot be written.
+        DatasetError: if the file cannot be written.
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

@@ -1,13 +1,13 @@
-"""Validate a package: every validator reads every file, without network access.
+"""Validate a package by several validators, without network access; slow ones read only the first rows of streams.
 
 checksums    every file exists and is unchanged, and there are no others
 data         the recordings are readable, the tables agree with them, and nothing private is included
 times        every time is shifted
 metadata     title, version, licence and day are the same in every metadata file
-croissant    mlcroissant accepts the metadata and loads back, bit for bit, what the files hold
-frictionless frictionless accepts the descriptor and every cell has the type that its schema says
-ro-crate     rocrate opens the crate, and it lists every file as it is
-datacite     the metadata fit DataCite's own schema
+croissant    mlcroissant accepts the metadata and loads exactly the values of the files
+frictionless frictionless accepts the descriptor, and every cell has the type that its schema requires
+ro-crate     rocrate opens the crate, which lists every file with the right size and checksum
+datacite     the metadata agree with DataCite's schema
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from plushsense.dataset.publishing.metadata import CRATE_FILE, DATACITE_FILE, DA
 from plushsense.dataset.publishing.tables import build_tables, list_package_files, open_package, read_checksums
 from plushsense.dataset.store import PEOPLE, DatasetHead, read_people
 
-# The wording of findings may differ between versions.
+# Flags are not compared, since their wording may differ between versions.
 _NOT_COMPARED = ("flags",)
 
 
@@ -61,16 +61,16 @@ def _get(table: Any, *path: str | int) -> Any:
 
 StageProgress = Callable[[str, int, int], None]
 EXTRA = "publish"
-# Rows of each stream that slow validators read by default.
+# Number of rows of each stream that slow validators read by default.
 STREAM_ROWS = 1000
 SHOWN = 50
-# Files that PlushSense adds to the data folder when it is opened.
+# Files that PlushSense may add to the data folder when it opens it.
 _OWN = re.compile(rf"{DATA}/(recordings\.csv|streams\.csv|index\.json|[^/]+\.lock|cache/.*|evaluations/.*)")
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A problem that a validator found, and its file ("" for the whole package)."""
+    """Problem that a validator found, and the file concerned ("" for the whole package)."""
 
     validator: str
     file: str
@@ -82,7 +82,7 @@ class Problem:
 
 @dataclass
 class ValidationResult:
-    """Result of all validators; ``validators`` lists what each examined and how long it took."""
+    """Result of all validators; ``validators`` lists what each of them examined, and its duration."""
 
     problems: list[Problem] = field(default_factory=list)
     validators: list[dict[str, Any]] = field(default_factory=list)
@@ -99,7 +99,7 @@ class ValidationResult:
 
 @dataclass
 class PackageView:
-    """The package under validation, with the problems that the present validator found; slow results are cached."""
+    """Package under validation, with the problems found by the current validator; slow results are cached."""
 
     root: Path
     thorough: bool = False
@@ -113,7 +113,7 @@ class PackageView:
             self.problems.append((file, problem))
 
     def load(self, file: str) -> Any:
-        """Read a JSON file of the package; None, and a problem, if it is unreadable."""
+        """Read a JSON file of the package; if it is unreadable, report a problem and return None."""
         try:
             return json.loads((self.root / file).read_text(encoding="utf-8"))
         except (OSError, ValueError) as cause:
@@ -122,20 +122,20 @@ class PackageView:
 
     @cached_property
     def sums(self) -> dict[str, str]:
-        """SHA-256 of every file that is there."""
+        """SHA-256 of every existing file by path."""
         return {p.relative_to(self.root).as_posix(): sha256_of(p) for p in list_package_files(self.root)}
 
     @cached_property
     def built(self) -> IndexBuild:
-        """The data folder, read anew from its raw files."""
+        """Index of the data folder, built from its raw files."""
         return build_index(self.root / DATA, DatasetHead.read(self.root / DATA))
 
     def is_own(self, path: str) -> bool:
-        """Return whether PlushSense may have added a file by opening the data folder; not in a zip."""
+        """Return whether PlushSense may have added a file when it opened the data folder; false for a zip."""
         return not self.packed and _OWN.fullmatch(path) is not None
 
     def is_local(self, path: object) -> bool:
-        """Return whether a path of a metadata file stays in the package and off the network."""
+        """Return whether a path in a metadata file is a relative path inside the package, not an address."""
         if not isinstance(path, str) or not path or ":" in path or "\\" in path:
             return False
         plain = PurePosixPath(path)
@@ -145,14 +145,14 @@ class PackageView:
 def validate_package(
     package: str | Path, *, thorough: bool = False, progress: StageProgress | None = None
 ) -> ValidationResult:
-    """Validate a package, a folder or a zip.
+    """Validate a package (a folder or a zip).
 
     Args:
-        thorough: let the slow validators read every row of the streams, not only the first thousand of each.
+        thorough: whether slow validators read every row of the streams, instead of the first `STREAM_ROWS`.
 
     Raises:
-        DatasetError: for what is no package.
-        MissingExtraError: without the validators.
+        DatasetError: if ``package`` is no package.
+        MissingExtraError: if a validator is not installed.
     """
     with open_package(Path(package)) as root:
         return check_folder(root, thorough=thorough, packed=Path(package).is_file(), progress=progress)
@@ -161,7 +161,7 @@ def validate_package(
 def check_folder(
     root: Path, *, thorough: bool = False, packed: bool = False, progress: StageProgress | None = None
 ) -> ValidationResult:
-    """Validate the folder of a package; ``packed``: it was unpacked from a zip."""
+    """Validate the folder of a package; ``packed`` is whether it was unpacked from a zip."""
     progress = progress or (lambda stage, done, total: None)
     checked = ValidationResult()
     package = PackageView(root, thorough, packed)
@@ -236,7 +236,7 @@ def _data(p: PackageView) -> None:
 
 
 def _report_private(p: PackageView) -> None:
-    """Report private data: author, time and reason of marks, and references of consent forms."""
+    """Report private data: author, time and reason of marks, and references to consent forms."""
     folder = p.root / DATA
     if any(person.consent for person in read_people(folder).values()):
         p.report(f"{DATA}/{PEOPLE}", "holds references of consent forms, which must not be published")
@@ -360,7 +360,7 @@ def _frictionless(p: PackageView) -> None:
     for resource in package.resources:
         limit = None
         if resource.path.startswith(f"{DATA}/streams/") and not p.thorough:
-            # Part of a file has another checksum; that of the whole file is checked above.
+            # Another validator checks the whole file; the checksum of its first rows would differ.
             limit, resource.hash, resource.bytes = STREAM_ROWS, None, None
         report = resource.validate(limit_rows=limit) if limit else resource.validate()
         for task in report.tasks:

@@ -1,8 +1,8 @@
 """Write the published data set: raw files with shifted times and plain columns, and nothing private.
 
-Raw files are rewritten with the layout's column keys, one separator and shifted times, so that no sidecar, header note
-or malformed line of the original is included. Sessions are numbered, since their names may be dates; marks lose who,
-why and when.
+Raw files are rewritten with the layout's column keys, one separator and shifted times; sidecars, header notes and
+malformed lines are not included. Sessions are numbered, since their names may be dates. Marks are written without their
+author, reason and time.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from plushsense.dataset.store import (
 
 YEAR_2000_MS = 946_684_800_000
 _SPREAD_MS = 366 * 86_400_000
-# All shifted times are before this: sessions of one person may be a few years apart.
+# Limit of all shifted times; the sessions of one person may be a few years apart.
 LATEST_MS = 1_262_304_000_000
 _FAR_MS = 9 * 366 * 86_400_000
 # A 32-bit clock in ms wraps after 49 days; larger values are dates.
@@ -57,18 +57,18 @@ WALL_CLOCK_MS = 2**32
 
 @dataclass(frozen=True)
 class Shift:
-    """Time shift of one person: the true time ``anchor_ms`` becomes ``target_ms``; ``device``: the device clock too."""
+    """Time shift of one person from ``anchor_ms`` to ``target_ms``; ``device``: also shift the device clock."""
 
     anchor_ms: int
     target_ms: int
     device: bool
 
     def plausible(self, times: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which times can belong to this person; times years away are damage and would reveal the shift."""
+        """Return which times are near the anchor; others are transmission errors and, shifted, could reveal it."""
         return (times >= self.anchor_ms - _SPREAD_MS) & (times < self.anchor_ms + _FAR_MS)
 
     def times(self, times: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Shift times; an implausible one is replaced by the last plausible one before it."""
+        """Shift times; replace an implausible one by the last plausible one before it."""
         good = self.plausible(times)
         if not good.all():
             if not good.any():
@@ -82,7 +82,7 @@ class Shift:
         return time - self.anchor_ms + self.target_ms if self.plausible(np.array([time]))[0] else None
 
     def frames(self, frames: Frames, keep_host: bool) -> Frames:
-        """Return the rows with shifted clocks; the values are the same array."""
+        """Return the rows with shifted clocks, without the host's unless ``keep_host``; the values are not copied."""
         host = self.times(frames.host_ms) if keep_host and frames.host_ms is not None else None
         device = self.times(frames.device_ms) if self.device else frames.device_ms
         return replace(frames, host_ms=host, device_ms=device)
@@ -94,10 +94,10 @@ def shift_of(subject: str, firsts: list[int], device: bool, key: bytes) -> Shift
     Args:
         firsts: the first wall-clock time of each of the person's files.
         device: whether the device clock is a wall clock too.
-        key: the secret that the instant is drawn from: the same key gives the same shift.
+        key: the secret from which the new time is derived; the same key gives the same shift.
     """
     drawn = int.from_bytes(hmac.digest(key, subject.encode("utf-8"), "sha256")[:8], "big") % _SPREAD_MS
-    # The median decides which times are plausible, so that one damaged file does not matter.
+    # The median decides which times are plausible, so that one damaged file has no effect.
     middle = sorted(firsts)[len(firsts) // 2] if firsts else 0
     near = [t for t in firsts if abs(t - middle) <= _FAR_MS // 2]
     return Shift(min(near, default=0), YEAR_2000_MS + drawn, device)
@@ -110,7 +110,7 @@ _NOT_A_CODE = re.compile(r"[-+]?[\d.]+(e\d+)?|na|n/a|null|none|nan|inf(inity)?|t
 
 @dataclass(frozen=True)
 class PublishOptions:
-    """Options of publishing: more ``columns`` of the people's file; ``key`` fixes the shifts."""
+    """What to include (streams, excluded recordings, ``columns`` of the people's table), and the key of the shifts."""
 
     streams: bool = True
     excluded: bool = False
@@ -120,7 +120,7 @@ class PublishOptions:
 
 @dataclass(frozen=True)
 class PackageContents:
-    """The published data set, its people, and the original of each recording."""
+    """Published data set, its people, and the original recording of each published id."""
 
     dataset: Dataset
     people: dict[str, PersonInfo]
@@ -129,10 +129,10 @@ class PackageContents:
 
 
 class ContentsWriter:
-    """Writes the published data set into the new ``folder``; every file is read back and compared.
+    """Writer of the published data set into the new ``folder``; every written file is read again and compared.
 
     Raises:
-        DatasetError: when nothing would be left, or a file does not come back as it was.
+        DatasetError: if no recording is left to publish, or a file would differ from the original.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class ContentsWriter:
         self.taken: set[str] = set()
 
     def write(self) -> PackageContents:
-        """Write all files and return what was written."""
+        """Write all files; return the published data set, with notes on what was left out or changed."""
         infos: list[StreamInfo | RecordingInfo] = [*self.streams, *([] if self.labelled else self.kept)]
         files: dict[str, str] = {}
         for done, info in enumerate(infos, 1):
@@ -213,7 +213,7 @@ class ContentsWriter:
         raw = read_recording(self.source.path / recording.file, self.source.layout)
         frames = raw.frames
         if raw.integrated and recording.stream_row >= 0 and self.streams:
-            # A clock summed from delays begins at 0; use the stream's clock, so that the recording is located in it.
+            # A clock summed from delays begins at 0: use the stream's clock, by which the recording can be located.
             at = int(self.source.read_stream(recording.stream).device_ms[recording.stream_row])
             frames = replace(frames, device_ms=frames.device_ms - frames.device_ms[0] + at)
         shift = self.shifts[code]
@@ -242,7 +242,7 @@ class ContentsWriter:
             raise DatasetError(f"'{target}' would differ from the recording when it is read. Please report it.")
 
     def _free(self, path: str) -> str:
-        """Return a path below the data folder that no other file has, also on file systems that ignore case."""
+        """Return a path below the data folder that is unused, also on file systems that ignore case."""
         place, _, name = path.rpartition("/")
         number = 2
         while path.casefold() in self.taken:
@@ -290,7 +290,7 @@ class ContentsWriter:
         return shifts
 
     def _sessions(self) -> dict[str, dict[str, int]]:
-        """Number each person's sessions in the order of time; those without a recording come last."""
+        """Number each person's sessions by time; sessions without a recording come last."""
         numbered = {}
         for code in self.codes:
             began: dict[str, int] = {}
@@ -320,7 +320,7 @@ class ContentsWriter:
             write_people(self.folder, people.values())
         left_out = len(columns - set(self.options.columns)) + any(p.consent for p in known.values())
         if left_out:
-            # Only the number, since the name of a column may be private too.
+            # Give only the number, since even the name of a column may be private.
             self.notes.append(f"Left out: {_count(left_out, 'column')} of the people's table.")
         return people
 
@@ -375,9 +375,9 @@ def _folder_of(file: str) -> str:
 
 
 def public_codes(dataset: Dataset) -> dict[str, str]:
-    """Return public codes by a person's folder, with a P before those that readers take for a number or missing."""
+    """Return the public code of each person's folder; P is prepended to those that look like a number or no value."""
     folders = {_folder_of(r.file) for r in dataset.recordings} | {_folder_of(s.file) for s in dataset.streams}
-    # "none" is our code for nobody.
+    # "none" is the code for nobody.
     fine = {f for f in folders if f == "none" or not _NOT_A_CODE.fullmatch(f)}
     codes: dict[str, str] = {}
     taken = {f.casefold() for f in fine}

@@ -1,6 +1,6 @@
-"""Write the Croissant metadata of a package (``croissant.json``), and compare what mlcroissant loads with the files.
+"""Create the Croissant metadata of a package (``croissant.json``), and compare what mlcroissant loads with the files.
 
-Every value is compared: tables with their text, rows of recordings and streams with those that PlushSense reads.
+Each loaded value of a table is compared with its text, each row of a recording or stream with what PlushSense reads.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _TYPES = {INTEGER: "cr:Int64", NUMBER: "cr:Float64", TEXT: "sc:Text", YES_NO: "s
 
 
 def croissant(d: Description) -> dict[str, Any]:
-    """Return the metadata as JSON-LD; the tables' checksums come from ``d.files``."""
+    """Return the metadata as JSON-LD; ``d.files`` must contain the tables, whose checksums are included."""
     files = {f.path: f for f in d.files}
     people = [
         {"@type": "sc:Person", "name": c.name}
@@ -50,7 +50,7 @@ def croissant(d: Description) -> dict[str, Any]:
         for c in d.creators
     ]
     document: dict[str, Any] = {
-        # Written out, so that readers need not fetch it.
+        # The context in full instead of its address, so that readers need not fetch it.
         "@context": json.loads(resources.files("plushsense.dataset.publishing").joinpath(CONTEXT).read_text("utf-8")),
         "@type": "sc:Dataset",
         "name": d.title,
@@ -139,10 +139,10 @@ ReportProblem = Callable[[str, str], None]
 def compare_records(
     mlcroissant: ModuleType, root: Path, dataset: Dataset, stream_rows: int | None, report: ReportProblem
 ) -> dict[str, int]:
-    """Load every record set, compare it with the files, and return how many records of each were compared.
+    """Load every record set, compare it with the files, and return the number of compared records of each.
 
     Args:
-        stream_rows: of each stream only so many rows, from its beginning; None: all.
+        stream_rows: number of rows to compare from the beginning of each stream; None for all.
         report: called with a file and its problem.
     """
     path = str(root / CROISSANT_FILE)
@@ -163,7 +163,7 @@ def compare_records(
             continue
         compared[name] = 0
         for file in files:
-            # One file at a time, so that only its beginning is parsed.
+            # Load one file at a time, so that only its beginning is parsed.
             source.includes = [glob.escape(file[0])]
             records = itertools.islice(iter(loaded.records(name)), stream_rows)
             compared[name] += _rows(name, records, [file], dataset, stream_rows, report)
@@ -229,7 +229,7 @@ def _rows(
     limit: int | None,
     report: ReportProblem,
 ) -> int:
-    """Compare the rows of recordings or streams file by file, in any order of files."""
+    """Compare the rows of recordings or streams by file, in any order of files; return their number."""
     remaining = dict(files)
     compared = 0
     key = f"{name}/{FILE_FIELD}"
@@ -252,7 +252,7 @@ def _rows(
 def _difference(
     rows: list[dict[str, Any]], name: str, frames: Frames, dataset: Dataset, limit: int | None
 ) -> str | None:
-    """Return how records differ from frames; None if they are equal."""
+    """Return how the records ``rows`` differ from ``frames``; None if they are equal."""
     layout = dataset.layout
     n = len(frames) if limit is None else min(limit, len(frames))
     if len(rows) != n:

@@ -1,4 +1,4 @@
-"""Describe a package: the one source of its metadata files and of its texts, from the templates beside this file."""
+"""Describe a package: the common source of its metadata files, and of its texts (templates beside this file)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from plushsense.dataset.store import RECORDINGS, STREAMS, Dataset
 
 @dataclass(frozen=True)
 class Licence:
-    """A licence: SPDX name, title, and the address of its text."""
+    """Licence: SPDX name, title, and the address of its text."""
 
     spdx: str
     title: str
@@ -39,10 +39,10 @@ LICENCES: dict[str, Licence] = {
 
 
 def find_licence(spdx: str) -> Licence:
-    """Return the licence of an SPDX name, in any case.
+    """Return the licence with an SPDX name, whose case is ignored.
 
     Raises:
-        DatasetError: for a name that is not in `LICENCES`, with the nearest one.
+        DatasetError: for a name that is not in `LICENCES`; the message suggests the nearest one.
     """
     for name, licence in LICENCES.items():
         if name.casefold() == spdx.strip().casefold():
@@ -62,7 +62,7 @@ CHECKSUMS = "checksums.sha256"
 
 @dataclass(frozen=True)
 class TableColumn:
-    """A column of a table: its kind (`INTEGER`, …), what it means, its unit, and the range of valid values."""
+    """Column of a table: its kind (`INTEGER`, …), meaning (``text``), unit, and range of valid values."""
 
     name: str
     kind: str
@@ -70,12 +70,12 @@ class TableColumn:
     unit: str = ""
     valid: tuple[float, float] | None = None
     refers: str = ""
-    """``table.column`` that its values refer to."""
+    """Foreign key: the ``table.column`` that the values refer to."""
 
 
 @dataclass(frozen=True)
 class PackageTable:
-    """A table of the package: one file, or (``files``) many of the same columns."""
+    """Table of the package: one ``file``, or many ``files`` with the same columns; ``key`` is the primary key."""
 
     name: str
     text: str
@@ -88,7 +88,7 @@ class PackageTable:
 
 @dataclass(frozen=True)
 class FileEntry:
-    """A file of the package."""
+    """File of the package; ``media`` is its media type, ``text`` its description."""
 
     path: str
     bytes: int
@@ -99,7 +99,7 @@ class FileEntry:
 
 @dataclass(frozen=True)
 class Description:
-    """The package: authors, terms, tables and files; ``published`` is the day in ISO format."""
+    """Description of a package: authors, terms, tables and files; ``published`` is the day in ISO format."""
 
     dataset: Dataset
     licence: Licence
@@ -113,7 +113,7 @@ class Description:
 
     @property
     def name(self) -> str:
-        """A short name for files and identifiers."""
+        """Short ASCII name for files and identifiers."""
         plain = "".join(c if c.isascii() and c.isalnum() else "-" for c in self.dataset.head.name.lower())
         return "-".join(part for part in plain.split("-") if part) or "dataset"
 
@@ -129,18 +129,18 @@ class Description:
 
     @property
     def title(self) -> str:
-        """The title, marked SIMULATION if it is one."""
+        """Title of the data set; begins with SIMULATION for recordings of the virtual toy."""
         title = self.about.title or self.dataset.head.name
         return f"SIMULATION: {title}" if self.simulated and not title.startswith("SIMULATION") else title
 
     @property
     def gestures_made(self) -> int:
-        """Number of gestures with recordings; the set can hold more."""
+        """Number of gestures with recordings; the gesture set may contain more."""
         return len({r.gesture for r in self.dataset.recordings})
 
     @property
     def text(self) -> str:
-        """The description in a paragraph."""
+        """Description of the data set in one paragraph."""
         d = self.dataset
         counted = (
             f"{len(d.recordings)} recordings of {self.gestures_made} gestures by {len(d.subjects)} people on "
@@ -152,24 +152,24 @@ class Description:
 
     @property
     def keywords(self) -> tuple[str, ...]:
-        """Keywords, with "simulation" if it is one."""
+        """Keywords, with "simulation" for recordings of the virtual toy."""
         return (*self.about.keywords, *(("simulation",) if self.simulated else ())) or ("touch gestures",)
 
     @property
     def creators(self) -> tuple[Creator, ...]:
-        """The authors; the contact if nobody else is named."""
+        """Authors of the data set; the contact if there are none."""
         return self.about.creators or (Creator(self.about.contact.name),)
 
     @property
     def citation(self) -> str:
-        """The citation in one line."""
+        """Citation of the data set in one line."""
         names = "; ".join(c.name for c in self.creators)
         where = f" https://doi.org/{self.about.doi}" if self.about.doi else f" {self.about.homepage}".rstrip()
         return f"{names} ({self.published[:4]}): {self.title}, version {self.version} [data set].{where}"
 
     @property
     def url(self) -> str:
-        """The address of the data set; "" if unknown."""
+        """Address of the data set; "" if unknown."""
         return f"https://doi.org/{self.about.doi}" if self.about.doi else self.about.homepage
 
 
@@ -187,13 +187,13 @@ _MEDIA = {
 
 
 def file_entry(root: Path, path: Path, text: str) -> FileEntry:
-    """Return the metadata of a file of the package in ``root``."""
+    """Return the metadata of the file ``path`` in the package ``root``; ``text`` describes it."""
     relative = path.relative_to(root).as_posix()
     return FileEntry(relative, path.stat().st_size, sha256_of(path), _MEDIA.get(path.suffix, "text/plain"), text)
 
 
 def sample_columns(layout: Layout) -> tuple[TableColumn, ...]:
-    """Return the columns of a recording's or stream's file, in file order."""
+    """Return the columns of the files of recordings and streams, in file order."""
     others = {
         HOST_MS: TableColumn(
             HOST_MS, INTEGER, "time at which the computer received the row; shifted, the date is fictitious", "ms"
@@ -207,7 +207,7 @@ def sample_columns(layout: Layout) -> tuple[TableColumn, ...]:
 
 
 def _channel_column(channel: Channel) -> TableColumn:
-    """Return a measured channel as a column."""
+    """Return the column of a measured channel."""
     text = f"{channel.kind}, raw reading"
     if (channel.offset, channel.scale) != (0.0, 1.0):
         text += f"; physical value = (raw - {channel.offset:g}) * {channel.scale:g} {channel.unit}"
@@ -228,12 +228,12 @@ Rows = Sequence[tuple[str, ...]]
 
 
 def fill_template(template: str, d: Description, **values: Any) -> str:
-    """Fill a template of this folder."""
+    """Fill a template of this folder with the description and ``values``."""
     return fill_text("plushsense.dataset.publishing", template, d=d, SIMULATION=SIMULATION, **values)
 
 
 def readme(d: Description, reidentification: str | None) -> str:
-    """Return the README in Markdown; ``reidentification`` is the report's short form, None if it was left out."""
+    """Return the README in Markdown; ``reidentification`` is the short form of that report, None if left out."""
     samples = next(t for t in d.tables if t.files)
     return fill_template(
         "README.md.j2",
@@ -297,6 +297,6 @@ def _findings(d: Description) -> Rows:
 
 
 def _kind(flag: str) -> str:
-    """Return a finding without its numbers and names, so that similar ones are counted together."""
+    """Return a flag without its numbers and names, so that similar flags are counted together."""
     flag = re.sub(r"(the same content as) .*", r"\1 another", flag)
     return re.sub(r"\d[\d.]*", "n", flag.split(" (")[0]).replace("lines", "line").replace("gaps", "gap")

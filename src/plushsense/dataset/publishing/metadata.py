@@ -1,14 +1,14 @@
-"""Write the metadata of a package beside Croissant: RO-Crate, DataCite, Frictionless Data Package and Motion-BIDS.
+"""Create the metadata of a package besides Croissant: RO-Crate, DataCite, Frictionless Data Package and Motion-BIDS.
 
 ``ro-crate-metadata.json`` describes every file (https://w3id.org/ro/crate), ``datacite.json`` and ``.xml`` are required
 for a DOI, ``datapackage.json`` and ``schemas/`` describe the tables (https://specs.frictionlessdata.io): each CSV file
-is a resource with its size, checksum and columns. Valid ranges are stated and not enforced, since values outside of
-them are kept.
+is a resource with its size, checksum and columns. Valid ranges are stated but not enforced, since the files contain
+values outside of them.
 
-``bids/`` is a tree like that of Motion-BIDS (Jeung et al., Scientific Data 2024):
-``sub-P01/[ses-1/]motion/sub-P01_task-backstroke1_tracksys-toy_run-1_motion.tsv`` holds one trimmed recording without a
-header, one column per channel and the time since its start; beside it are ``_channels.tsv`` and ``_motion.json``. Its
-README and `DEVIATIONS` state how it differs from the standard.
+``bids/`` is a tree similar to Motion-BIDS (Jeung et al., Scientific Data 2024):
+``sub-P01/[ses-1/]motion/sub-P01_task-backstroke1_tracksys-toy_run-1_motion.tsv`` is one trimmed recording without a
+header: one column per channel, and the time since its start. Beside it are ``_channels.tsv`` and ``_motion.json``. The
+README in the tree lists the `DEVIATIONS` from the standard.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _CONTACT = "#contact"
 
 
 def crate(d: Description) -> dict[str, Any]:
-    """Return RO-Crate metadata as JSON-LD; every file but this one and the checksums is part of the crate."""
+    """Return the RO-Crate metadata as JSON-LD, with the files ``d.files``."""
     creators = [
         (f"https://orcid.org/{c.orcid}" if c.orcid else f"#creator-{i}", c) for i, c in enumerate(d.creators, 1)
     ]
@@ -90,7 +90,7 @@ UNAVAILABLE = ":unav"
 
 
 def datacite(d: Description) -> dict[str, Any]:
-    """Return DataCite metadata."""
+    """Return the DataCite metadata (schema 4)."""
     document: dict[str, Any] = {
         "schemaVersion": SCHEMA_VERSION,
         "types": {"resourceTypeGeneral": "Dataset", "resourceType": "Touch gesture recordings"},
@@ -146,12 +146,12 @@ SCHEMAS = "schemas"
 
 
 def schemas(d: Description) -> dict[str, dict[str, Any]]:
-    """Return the table schemas by their files' paths."""
+    """Return the Frictionless schema of each table, by the path of its file."""
     return {_schema_path(table): _schema(table) for table in d.tables}
 
 
 def datapackage(d: Description) -> dict[str, Any]:
-    """Return the Frictionless descriptor."""
+    """Return the Frictionless descriptor of the package; ``d.files`` must contain the tables."""
     described = {f.path: f for f in d.files}
     resources = []
     for table in d.tables:
@@ -236,7 +236,7 @@ _TYPES = {"acceleration": "ACCEL", "angular rate": "GYRO"}
 
 
 def write_bids(root: Path, d: Description) -> int:
-    """Write the tree into ``root/bids`` and return how many recordings it holds."""
+    """Write the Motion-BIDS tree into ``root/bids`` and return the number of its recordings."""
     top = root / BIDS
     used = d.dataset.used
     people = sorted({r.subject for r in used})
@@ -320,7 +320,7 @@ def _component(channel: Channel) -> str:
 
 
 def _letters(words: list[str], empty: str) -> dict[str, str]:
-    """Return distinct BIDS labels of letters and digits."""
+    """Return for each word a distinct BIDS label of letters and digits; ``empty`` if nothing of the word is left."""
     labels: dict[str, str] = {}
     for word in words:
         plain = "".join(c for c in word if c.isascii() and c.isalnum()) or empty
@@ -337,5 +337,5 @@ def write_json(path: Path, table: dict[str, Any]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file of the package, with the same line ends on every system."""
+    """Write a text file of the package, with the same line endings on every system."""
     path.write_text(text, encoding="utf-8", newline="\n")

@@ -1,4 +1,4 @@
-"""Publish a data set as a package: refuse incomplete descriptions, write all files, then validate them."""
+"""Publish a data set as a package: require a complete description, write all files, and validate them."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ from plushsense.dataset.publishing.metadata import (
 from plushsense.dataset.publishing.tables import list_package_files, write_checksums, write_tables, write_zip
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, Dataset, DatasetHead, PersonInfo
 
-# In smaller groups, age group and gender alone may identify a person.
+# In smaller groups, age group and gender alone could identify a person.
 FEWEST_ALIKE = 3
 _VERSION = re.compile(r"(0|[1-9]\d*)\.(0|[1-9]\d*)\.(0|[1-9]\d*)([-+][0-9A-Za-z.+-]+)?")
 _LICENCE_FILES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "LICENCE.txt", "COPYING")
@@ -57,7 +57,7 @@ _LICENCE_FILES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "LICENCE.tx
 
 @dataclass(frozen=True)
 class Reidentification:
-    """Result of the re-identification test: a report, its short form, and its figures."""
+    """Result of the test whether people can be recognised: a report, its short form, and its figures."""
 
     report: str
     short: str
@@ -66,7 +66,7 @@ class Reidentification:
 
 @dataclass
 class PublishResult:
-    """Result of publishing."""
+    """Result of publishing; ``zip`` is None if the package is not valid."""
 
     folder: Path
     zip: Path | None
@@ -105,10 +105,10 @@ class PublishResult:
 def complete_head(
     head: DatasetHead, where: Path, licence: str = "", contact: str = "", consent: str = ""
 ) -> DatasetHead:
-    """Return the head with the given values.
+    """Return ``head`` with the given values that are not empty; ``where`` is its folder in messages.
 
     Raises:
-        DatasetError: without a licence, contact or consent statement, or for an invalid value.
+        DatasetError: if licence, contact or consent statement is missing, or a value invalid.
     """
     about = replace(head.about, contact=Contact.parse(contact)) if contact else head.about
     head = replace(head, about=about, licence=licence or head.licence, consent=consent.strip() or head.consent)
@@ -138,10 +138,10 @@ def require_validators() -> None:
 
 
 def check_output_folder(dataset: Dataset, out: Path) -> Path:
-    """Check the target folder and return the path of the zip beside it.
+    """Check the target folder ``out`` and return the path of the zip beside it.
 
     Raises:
-        DatasetError: when it is not empty, the zip exists, or ``out`` lies in the data set.
+        DatasetError: if ``out`` is not empty or lies in the data set, or the zip exists.
     """
     real = out.resolve()
     target = real.with_name(real.name + ".zip")
@@ -169,15 +169,16 @@ def publish(
     """Write the package into the new folder ``out``, validate it, and pack it as ``out.zip`` if it is valid.
 
     Args:
-        head: a `complete_head`.
+        head: the head from `complete_head`.
+        bids: whether to add a Motion-BIDS tree.
         reidentification: None leaves the report out, which the README then states.
-        published: the day of publication, ISO; today by default.
-        thorough: as `validate_package`.
+        published: the day of publication in ISO format; today by default.
+        thorough: as in `validate_package`.
         progress: called with the name of the stage, the work done and its total.
 
     Raises:
-        DatasetError: as `check_output_folder`, or when the data set cannot be published.
-        MissingExtraError: without the validators.
+        DatasetError: as in `check_output_folder`, or if the data set cannot be published.
+        MissingExtraError: if a validator is not installed.
     """
     began = time.perf_counter()
     require_validators()
@@ -230,7 +231,7 @@ def _write_texts(work: Path, d: Description, source: Dataset, reidentification: 
 
 
 def _write_metadata(work: Path, d: Description) -> None:
-    """Write the metadata files, each of which lists those before it; the checksums cover all."""
+    """Write the metadata files in an order in which each file exists before another one lists it."""
     for path, schema in schemas(d).items():
         (work / path).parent.mkdir(exist_ok=True)
         write_json(work / path, schema)

@@ -35,7 +35,7 @@ Row = Mapping[str, object]
 
 
 def build_tables(contents: PackageContents) -> list[tuple[PackageTable, str]]:
-    """Return the tables beside the data, and the text of each."""
+    """Return the tables beside the data, each with its text in CSV."""
     d = contents.dataset
     rows = {
         "recordings": _recordings(d),
@@ -58,7 +58,7 @@ def build_tables(contents: PackageContents) -> list[tuple[PackageTable, str]]:
 
 
 def write_tables(root: Path, contents: PackageContents) -> tuple[PackageTable, ...]:
-    """Write the tables beside the data, and describe them and the data's files."""
+    """Write the tables beside the data; return them and the tables of all recordings' and streams' files."""
     d = contents.dataset
     made = []
     for table, text in build_tables(contents):
@@ -115,7 +115,7 @@ def _streams(d: Dataset) -> Iterable[Row]:
 def _people(contents: PackageContents) -> Iterable[Row]:
     d = contents.dataset
     more = dict.fromkeys((key for p in contents.people.values() for key in p.more), "")
-    # "none" and "unknown" are listed too, so that every reference resolves.
+    # List "none" and "unknown" too, so that every reference can be resolved.
     for code in sorted({r.subject for r in d.recordings} | {s.subject for s in d.streams}):
         mine = [r for r in d.recordings if r.subject == code]
         person = contents.people.get(code, PersonInfo(code))
@@ -124,7 +124,7 @@ def _people(contents: PackageContents) -> Iterable[Row]:
 
 
 def _gestures(d: Dataset) -> Iterable[Row]:
-    # Labels outside the gesture set are listed too, so that every reference resolves.
+    # List labels outside the gesture set too, so that every reference can be resolved.
     known = {g.label: vars(g) for g in d.gestures.gestures}
     unknown = {"affect": "none", "free_choice": False, "description": "not in the gesture set"}
     for label in (*known, *sorted({r.gesture for r in d.recordings} - set(known))):
@@ -139,7 +139,7 @@ def _gestures(d: Dataset) -> Iterable[Row]:
 
 def _channels(d: Dataset) -> Iterable[Row]:
     for c in d.layout.channels:
-        # In full, not rounded to three digits.
+        # As text with all digits, since floats are rounded to three.
         numbers = {key: repr(getattr(c, key)) for key in ("offset", "scale", "step", "valid_min", "valid_max")}
         yield vars(c) | {"channel": c.name} | numbers
 
@@ -149,7 +149,7 @@ _LIMITS = UnpackLimits(total_bytes=64 * 2**30)
 
 
 def list_package_files(root: Path) -> list[Path]:
-    """Return every file below a folder, in the order of their paths."""
+    """Return every file below ``root``, sorted by path."""
     return sorted(walk_files(root), key=lambda p: p.relative_to(root).as_posix())
 
 
@@ -165,7 +165,7 @@ def write_checksums(root: Path) -> int:
 
 
 def read_checksums(root: Path) -> dict[str, str]:
-    """Read the checksums by path; raise DatasetError for a missing or damaged file."""
+    """Read ``checksums.sha256`` as SHA-256 by path; raise DatasetError if it is missing or damaged."""
     path = root / CHECKSUMS
     try:
         text = path.read_text(encoding="utf-8")
@@ -180,10 +180,10 @@ def read_checksums(root: Path) -> dict[str, str]:
 
 
 def write_zip(root: Path, target: Path, folder: str) -> None:
-    """Pack a package under one folder name, completely or not at all; an existing file is never replaced.
+    """Write the package as the zip ``target`` with the top folder ``folder``, completely or not at all.
 
     Raises:
-        DatasetError: when the file is there already.
+        DatasetError: if ``target`` exists.
     """
     if target.exists():
         raise DatasetError(f"'{target}' is already there: nothing is overwritten, give another OUT.")
@@ -195,10 +195,10 @@ def write_zip(root: Path, target: Path, folder: str) -> None:
 
 @contextmanager
 def open_package(package: Path) -> Iterator[Path]:
-    """Yield the folder of a package: itself, or a zip unpacked into a temporary folder.
+    """Yield the folder of a package; a zip is unpacked into a temporary folder.
 
     Raises:
-        DatasetError: for what is neither, or a zip whose entries would leave their folder.
+        DatasetError: if ``package`` is neither a folder nor a zip, or an entry of the zip is refused.
     """
     if package.is_dir():
         yield package

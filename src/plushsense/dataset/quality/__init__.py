@@ -1,1 +1,1 @@
-"""Quality checks of recordings: each check is a function and a line in `checking.CHECKS`."""
+"""Quality checks of recordings; each check is a function and an entry of `checking.CHECKS`."""

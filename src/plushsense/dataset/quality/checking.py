@@ -1,4 +1,4 @@
-"""Run the quality checks over a data set, and make the marks that accept findings or exclude recordings."""
+"""Run the quality checks on a data set, and make the marks that accept findings or exclude recordings."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from plushsense.dataset.store import Dataset, Progress, RecordingInfo, StreamInf
 
 @dataclass(frozen=True)
 class Check:
-    """A quality check.
+    """Quality check.
 
-    ``run`` is a function of `recordings`, which takes an `Examination` of one recording or stream, or of `comparisons`,
-    which takes the `DatasetSummary` and compares all of them; the module in which it is defined decides. ``scope``
-    lists the subjects of its findings: recording, stream, subject, dataset. With ``at_import`` it also runs at every
-    import, and its messages become flags of the index. ``stream_action`` replaces ``action`` for a stream.
+    ``run`` is a function of the module `recordings`, called with the `Examination` of one recording or stream, or of
+    the module `comparisons`, called once with the `DatasetSummary`. ``scope`` lists what its findings can be about:
+    recording, stream, subject, dataset. A check with ``at_import`` also runs whenever the index is built, and its
+    messages become flags of the index. ``action`` is the advice to the user; ``stream_action`` replaces it for streams.
     """
 
     run: Callable[[Any], Iterator[Issue]]
@@ -37,7 +37,7 @@ class Check:
 
     @property
     def compares(self) -> bool:
-        """Whether the check compares all recordings."""
+        """Whether the check is one of `comparisons`, which examine all recordings together."""
         return self.run.__module__ == comparisons.__name__
 
 
@@ -83,7 +83,7 @@ CHECKS: dict[str, Check] = {
 
 
 def import_flags(examined: Examination) -> list[str]:
-    """Return the messages of the import checks about one recording or stream, without those of severity info."""
+    """Return the messages of the ``at_import`` checks for one recording or stream, without those of severity info."""
     scope = _S if examined.stream else _R
     return [
         issue.message
@@ -94,14 +94,14 @@ def import_flags(examined: Examination) -> list[str]:
     ]
 
 
-# A finding that concerns this share of the recordings is reported once, for the data set.
+# A check that finds something in more than this share of the recordings is reported once, for the data set.
 _NEARLY_ALL = 0.8
 _MANY = 10
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """Result of the checks; ``recordings`` were examined, ``excluded`` ones were not."""
+    """Result of the checks; ``recordings`` and ``excluded`` are the numbers of examined and of excluded recordings."""
 
     dataset: Dataset
     findings: tuple[Finding, ...]
@@ -113,7 +113,7 @@ class CheckReport:
 
     @property
     def undecided(self) -> list[Finding]:
-        """Findings that need a decision: errors that nobody accepted."""
+        """Findings that need a decision: errors that are not accepted."""
         return [f for f in self.findings if f.severity == "error" and not f.accepted]
 
     @property
@@ -122,11 +122,11 @@ class CheckReport:
         return not self.undecided
 
     def findings_of(self, *checks: str) -> list[Finding]:
-        """Return the findings of some checks."""
+        """Return the findings of the checks with the given names."""
         return [f for f in self.findings if f.check in checks]
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Count findings by severity and by check; accepted ones are counted apart."""
+        """Count the findings by severity and by check; accepted findings are counted separately."""
         standing = [f for f in self.findings if not f.accepted]
         by_severity = Counter(f.severity for f in standing)
         by_check = Counter(f.check for f in standing)
@@ -152,7 +152,7 @@ class CheckReport:
 
 
 def known_checks(only: Iterable[str]) -> tuple[str, ...]:
-    """Return the checks named in ``only``, all if it is empty; raise ConfigError for an unknown name."""
+    """Return the names in ``only`` without repetitions, all checks if empty; raise ConfigError for an unknown name."""
     names = tuple(dict.fromkeys(only))
     for name in names:
         if name not in CHECKS:
@@ -167,12 +167,12 @@ def check(
     limits: CheckLimits | None = None,
     progress: Progress | None = None,
 ) -> CheckReport:
-    """Examine every recording that is not excluded, and every stream.
+    """Run the quality checks on every recording that is not excluded, and on every stream.
 
     Args:
-        only: names of checks; all by default.
-        limits: the limits above which something is reported.
-        progress: called with (files done, files in all).
+        only: names of the checks to run; all by default.
+        limits: limits that decide what is reported.
+        progress: called with (files done, number of files).
 
     Raises:
         ConfigError: for an unknown check.
@@ -222,7 +222,7 @@ def _examination(
     usual: dict[str, float],
     limits: CheckLimits,
 ) -> Examination:
-    """Return what the checks of one recording or stream need; ``usual`` are the usual rows by gesture."""
+    """Return the input of the checks of one recording or stream; ``usual`` holds the usual rows by gesture."""
     if isinstance(info, StreamInfo):
         malformed = result.malformed - result.cut
         return Examination(
@@ -245,7 +245,7 @@ def _examination(
 def _read(
     dataset: Dataset, used: Sequence[RecordingInfo], progress: Progress | None
 ) -> Iterator[tuple[RecordingInfo | StreamInfo, ReadResult, Frames]]:
-    """Read every raw file once: streams with the recordings that are part of them, and the recordings' own files."""
+    """Read every raw file once; yield streams, recordings that are parts of streams, and recordings with own files."""
     own = [r for r in used if not r.file.startswith("streams/")]
     infos: list[StreamInfo | RecordingInfo] = [*dataset.streams, *own]
     for done, info in enumerate(infos, 1):
@@ -276,7 +276,7 @@ def _finding(issue: Issue, name: str, info: RecordingInfo | StreamInfo | None) -
 
 
 def _merge_common(findings: list[Finding], recordings: int) -> Iterator[Finding]:
-    """Merge the findings of a check that concerns nearly every recording into one of the data set."""
+    """Yield the findings; those of a check that concerns nearly every recording are merged into one of the data set."""
     concerned = Counter(check for check, _ in {(f.check, f.recording) for f in findings if f.recording})
     common = {c for c, n in concerned.items() if n >= _MANY and n > _NEARLY_ALL * recordings}
     yield from (f for f in findings if f.check not in common or not (f.recording or f.stream))
@@ -292,10 +292,10 @@ def _merge_common(findings: list[Finding], recordings: int) -> Iterator[Finding]
 
 
 def author_name(who: str | None) -> str:
-    """Return the name of the person who decides: ``who``, else the login name.
+    """Return the name of the person who makes a mark: ``who``, by default the login name.
 
     Raises:
-        ConfigError: when there is no login name.
+        ConfigError: if both are missing.
     """
     try:
         return who or getpass.getuser()
@@ -306,7 +306,7 @@ def author_name(who: str | None) -> str:
 def exclusions(
     dataset: Dataset, exclude: Sequence[str] = (), include: Sequence[str] = (), *, who: str, why: str
 ) -> list[Mark]:
-    """Return marks that exclude or include recordings; patterns match ids."""
+    """Return marks for the recordings to exclude or include, given as ids or patterns; without those already so."""
     excluded = {r.id: r.excluded for r in dataset.recordings}
     return [
         Mark(identity, action, who, why)
@@ -318,17 +318,17 @@ def exclusions(
 
 
 def parse_acceptance(text: str) -> tuple[str, str]:
-    """Split ``CHECK:PATTERN``; without a pattern it refers to the whole data set. An unknown check is a ConfigError."""
+    """Split ``CHECK:PATTERN``; the pattern is "" if there is none. Raise ConfigError for an unknown check."""
     check, _, pattern = text.partition(":")
     known_checks([check])
     return check, pattern
 
 
 def acceptances(checked: CheckReport, accept: Sequence[str], *, who: str, why: str) -> list[Mark]:
-    """Return marks that accept findings: ``CHECK:PATTERN``, where the pattern matches recordings, streams or people.
+    """Return marks that accept findings, given as ``CHECK:PATTERN``; the pattern matches recordings, streams or people.
 
     Raises:
-        DatasetError: when the check has no such finding, so that a later fault is not hidden.
+        DatasetError: if there is no such finding. Accepting in advance would hide a later fault.
     """
     marks = []
     for entry in accept:
@@ -342,7 +342,7 @@ def acceptances(checked: CheckReport, accept: Sequence[str], *, who: str, why: s
 
 
 def withdrawals(dataset: Dataset, unaccept: Sequence[str], *, who: str, why: str) -> list[Mark]:
-    """Return marks that undo acceptances; raise DatasetError when no such finding is accepted."""
+    """Return marks that undo acceptances (``CHECK:PATTERN``); raise DatasetError if no such finding is accepted."""
     marks = []
     standing = read_marks(dataset.path)
     for entry in unaccept:

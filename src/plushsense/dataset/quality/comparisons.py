@@ -1,4 +1,4 @@
-"""Checks that compare recordings with each other."""
+"""Quality checks that compare the recordings, streams and people of a data set with each other."""
 
 from __future__ import annotations
 
@@ -39,21 +39,21 @@ _AGREE = 0.6
 
 
 def usual_seconds(group: list[RecordingSummary]) -> float:
-    """Return the mean duration (as in the paper) of the recordings that were stopped.
+    """Return the mean duration in seconds (the measure of the paper), without recordings that were never stopped.
 
-    A single recording of three minutes among gestures of two seconds would make outliers of half of the good ones.
+    One such recording of three minutes among gestures of two seconds would make half of the others look too short.
     """
     seconds = np.array([o.seconds for o in group])
     return float(seconds[seconds <= NEVER_STOPPED_FACTOR * np.median(seconds)].mean())
 
 
 def never_stopped(o: RecordingSummary, group: list[RecordingSummary]) -> bool:
-    """Return whether a recording is longer than 10 times the median of its gesture."""
+    """Return whether ``o`` lasts longer than `NEVER_STOPPED_FACTOR` times the median of its gesture, ``group``."""
     return o.seconds > NEVER_STOPPED_FACTOR * float(np.median([g.seconds for g in group]))
 
 
 def _by_subject(group: Iterable[RecordingSummary], values: Iterable[float]) -> dict[str, list[float]]:
-    """Group the values of recordings by person."""
+    """Group ``values``, one for each recording of ``group``, by person."""
     grouped: dict[str, list[float]] = {}
     for o, value in zip(group, values, strict=True):
         grouped.setdefault(o.info.subject, []).append(value)
@@ -61,7 +61,7 @@ def _by_subject(group: Iterable[RecordingSummary], values: Iterable[float]) -> d
 
 
 def _is_cut_by_the_file(o: RecordingSummary, w: DatasetSummary) -> bool:
-    """Return whether a run of equal labels touches an end of its file, so that its duration is not the person's."""
+    """Return whether a recording is a run of equal labels at an end of its file, so that it may be incomplete."""
     info = o.info
     if not isinstance(info, RecordingInfo) or w.dataset.layout.csv.columns[-1] != "label":
         return False
@@ -81,7 +81,7 @@ def duration(w: DatasetSummary) -> Iterator[Issue]:
             off = o.seconds / mean - 1 if mean else 0.0
             if abs(off) <= share or never_stopped(o, group):
                 continue
-            # A person who always takes longer than others is no fault of the recording.
+            # It is no fault of the recording if this person always takes longer (or less long) than others.
             median = float(np.median(own[o.info.subject]))
             habit = bool(median) and len(own[o.info.subject]) >= 3 and abs(o.seconds / median - 1) <= share
             others = "as this person's others do (their median " if habit else "this person's median is "
@@ -94,7 +94,7 @@ def duration(w: DatasetSummary) -> Iterator[Issue]:
 
 
 def flat(w: DatasetSummary) -> Iterator[Issue]:
-    """Find channels with one value throughout that usually have more."""
+    """Find channels that never change in a recording or stream; those constant in most recordings, once for all."""
     names = w.dataset.layout.names
     long = [o for o in w.recordings if o.rows >= _FLAT_ROWS]
     if not long:
@@ -126,7 +126,7 @@ def _channels(names: tuple[str, ...], at: np.ndarray) -> str:
 
 
 def stuck(w: DatasetSummary) -> Iterator[Issue]:
-    """Find channels that hold one value far longer than usual and then go on; all channels at once: the toy hung."""
+    """Find channels that keep one value far longer than usual, but not throughout; if all do, the toy hung."""
     if not w.recordings:
         return
     names = w.dataset.layout.names
@@ -149,12 +149,12 @@ def stuck(w: DatasetSummary) -> Iterator[Issue]:
 
 
 def saturated(w: DatasetSummary) -> Iterator[Issue]:
-    """Find moving channels that stay at their highest or lowest value: the end of the sensor's range."""
+    """Find channels that change but stay at their highest or lowest value, probably the limit of the sensor's range."""
     if not w.recordings:
         return
     names = w.dataset.layout.names
     usual = np.median([o.spread for o in w.recordings], axis=0)
-    # Where several recordings reach the same extreme, it is the sensor's limit; elsewhere a flat top must be longer.
+    # An extreme that several recordings reach is the sensor's limit; any other must be held for longer to be reported.
     tops = np.abs([o.top for o in w.recordings])
     rail = tops.max(axis=0)
     shared = (tops >= _RAIL * rail).sum(axis=0) >= _ALIKE
@@ -180,7 +180,7 @@ def saturated(w: DatasetSummary) -> Iterator[Issue]:
 
 
 def drift(w: DatasetSummary) -> Iterator[Issue]:
-    """Find channels whose baseline changes from the first quarter of a session to the last."""
+    """Find channels whose baseline differs between the first and the last quarter of a session."""
     layout = w.dataset.layout
     level = [c for c, ch in enumerate(layout.channels) if ch.kind in LEVEL_KINDS]
     if not level or not w.recordings:
@@ -204,7 +204,7 @@ def drift(w: DatasetSummary) -> Iterator[Issue]:
 
 
 def _baselines(w: DatasetSummary) -> Iterator[tuple[str, np.ndarray, str, float]]:
-    """Yield the name, baselines (K, C) in order of time, subject of findings and duration of each session."""
+    """Yield for each session its name, its baselines (K, C) over time, the id for findings, and its seconds."""
     streamed = set()
     for o in w.streams:
         if o.lows is not None:
@@ -221,18 +221,18 @@ def _baselines(w: DatasetSummary) -> Iterator[tuple[str, np.ndarray, str, float]
 
 
 def no_onset(w: DatasetSummary) -> Iterator[Issue]:
-    """Find recordings with hardly any activity, if their gesture usually has clear activity."""
+    """Find recordings with hardly any activity, of gestures that usually have clear activity."""
     for group in w.groups.values():
         if len(group) < _ENOUGH:
             continue
         peaks = np.array([np.percentile(w.activity(o), 95) for o in group])
         usual = float(np.median(peaks))
-        # A gesture that many people make without moving has no onset.
+        # A gesture that is often made without moving has no onset.
         if usual < 2 * _SOMETHING or np.percentile(peaks, 20) < _PLAIN * usual:
             continue
         own = _by_subject(group, peaks.tolist())
         for o, peak in zip(group, peaks, strict=True):
-            # A person who is always gentle is no fault of the recording, provided the activity is above rest.
+            # It is no fault of the recording if this person is always gentle, provided the activity is above rest.
             mine = own[o.info.subject]
             if len(mine) >= 3 and peak > max(0.5 * float(np.median(mine)), _GENTLE * w.limits.onset * usual):
                 continue
@@ -250,9 +250,9 @@ def no_onset(w: DatasetSummary) -> Iterator[Issue]:
 
 
 def bursts(activity: np.ndarray, quiet_blocks: int) -> list[tuple[int, int]]:
-    """Return stretches of active blocks, separated by stillness of at least ``quiet_blocks``.
+    """Return the stretches (first, last + 1) of active blocks that at least ``quiet_blocks`` still blocks separate.
 
-    Stretches much weaker than the largest are dropped: the toy is put down, a key is pressed.
+    Stretches much weaker than the strongest are left out, since the toy was only put down or a key pressed.
     """
     top = float(np.percentile(activity, 95)) if len(activity) else 0.0
     on = np.flatnonzero(activity > _QUIET * top)
@@ -268,7 +268,7 @@ def bursts(activity: np.ndarray, quiet_blocks: int) -> list[tuple[int, int]]:
 
 
 def several_gestures(w: DatasetSummary) -> Iterator[Issue]:
-    """Find recordings with more than one stretch of activity, if the gesture usually has one."""
+    """Find recordings with several stretches of activity, of gestures that usually have one."""
     for group in w.groups.values():
         if len(group) < _ENOUGH:
             continue
@@ -276,7 +276,7 @@ def several_gestures(w: DatasetSummary) -> Iterator[Issue]:
         for o in group:
             block_s = o.hop * o.period_ms / 1000
             parts_of.append(bursts(w.activity(o), max(1, round(w.limits.quiet_s / block_s))))
-        # If many recordings have several parts, the gesture has.
+        # If many recordings have several parts, the gesture itself has.
         if np.mean([len(parts) > 1 for parts in parts_of]) > _SEVERAL_USUAL:
             continue
         for o, parts in zip(group, parts_of, strict=True):
@@ -292,8 +292,8 @@ def several_gestures(w: DatasetSummary) -> Iterator[Issue]:
 
 
 def duplicate(w: DatasetSummary) -> Iterator[Issue]:
-    """Find recordings or streams with the same values, whatever their clocks; the first by name is the original."""
-    # Constant recordings are equal without being copies.
+    """Find recordings with equal values (even if their clocks differ) and equal streams; the first is the original."""
+    # Constant recordings can be equal without being copies.
     varying = (o for o in w.recordings if not (o.runs >= o.rows).all())
     originals: dict[bytes | str, str] = {}
     for o in (*sorted(varying, key=lambda o: o.info.id), *w.streams):
@@ -303,7 +303,7 @@ def duplicate(w: DatasetSummary) -> Iterator[Issue]:
 
 
 def overlap(w: DatasetSummary) -> Iterator[Issue]:
-    """Find two recordings that hold the same stretch of their stream."""
+    """Find recordings that share rows of their stream with an earlier recording."""
     placed = [
         (o.info.stream, o.info.stream_row + o.info.start, o.info.stream_row + o.info.stop, o)
         for o in w.recordings
@@ -325,7 +325,7 @@ def overlap(w: DatasetSummary) -> Iterator[Issue]:
 
 
 def _people(w: DatasetSummary) -> dict[str, Counter[str]]:
-    """Count the recordings of each person by gesture, without gestures of free choice or made by nobody."""
+    """Count the recordings of each person by gesture, except free-choice gestures and those that nobody makes."""
     counts: dict[str, Counter[str]] = {}
     for o in w.recordings:
         gesture = w.dataset.gestures.find(gesture_of(o))
@@ -336,7 +336,7 @@ def _people(w: DatasetSummary) -> dict[str, Counter[str]]:
 
 
 def missing(w: DatasetSummary) -> Iterator[Issue]:
-    """Find people with fewer recordings of a gesture than the others, where most made the same number."""
+    """Find people with fewer recordings of a gesture than usual, if most people made the same number."""
     people = _people(w)
     cells = Counter(n for counts in people.values() for n in counts.values())
     if not cells:
@@ -360,7 +360,7 @@ def missing(w: DatasetSummary) -> Iterator[Issue]:
 
 
 def _balance(counts: dict[str, int], what: str, factor: float) -> Iterator[Issue]:
-    """Find names whose count is far from the median."""
+    """Report the names whose count is more than ``factor`` times above or below the median."""
     usual = float(np.median(list(counts.values()))) if counts else 0.0
     odd = [f"{name} {n}" for name, n in counts.items() if usual and (n * factor < usual or n > factor * usual)]
     if odd:
@@ -390,7 +390,7 @@ def not_in_stream(w: DatasetSummary) -> Iterator[Issue]:
     for o in w.recordings:
         if not isinstance(o.info, RecordingInfo):
             continue
-        # Recordings of the untouched toy are in the folder of the person whose session it is.
+        # Recordings of the untouched toy have the subject nobody but are in the folder of the session's person.
         folder = o.info.id.split("/", 1)[0]
         if o.info.stream_row < 0 and (folder, o.info.session) in streamed:
             yield Issue("not found in the session's stream", about=o.info.id)

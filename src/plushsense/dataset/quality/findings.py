@@ -1,4 +1,4 @@
-"""Findings of the quality checks, and the limits above which they are reported."""
+"""Findings of the quality checks, and the limits that decide what is reported."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from plushsense.core.errors import ConfigError, nearest
 
 Severity = Literal["info", "warning", "error"]
 PARTLY_THERE = "only its first"
-"""Start of the index's flag for a recording whose end is not in the stream."""
+"""First words of the index flag of a recording whose last rows are not in its stream."""
 
-# Most urgent first. An error needs a decision: until it is accepted, or the recording excluded, the check fails.
+# Most urgent first. An error needs a decision: the check fails until it is accepted or the recording is excluded.
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "info")
 
 
@@ -21,36 +21,36 @@ class CheckLimits:
     """Limits of the checks; docs/checks.md gives the reason for each."""
 
     duration: float = 0.4
-    """Share of the gesture's mean duration by which a recording may differ (the paper: 0.4)."""
+    """Largest difference of a recording's duration from the mean of its gesture, as a share of it (the paper: 0.4)."""
     rate: float = 0.2
-    """Share of the layout's rate by which the measured one may differ."""
+    """Largest difference of the measured frame rate from the layout's, as a share of the latter."""
     jitter: float = 0.3
-    """Half the spread (5 to 95 %) of the time between frames, as a share of its median."""
+    """Half the range from the 5th to the 95th percentile of the time between frames, as a share of its median."""
     gap_ms: float = 50.0
-    """Time without a frame; where frames come slower than 20 a second, 2.5 periods."""
+    """Longest time without a frame; 2.5 periods if that is longer (below 50 frames a second)."""
     long_gap_ms: float = 1000.0
-    """A gap in a recording that needs a decision."""
+    """Duration above which a gap in a recording is an error."""
     pause_s: float = 60.0
-    """A stream that stood still this long goes on afterwards as another session."""
+    """Longest pause of a stream, by the computer's clock; after a longer one it was resumed."""
     lost: float = 0.02
-    """Share of frames that the device clock misses."""
+    """Largest share of lost frames, by the device clock."""
     garbage: float = 0.2
-    """Share of rows with an invalid value that needs a decision."""
+    """Share of bad rows (invalid values, blank rows, spikes) above which these are an error."""
     spike: float = 6.0
-    """A jump of one row away and back, as a multiple of the channel's 95 % step in the recording."""
+    """Size of a jump away and back within one row, as a multiple of the channel's 95th percentile of steps."""
     stuck_s: float = 0.5
-    """A channel that holds one value; at least 10 times what is usual for the channel."""
+    """Longest time that a channel may keep one value; 10 times what is usual for the channel if that is longer."""
     saturated_s: float = 0.1
-    """A channel that stays at its highest or lowest value; at least 4 times what is usual for the channel. Half of it
-    where several recordings end at that value."""
+    """Longest time that a channel may stay at its highest or lowest value; 4 times what is usual for the channel if
+    that is longer. Half of it for a value that several recordings reach."""
     drift: float = 0.5
-    """Change of a capacitive channel's baseline within a session, as a share of its signal when touched."""
+    """Largest change of a contact channel's baseline within a session, as a share of its signal when touched."""
     onset: float = 0.1
-    """Activity of a recording as a share of what is usual for its gesture."""
+    """Least activity of a recording, as a share of what is usual for its gesture."""
     quiet_s: float = 0.7
-    """Stillness that separates two gestures."""
+    """Duration of stillness that separates two gestures."""
     balance: float = 2.0
-    """Times more or fewer recordings than the median gesture or person."""
+    """Largest ratio, up or down, of the recordings of a gesture or person to the median."""
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -59,7 +59,7 @@ class CheckLimits:
                 raise ConfigError(f"The limit {f.name} is {value!r}; it must be a number above 0.")
 
     def changed(self, given: Mapping[str, float]) -> Self:
-        """Return these limits with some replaced; raise ConfigError for an unknown name."""
+        """Return a copy with the limits of ``given`` replaced; raise ConfigError for an unknown name."""
         known = [f.name for f in fields(self)]
         for name in given:
             if name not in known:
@@ -69,11 +69,11 @@ class CheckLimits:
 
 @dataclass(frozen=True)
 class Issue:
-    """A finding as a check yields it.
+    """Result that a check yields; `Finding` adds the check, its severity and the subject.
 
     ``rows`` are ranges (first, last + 1) of the recording or stream, ``channels`` are positions in the layout. Checks
-    that compare set ``about`` to the id of the recording, stream or person. ``severity`` is set if it differs from the
-    check's.
+    that compare recordings set ``about`` to the id of the recording, stream or person concerned. ``severity`` is None
+    unless it differs from that of the check.
     """
 
     message: str
@@ -85,10 +85,10 @@ class Issue:
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """A finding as it is reported.
+    """Finding of the report.
 
-    ``recording``, ``stream``, ``subject`` and ``gesture`` are "" if they do not apply. ``accepted``: a mark states that
-    it is known and no fault.
+    ``recording``, ``stream``, ``subject`` and ``gesture`` are "" if they do not apply. ``action`` is the advice to the
+    user. ``accepted`` is whether a mark states that the finding is known and no fault.
     """
 
     recording: str = ""
@@ -105,5 +105,5 @@ class Finding:
 
     @property
     def about(self) -> str:
-        """The id that marks use: of a recording, a stream, a person, or "" for the data set."""
+        """Id that marks use: of the recording, stream or person concerned, or "" for the whole data set."""
         return self.recording or self.stream or self.subject

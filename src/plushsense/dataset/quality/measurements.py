@@ -1,4 +1,4 @@
-"""Measurements of a recording for the checks, and the summary by which recordings are compared."""
+"""Measurements of single recordings for the checks, and the summaries by which recordings are compared."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from plushsense.recording.takes import measured_rate_hz
 
 NEVER_STOPPED_FACTOR = 10.0
 SLOW_FACTOR = 2.5
-# Share of nearly equal stamps from which on frames count as stamped several at once, on arrival.
+# If more than this share of steps is almost 0, frames were stamped on arrival, several at once.
 _BURSTS = 0.05
 
 
 @dataclass(frozen=True)
 class Examination:
-    """Rows of a recording or stream under examination.
+    """Input of the checks of one recording or stream.
 
-    ``rows_named`` is the count in the file's name (None if there is none), ``usual_rows`` the median over the
-    recordings of the gesture, ``first_row`` the row of the file at which ``frames`` begin. ``malformed`` counts
-    unreadable lines of the file, ``cut`` is whether its last line is incomplete, ``stream`` whether it is a stream.
+    ``rows_named`` is the number of rows in the file's name (None if there is none), ``usual_rows`` the median number
+    over the recordings of the gesture, ``first_row`` the row of the file at which ``frames`` begin. ``malformed``
+    counts unreadable lines of the file, ``cut`` is whether its last line is incomplete, ``stream`` if it is a stream.
     """
 
     frames: Frames
@@ -55,30 +55,30 @@ class Examination:
 
     @cached_property
     def in_bursts(self) -> bool:
-        """Whether frames are stamped several at once, so that single steps carry little information."""
+        """Whether several frames often have nearly the same time stamp, so that single steps mean little."""
         return len(self.steps) >= 10 and float(np.mean(np.abs(self.steps) < 0.25 * self.period_ms)) > _BURSTS
 
     @cached_property
     def spread_ms(self) -> tuple[float, float]:
-        """The 5th and 95th percentile of the time between frames; lost frames, gaps and resets apart."""
+        """The 5th and 95th percentile of the time between frames, without lost frames, gaps and clock resets."""
         even = self.steps[(self.steps >= 0) & (self.steps < 1.75 * self.period_ms)]
         low, high = np.percentile(even, (5, 95)) if len(even) else (0.0, 0.0)
         return float(low), float(high)
 
     @property
     def jitters(self) -> bool:
-        """Whether the time between frames varies by more than the limit."""
+        """Whether the time between frames varies by more than ``limits.jitter``."""
         low, high = self.spread_ms
         return len(self.steps) >= 20 and (high - low) / 2 > self.limits.jitter * self.period_ms > 0
 
     @property
     def uneven(self) -> bool:
-        """Whether stamps are uneven, so that only delays that are not caught up count as missing frames."""
+        """Whether time stamps are uneven, so that only a delay that later frames do not catch up is a gap."""
         return self.in_bursts or self.jitters
 
     @property
     def gap_ms(self) -> float:
-        """The step from which on it is a gap: slow toys have longer ones."""
+        """Step in ms above which frames are missing; longer for toys with a low frame rate."""
         return max(self.limits.gap_ms, SLOW_FACTOR * self.period_ms)
 
     @cached_property
@@ -88,7 +88,7 @@ class Examination:
         far = np.flatnonzero(self.steps > 5000)
         if host is None or not len(far):
             return np.empty(0, dtype=np.int64)
-        # Buffered frames arrive late and all at once, so compare the time around them.
+        # Buffered frames arrive late and together, so compare the times some rows before and after.
         before, after = host[np.maximum(far - 20, 0)], host[np.minimum(far + 21, len(host) - 1)]
         return far[(after - before) < 0.5 * self.steps[far]]
 
@@ -98,8 +98,8 @@ class Examination:
         gaps = np.setdiff1d(np.flatnonzero(self.steps > self.gap_ms), self.jumps)
         if not self.uneven or not len(gaps):
             return gaps
-        # With uneven stamps, a delay that the following frames catch up is no gap: compare the time of the rows
-        # around with their number.
+        # With uneven stamps, a delay that later frames catch up is no gap: compare the duration of the rows around it
+        # with their number.
         rate = measured_rate_hz(self.frames.device_ms)
         time, reach = self.frames.device_ms, 15
         low, high = np.maximum(gaps - reach, 0), np.minimum(gaps + 1 + reach, len(time) - 1)
@@ -128,23 +128,24 @@ def duration_s(frames: Frames) -> float:
 
 
 LEVEL_KINDS = ("capacitive", "proximity")
-"""Kinds of channel whose level shows touch; other channels turn with the toy."""
+"""Kinds of channels whose level shows touch; the level of other kinds also changes as the toy is turned."""
 _HOP_S = 0.1
 _CHUNK_S = 10.0
 _NOISE = 2.0
-# A channel needs activity of this many times its noise to count.
+# Least scale of a channel's activity, as a multiple of its noise, so that channels that never move do not count.
 _MOVED = 10.0
 
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """Summary of a recording or stream; C channels.
+    """Summary of a recording or stream with C channels.
 
-    ``activity`` (B, C) float32 is the range of each channel over 0.2 s, in blocks of 0.1 s (``hop`` rows); for channels
-    of `LEVEL_KINDS` at least the height over the recording's low. ``runs`` (C,) is the longest run of one value in
-    rows, from ``run_at``; ``top_runs`` the same at the highest or lowest value ``top``, which occurs in ``top_rows``
-    rows. ``spread`` (C,) is the range from the 2nd to the 98th percentile, ``low`` the 10th percentile, and ``lows``
-    (K, C) the 10th percentile of every 10 s of a stream.
+    ``activity`` (B, C) float32 is the range of each channel over 0.2 s, for every block of 0.1 s (``hop`` rows), empty
+    for streams; for channels of `LEVEL_KINDS` it is at least the height above the recording's 10th percentile. ``runs``
+    (C,) is the length in rows of the longest run of one value, which begins at row ``run_at``; ``top_runs`` and
+    ``top_at`` are the same at the highest or lowest value ``top``, which occurs in ``top_rows`` rows. ``spread`` (C,)
+    is the range from the 2nd to the 98th percentile, ``low`` the 10th percentile, ``lows`` (K, C) the 10th percentile
+    of every 10 s of a stream. ``content`` is a hash of the values, b"" for a stream.
     """
 
     info: RecordingInfo | StreamInfo
@@ -166,12 +167,12 @@ class RecordingSummary:
 
     @property
     def first_row(self) -> int:
-        """Row of the recording at which the examined rows begin."""
+        """Row of the recording at which the summarised rows begin."""
         return self.info.start if isinstance(self.info, RecordingInfo) else 0
 
 
 def _longest(same: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return for each column of ``same`` (T, C) the longest run of True and its first row."""
+    """Return the length and the first row of the longest run of True in each column of ``same`` (T, C)."""
     rows = np.arange(len(same))[:, None]
     broken = np.maximum.accumulate(np.where(same, -1, rows), axis=0)
     length = np.where(same, rows - broken, 0)
@@ -195,7 +196,7 @@ def _activity(values: NDArray[np.float64], hop: int, level: NDArray[np.bool_]) -
 
 
 def summarize(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) -> RecordingSummary:
-    """Summarise some rows; invalid values are clipped to the valid range, so that one does not hide the rest."""
+    """Summarise ``frames``; invalid values are clipped to the valid range, so that they do not dominate."""
     values = np.clip(frames.values, layout.valid_min_int, layout.valid_max_int)
     t, c = values.shape
     stream = isinstance(info, StreamInfo)
@@ -208,7 +209,7 @@ def summarize(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) 
     runs, at = _longest(same)
     held_top, top_at = _longest(values == values.max(axis=0))
     held_low, low_at = _longest(values == values.min(axis=0))
-    # Without touch a level rests at its lowest value, which is not saturation.
+    # Without touch such a channel stays at its lowest value, which is not saturation.
     held_low[level] = 0
     top_at = np.where(held_low > held_top, low_at, top_at)
     top = values[top_at, np.arange(c)]
@@ -233,7 +234,7 @@ def summarize(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) 
         (values == top).sum(axis=0),
         q98 - q2,
         low,
-        # Copies under other names or clocks have the same values.
+        # Hash the values only, since copies may have other names and clocks.
         b"" if stream else hashlib.sha256(np.ascontiguousarray(frames.values).tobytes()).digest(),
         lows,
     )
@@ -241,7 +242,7 @@ def summarize(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) 
 
 @dataclass(frozen=True)
 class DatasetSummary:
-    """Summaries of all used recordings and of the streams, for checks that compare."""
+    """Summaries of all used recordings and of the streams: the input of the checks that compare them."""
 
     dataset: Dataset
     recordings: Sequence[RecordingSummary]
@@ -250,7 +251,7 @@ class DatasetSummary:
 
     @cached_property
     def groups(self) -> dict[str, list[RecordingSummary]]:
-        """Recordings that should be alike: of one gesture, and of one person if the gesture is free choice."""
+        """Groups of similar recordings: those of one gesture, and of one person if the gesture is a free choice."""
         groups: dict[str, list[RecordingSummary]] = {}
         for o in self.recordings:
             gesture = self.dataset.gestures.find(gesture_of(o))
@@ -260,33 +261,33 @@ class DatasetSummary:
 
     @cached_property
     def noise(self) -> NDArray[np.float64]:
-        """Activity of each channel at rest, (C,): the quiet moments of the quietest recordings."""
+        """Activity of each channel at rest, (C,), from the quiet moments of the quietest recordings."""
         quiet = [np.percentile(o.activity, 10, axis=0) for o in self.recordings if len(o.activity)]
         return np.asarray(np.percentile(quiet or np.zeros((1, self.dataset.layout.n_channels)), 5, axis=0))
 
     @cached_property
     def scale(self) -> NDArray[np.float64]:
-        """Activity of each channel when it is touched, (C,), which makes channels of all kinds comparable."""
+        """Activity of each channel when it is touched, (C,), by which kinds of channels are made comparable."""
         peaks = [np.percentile(o.activity, 95, axis=0) for o in self.recordings if len(o.activity)]
         high = np.asarray(np.percentile(peaks or np.zeros((1, self.dataset.layout.n_channels)), 90, axis=0), np.float64)
         return np.maximum(high - _NOISE * self.noise, np.maximum(_MOVED * self.noise, 1.0))
 
     def activity(self, o: RecordingSummary) -> NDArray[np.float64]:
-        """Return the activity in each block of a recording over all channels, beyond their noise, (B,)."""
+        """Return the activity above the noise in each block of a recording, (B,), combined over all channels."""
         beyond = np.maximum(o.activity - _NOISE * self.noise, 0.0) / self.scale
         return np.asarray(np.sqrt(np.square(beyond).sum(axis=1)))
 
     @cached_property
     def usual_run_ms(self) -> NDArray[np.float64]:
-        """The median over the recordings of each channel's longest stretch of one value in ms, (C,)."""
+        """Usual duration of each channel's longest run of one value in ms, (C,): the median over the recordings."""
         return np.asarray(np.median([o.runs * o.period_ms for o in self.recordings], axis=0))
 
     @cached_property
     def usual_top_ms(self) -> NDArray[np.float64]:
-        """The same for stretches at the highest or lowest value."""
+        """As `usual_run_ms`, for runs at the highest or lowest value."""
         return np.asarray(np.median([o.top_runs * o.period_ms for o in self.recordings], axis=0))
 
 
 def gesture_of(o: RecordingSummary) -> str:
-    """Return the gesture of a recording's summary; "" for a stream."""
+    """Return the gesture of a summarised recording; "" for a stream."""
     return o.info.gesture if isinstance(o.info, RecordingInfo) else ""

@@ -1,4 +1,4 @@
-"""Checks of one recording or stream: values, rows and clock."""
+"""Quality checks of a single recording or stream: its values, rows and clock."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FEW_LOST = 3
 
 
 def _ranges(rows: NDArray[np.int64], s: Examination, length: int = 1) -> tuple[tuple[int, int], ...]:
-    """Return the ranges of rows of the file that begin at the first of ``rows``."""
+    """Return a range of ``length`` rows of the file from each of the first `_SHOWN` of ``rows``."""
     return tuple((int(r) + s.first_row, int(r) + s.first_row + length) for r in rows[:_SHOWN])
 
 
@@ -31,7 +31,7 @@ def _plural(n: int, what: str) -> str:
 
 
 def _weight(share: float, limits: CheckLimits) -> Severity | None:
-    """Return the severity for a share of bad rows: few are tolerable, since readers hold the last valid value."""
+    """Return the severity for a share of bad rows; few do no harm, since readers repeat the last valid value."""
     return "error" if share > limits.garbage else "info" if share < _FEW else None
 
 
@@ -78,7 +78,7 @@ def blank_rows(s: Examination) -> Iterator[Issue]:
 
 
 def spikes(s: Examination) -> Iterator[Issue]:
-    """Find single rows in which a channel jumps far away and back: a failed reading."""
+    """Find single rows in which a channel jumps far away and back, which are probably failed readings."""
     values = s.frames.values
     if len(values) < _SPIKE_ROWS:
         return
@@ -88,7 +88,7 @@ def spikes(s: Examination) -> Iterator[Issue]:
     usual = np.percentile(np.abs(steps), 95, axis=0)
     usual = np.maximum(usual, _OF_SPREAD * np.subtract(*np.percentile(values, (98, 2), axis=0)))
     far = (size > s.limits.spike * np.maximum(usual, 1)) & (size > 3 * np.abs(values[2:] - values[:-2]))
-    # Values outside the valid range have a check of their own.
+    # Another check reports values outside the valid range.
     far &= (values[1:-1] >= s.layout.valid_min_int) & (values[1:-1] <= s.layout.valid_max_int)
     rows = np.flatnonzero(far.any(axis=1)) + 1
     if len(rows):
@@ -111,7 +111,7 @@ def cut_line(s: Examination) -> Iterator[Issue]:
 
 
 def format_duration(ms: float) -> str:
-    """Format a time in a suitable unit."""
+    """Format a duration of ``ms`` milliseconds in a suitable unit."""
     for limit_ms, unit_ms, unit in ((10_000, 1, "ms"), (600_000, 1000, "s"), (36_000_000, 60_000, "min")):
         if ms < limit_ms:
             return f"{ms / unit_ms:.0f} {unit}"
@@ -122,7 +122,7 @@ def clock_reset(s: Examination) -> Iterator[Issue]:
     back = np.flatnonzero(s.steps < 0)
     of_stream: Severity | None = None
     if s.stream:
-        # A stream's first rows may be left over in the buffer of the serial port.
+        # The first rows of a stream may be old ones from the buffer of the serial port.
         of_stream = "info" if len(back) and back.max() < _LEFT_OVER else "warning"
     if len(back):
         yield Issue(
@@ -153,10 +153,10 @@ def gaps(s: Examination) -> Iterator[Issue]:
 
 
 def lost_frames(s: Examination) -> Iterator[Issue]:
-    """Count the frames that are missing by the device clock; if it is uneven, only those in gaps."""
+    """Count the lost frames by the device clock; if the time stamps are uneven, only those in gaps."""
     if s.period_ms <= 0:
         return
-    # Pauses and restarts have checks of their own.
+    # Other checks report pauses and restarts.
     good = (s.steps > 0) & (s.steps <= _STANDSTILL_MS)
     good[s.jumps] = False
     usual = float(np.mean(s.steps[good & (s.steps < 1.5 * s.period_ms)])) if good.any() else s.period_ms
@@ -183,10 +183,10 @@ def jitter(s: Examination) -> Iterator[Issue]:
 
 
 def rate(s: Examination) -> Iterator[Issue]:
-    """Compare the measured rate, outside gaps, with that of the layout."""
+    """Compare the measured frame rate, without gaps, with that of the layout."""
     even = s.steps[(s.steps >= 0) & (s.steps <= s.gap_ms)]
     nominal = s.layout.rate_hz
-    # With uneven stamps, the rate needs more rows.
+    # With uneven time stamps, more rows are needed to measure the rate.
     if len(even) < max(10, _RATE_OVER_S * nominal if s.uneven else 0) or even.sum() <= 0:
         return
     measured = 1000.0 * len(even) / float(even.sum())
@@ -195,7 +195,7 @@ def rate(s: Examination) -> Iterator[Issue]:
 
 
 def resumed(s: Examination) -> Iterator[Issue]:
-    """Find pauses after which a stream was appended to, by the computer's clock."""
+    """Find pauses, by the computer's clock, after which frames were appended to the same stream."""
     host = s.frames.host_ms
     if host is None or s.frames.device_ms is host:
         return
@@ -204,7 +204,7 @@ def resumed(s: Examination) -> Iterator[Issue]:
     if not len(at):
         return
     longest = float(quiet[at].max())
-    # The time zone of the recorder is unknown, so midnight is too.
+    # The time zone of the recorder, and so midnight, is unknown: guess from the length of the pause.
     days = longest > _NIGHT_MS
     yield Issue(
         f"goes on after a pause {len(at)}× (the longest {format_duration(longest)} by the computer's clock, "

@@ -1,8 +1,8 @@
-"""The network as .espdl for Espressif's ESP-DL, through esp-ppq (which needs PyTorch).
+"""Convert the network to .espdl for Espressif's ESP-DL, by esp-ppq (which needs PyTorch).
 
-ESP-DL has its own 8 bits: signed, one power of two a tensor (a filter on the P4). So this is a quantization of the
-float network by esp-ppq, not the toy's integers. Input ``scaled`` (1, C, span), output ``logits`` (1, K): the
-scaling stays with the caller, its numbers stand in the file's metadata.
+ESP-DL has an 8-bit format of its own: signed, with one power-of-two scale per tensor (on the P4 per filter). Therefore
+esp-ppq quantizes the float network; the integers are not those of the toy. Input is ``scaled`` (1, C, span), output
+``logits`` (1, K): the caller scales the values, by the numbers in the metadata of the file.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from plushsense.models.bundle import Bundle
 SCALED = "scaled"
 MAGIC = b"EDL2"
 HEAD_BYTES = 16
-_MOST = 128  # windows: esp-ppq simulates a few dozen a second
+_MOST = 128  # windows; esp-ppq simulates a few dozen per second
 
 
 def plain_model(bundle: Bundle) -> Any:
     """Return the folded network as an ONNX model for esp-ppq: only Conv, Relu, GlobalAveragePool, Flatten and Gemm."""
     g, arch, z = OnnxGraph("espdl"), bundle.arch, SCALED
-    # The filters are not equalised by their ranges: on the S3 that gave answers farther from the float network.
+    # Do not equalise the ranges of the filters: on the S3 the answers then differed more from the float network.
     *convolutions, dense = [tuple(v.astype(np.float32) for v in part) for part in folded(arch, bundle.weights)]
     for i, (layer, (weights, bias)) in enumerate(zip(arch.layers, convolutions, strict=True)):
         w, b = g.constant(f"w{i}", weights), g.constant(f"b{i}", bias)
@@ -48,9 +48,9 @@ def plain_model(bundle: Bundle) -> Any:
 
 
 def to_espdl(job: ConversionJob, target: str) -> Conversion:
-    """Convert the network for ``target`` (esp32, esp32s3, esp32c3, esp32p4 …); each has its own weight layout.
+    """Convert the network for ``target`` (esp32, esp32s3, esp32c3, esp32p4 …); each has another weight layout.
 
-    The file holds one made-up window and its answer, with which ESP-DL's ``model->test()`` tries it on the chip.
+    The file includes the last window and its answer, with which ESP-DL's ``model->test()`` tests it on the chip.
     """
     bundle = job.bundle
     refuse_undeployable(bundle.arch)
@@ -83,7 +83,7 @@ to_esp32p4 = partial(to_espdl, target="esp32p4")
 def _quantized(
     bundle: Bundle, model: Any, some: Floats, scaled: Floats, target: str, facts: dict[str, str]
 ) -> tuple[bytes, NDArray[np.float32]]:
-    """Return the bytes of the file and the logits (N, K) of esp-ppq's simulation."""
+    """Return the bytes of the file, with ranges from ``some``, and the logits (N, K) that esp-ppq simulates."""
     torch = need("torch", "espdl")
     output = io.StringIO()
     with (

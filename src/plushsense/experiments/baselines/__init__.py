@@ -1,1 +1,1 @@
-"""Classical and recurrent baselines beside our network, under several splits. Read run, score, report."""
+"""Compare classical and recurrent baselines with our network under several splits. Read run, score, report."""

@@ -1,8 +1,8 @@
-"""The classical programs to compare a network with: statistics or flattened windows, with and without PCA.
+"""Classical classifiers to compare a network with, on statistics or flattened windows, with and without PCA.
 
-A baseline is scaling, perhaps PCA, and a classifier of scikit-learn (extra ``baselines``), all fitted to the training
-windows of a fold and to nothing else. Names such as "cubic SVM" and "subspace kNN" are those of MATLAB's Classification
-Learner, which the paper used (sections 3.4 and 4.5); it gives no settings, so ours stand beside each name below.
+A baseline is a pipeline of scaling, optional PCA and a classifier of scikit-learn (extra ``baselines``), fitted only to
+the training windows of a fold. Names such as "cubic SVM" and "subspace kNN" come from MATLAB's Classification Learner,
+which the paper used (sections 3.4 and 4.5). The paper gives no settings; ours are in `BASELINES`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from plushsense.windows.features import Scaler, statistics
 
 Floats = NDArray[np.float64]
 
-# Part of every job's id: raise it when the same name would be another program.
+# Part of every job's id: increase it when a name comes to mean another program or other settings.
 BASELINES_VERSION = 1
 # The share of the variance that PCA keeps.
 PCA_VARIANCE = 0.95
@@ -38,14 +38,14 @@ def _sklearn(module: str) -> Any:
 
 
 class Baseline(NamedTuple):
-    """A classical program: its title in tables, and how its classifier is made from a seed."""
+    """A classical program: its title in tables, and a function that makes its classifier from a seed."""
 
     title: str
     make: Callable[[int], Any]
 
 
 def _subspace_knn(seed: int) -> Any:
-    """Return 30 nearest-neighbour classifiers, each on another random half of the values (Ho 1998)."""
+    """Return an ensemble of 30 nearest-neighbour classifiers, each on a random half of the features (Ho 1998)."""
     one = _sklearn("neighbors").KNeighborsClassifier(1, n_jobs=1)
     return _sklearn("ensemble").BaggingClassifier(
         one, 30, max_features=0.5, bootstrap=False, random_state=seed, n_jobs=1
@@ -86,16 +86,16 @@ def _flattened(windows: WindowSet, samples: int) -> Floats:
     return windows.x[:, :, -samples:].reshape(len(windows), -1).astype(np.float64)
 
 
-# Left out: on flattened windows of 3 channels one fit took 52 s, on 11 it would take minutes, for little gain.
+# (name, features, PCA) left out: one fit on flattened windows of 3 channels took 52 s; 11 channels would take minutes.
 TOO_LONG = (("boosting", "flattened", False),)
 
-# What a classifier is given of a window's last ``samples`` samples, (N, values).
+# Functions that compute a classifier's input (N, values) from the last ``samples`` samples of the windows.
 FEATURES: dict[str, Callable[[WindowSet, int], Floats]] = {"statistics": _statistics, "flattened": _flattened}
 
 
 @dataclass(frozen=True)
 class ClassicalFit:
-    """Fits one baseline; ``samples`` is the window that it reads, counted from the end."""
+    """A function that fits one baseline; it uses the last ``samples`` samples of each window."""
 
     name: str
     features: str
@@ -111,17 +111,16 @@ class ClassicalFit:
             steps.append(_sklearn("decomposition").PCA(PCA_VARIANCE, svd_solver="full"))
         pipeline = _sklearn("pipeline").make_pipeline(*steps, BASELINES[self.name].make(self.seed))
         with warnings.catch_warnings():
-            # The small network has a fixed number of iterations; the user cannot act on a warning about it.
+            # The MLP stops after a fixed number of iterations; the user can do nothing about the warning.
             warnings.simplefilter("ignore", _sklearn("exceptions").ConvergenceWarning)
             pipeline.fit(FEATURES[self.features](train, self.samples), train.y)
         return FittedClassifier(pipeline, lambda windows: FEATURES[self.features](windows, self.samples))
 
 
 class FittedClassifier:
-    """A fitted ``model`` with the function that returns its input from windows.
+    """A fitted ``model`` and the function ``view`` that computes its input from windows.
 
-    ``size_bytes`` is the length of the model's pickle in memory, a measure like MATLAB's "model size". Nothing is
-    stored in that format.
+    ``size_bytes`` is the length of the pickled model, comparable to MATLAB's "model size". The pickle is not stored.
     """
 
     def __init__(self, model: Any, view: Callable[[WindowSet], NDArray[Any]]) -> None:
@@ -138,8 +137,8 @@ class FittedClassifier:
 def likelihoods(model: Any, x: Any, classes: int) -> NDArray[np.float32]:
     """Return probabilities (N, K) over all classes; 0 for a class without training windows.
 
-    A support vector machine gives no probabilities: its decision values, votes with their margins, go through a
-    softmax, which keeps their order and is not calibrated.
+    Support vector machines give no probabilities here. The softmax of their decision values (votes and margins)
+    replaces them: it keeps the order of the classes and is not calibrated.
     """
     out = np.zeros((len(x), classes), dtype=np.float32)
     if hasattr(model, "predict_proba"):
@@ -154,7 +153,7 @@ def likelihoods(model: Any, x: Any, classes: int) -> NDArray[np.float32]:
 
 
 def enough_to_learn(train: WindowSet) -> None:
-    """Refuse a fold that trains on windows of one gesture."""
+    """Raise `BadInput` unless the training windows contain at least two gestures."""
     if len(np.unique(train.y)) < 2:
         found = ", ".join(train.labels[k] for k in np.unique(train.y)) or "none"
         raise BadInput(
@@ -166,10 +165,10 @@ def enough_to_learn(train: WindowSet) -> None:
 def classical(
     names: Sequence[str], features: Sequence[str], pca: Sequence[bool], samples: int, seed: int
 ) -> list[Contender]:
-    """Return every requested baseline on every requested view of the windows, except those that take `TOO_LONG`.
+    """Return a contender for each combination of ``names``, ``features`` and ``pca``, except those in `TOO_LONG`.
 
     Raises:
-        ConfigError: for a name or a view that there is not, with the nearest.
+        ConfigError: for an unknown name or kind of features; the message suggests the nearest one.
         MissingExtraError: without scikit-learn.
     """
     for what, given, known in (("baseline", names, tuple(BASELINES)), ("features", features, tuple(FEATURES))):
@@ -188,25 +187,25 @@ def classical(
     ]
 
 
-# Part of every job's id: raise it when the same name would be another program.
+# Part of every job's id: increase it when a name comes to mean another program or other settings.
 ROCKETS_VERSION = 1
 EXTRA_ROCKETS = "rocket"
 
-# The title, and aeon's class.
+# Title in tables, and name of the class in aeon, by name.
 ROCKETS: dict[str, tuple[str, str]] = {
     "minirocket": ("MiniRocket", "MiniRocketClassifier"),
     "multirocket-hydra": ("MultiRocket-Hydra", "MultiRocketHydraClassifier"),
 }
-# Windows that compile a rocket's kernels.
+# Number of random windows on which a rocket is run once to compile its kernels.
 _FIRST = 32
 
 
 @dataclass(frozen=True)
 class RocketFit:
-    """Fits a classifier of random convolutions (Dempster, Schmidt & Webb 2021, 2023) to windows scaled by channel.
+    """A function that fits a classifier of random convolutions (Dempster, Schmidt & Webb 2021, 2023).
 
-    Its kernels are compiled when they first run in a process (seconds to a minute). `prepare` does so before the
-    measured time begins.
+    Windows are scaled by channel. The kernels are compiled at their first run in a process (seconds to a minute);
+    `prepare` does this before the timing starts.
     """
 
     name: str
@@ -245,7 +244,7 @@ def _compiled(name: str, channels: int, samples: int) -> None:
 
 
 def rockets(names: Sequence[str], samples: int, seed: int) -> list[Contender]:
-    """Return the classifiers of aeon, which read the window itself.
+    """Return a contender for each name in `ROCKETS`; these classifiers of aeon use the samples of the windows.
 
     Raises:
         MissingExtraError: without aeon, or without PyTorch, which MultiRocket-Hydra needs.

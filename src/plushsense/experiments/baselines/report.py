@@ -1,4 +1,4 @@
-"""Table, figure and page of the baselines: the scores of each program under each split, and its costs."""
+"""Report of the baselines as table, figure and page: scores of each program under each split, and its costs."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ LEAKY = (
     "A leaky split has overlapping windows of one recording, and recordings of one person, on both sides: its numbers "
     "say little about a new person, and only a split by person counts."
 )
-# Okabe and Ito's blue and vermillion; filled against open says the same without colour.
+# Okabe and Ito's blue and vermillion; filled and open markers show the same difference without colour.
 _HONEST, _LEAKY = "#0072b2", "#d55e00"
 Program = tuple[str, str, bool]
 """Name, features, and whether PCA reduces them."""
 
 
 def program_table(result: Mapping[str, Any]) -> Table:
-    """Return one row for each program, the best under the first split first.
+    """Return one row for each program, ordered by accuracy under the first split, the best first.
 
-    Of each split accuracy and macro-F1, with accuracy / macro-F1 pooled over all windows as a note; the gap in accuracy
-    between the first leaky split and the first by person; the costs, which are those under the first split.
+    A row has accuracy and macro-F1 of each split, with those pooled over all windows as a note; the gap in accuracy
+    between the first leaky split and the first split by person; and the costs measured under the first split.
     """
     splits = [split["split"] for split in result["splits"]]
     by_program: dict[Program, dict[str, Mapping[str, Any]]] = {}
@@ -97,12 +97,12 @@ def _program(row: Mapping[str, Any]) -> Program:
 
 
 def size(n: int) -> str:
-    """Return bytes as kB or MB (thousands)."""
+    """Format a number of bytes as kB or MB (powers of 1000)."""
     return f"{n / 1e6:.1f} MB" if n >= 1e6 else f"{n / 1e3:.1f} kB"
 
 
 def milliseconds(value: float) -> str:
-    """Return milliseconds with about three digits."""
+    """Format milliseconds with about three digits."""
     return f"{value:.3f}" if value < 1 else f"{value:.1f}" if value < 100 else f"{value:.0f}"
 
 
@@ -117,7 +117,7 @@ def describe_costs(result: Mapping[str, Any]) -> str:
 
 
 def describe_data(result: Mapping[str, Any]) -> str:
-    """Return a sentence on the data of the comparison."""
+    """Return a sentence that describes the data of the comparison."""
     return (
         f"{result['dataset']}: {count(result['windows'])} windows of {count(result['recordings'])} recordings, "
         f"{result['subjects']} people, {len(result['labels'])} gestures; {result['window_s']:g} s windows, "
@@ -126,7 +126,7 @@ def describe_data(result: Mapping[str, Any]) -> str:
 
 
 def figure(result: Mapping[str, Any]) -> Figure:
-    """Draw a line for each program from its accuracy under the first split by person to the first leaky one."""
+    """Draw a line for each program between its accuracies under the first split by person and the first leaky split."""
     splits: Sequence[Mapping[str, Any]] = result["splits"]
     honest = next((s["split"] for s in splits if not s["leaky"]), None)
     leaky = next((s["split"] for s in splits if s["leaky"]), None)

@@ -1,4 +1,4 @@
-"""Baselines beside our network: the same windows, several splits, one table."""
+"""Compare baselines with our network on the same windows under several splits, and save the results."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ RECURRENT = {"lstm": "LSTM (32)", "bilstm": "BiLSTM (32)"}
 NETWORK = "network"
 # By name: classical programs, recurrent networks, rockets (extra), and our own network.
 MODELS = (*BASELINES, *RECURRENT, *ROCKETS, NETWORK)
-# "quick": seconds a fold in sum. "all" leaves out the rockets, whose package not everybody can install.
+# "quick" takes seconds per fold in all. "all" leaves out the rockets, whose package cannot be installed everywhere.
 SETS: dict[str, tuple[str, ...]] = {
     "quick": ("forest", "extra-trees", "knn", "rbf-svm", "tree"),
     "classical": tuple(BASELINES),
@@ -54,7 +54,7 @@ PCA: dict[str, tuple[bool, ...]] = {"both": (False, True), "no": (False,), "yes"
 
 @dataclass(frozen=True)
 class NetworkFit:
-    """Trains one of our networks; its size is that of its bundle."""
+    """A function that trains one of our networks; the size of the network is that of its bundle file."""
 
     arch: Arch
     spec: TrainSpec
@@ -73,7 +73,7 @@ class NetworkFit:
 
 @dataclass(frozen=True)
 class NetworkReader:
-    """A trained network as it runs beside a toy: in NumPy."""
+    """A trained network, run by the NumPy engine that also reads a connected toy."""
 
     network: Network
     scaler: Scaler
@@ -86,7 +86,7 @@ class NetworkReader:
 
 @dataclass(frozen=True)
 class RecurrentFit:
-    """Trains an LSTM or a BiLSTM on the last ``samples`` of the windows."""
+    """A function that trains an LSTM, or with ``both_ways`` a BiLSTM, on the last ``samples`` of the windows."""
 
     spec: TrainSpec
     samples: int
@@ -99,10 +99,10 @@ class RecurrentFit:
 
 
 def chosen(models: str | Sequence[str]) -> tuple[str, ...]:
-    """Return the programs of a list (or a text with commas) of names and sets, each once, in the order of the table.
+    """Return the programs in ``models`` (names of `MODELS` and `SETS`; a text has commas) in the order of `MODELS`.
 
     Raises:
-        ConfigError: for a name that there is not, with the nearest.
+        ConfigError: for an unknown name; the message suggests the nearest one.
     """
     given = [m.strip() for m in models.split(",")] if isinstance(models, str) else list(models)
     names: set[str] = set()
@@ -122,7 +122,7 @@ def contenders(
     gestures: GestureSet,
     windows: WindowSet,
 ) -> list[Contender]:
-    """Return the requested programs, ready to be compared; all with the seed of the training."""
+    """Return the requested programs for `compare`; all use the seed of ``config.training``."""
     spec, samples = config.training, layout.samples(config.windows.window_s)
     made = classical([m for m in models if m in BASELINES], features, pca, samples, spec.seed)
     made += rockets([m for m in models if m in ROCKETS], samples, spec.seed)
@@ -162,19 +162,20 @@ def baselines(
     warn: Warn = silent,
     **settings: Any,
 ) -> dict[str, Any]:
-    """Classical programs, recurrent networks and our own network on the same windows, under several splits.
+    """Compare classical programs, recurrent networks and our own network on the same windows, under several splits.
 
-    Windows are cut as for the network; the others read their last ``window_s`` seconds. Finished folds are kept in the
-    data set's ``cache`` folder; a comparison that was stopped goes on from there.
+    Windows are cut as for the network; other programs use their last ``window_s`` seconds. Finished folds are kept in
+    the data set's ``cache`` folder, so that a stopped comparison can be continued.
 
     Args:
         config, settings: as for `evaluate`; its split is not used.
         splits: such as "leave-one-subject-out", "by-subject:5", "windows:5" (leaky); the gap between them is reported.
-        models: names of `MODELS` and sets of `SETS`.
+        models: names of `MODELS` and `SETS`.
+        features: names of `FEATURES`, for the classical programs.
+        pca: "both", "no" or "yes", for the classical programs.
         cluster: address of a Ray cluster that does the work instead of this machine's processes.
-        pca: "both", "no" or "yes"; it concerns the classical programs.
-        out: a folder for the table as JSON, CSV and a page; a comparison of other settings or data that is there is
-            refused unless ``overwrite``.
+        out: a folder for the table as JSON and CSV, a page and a figure. If it holds a comparison of other settings or
+            data, an error is raised unless ``overwrite``.
 
     Returns:
         what `plushsense.experiments.baselines.score.compare` returns, with ``dataset``, ``dataset_hash``,
@@ -233,10 +234,10 @@ def comparison_id(
     features: Sequence[str] = tuple(FEATURES),
     pca: str = "both",
 ) -> str:
-    """Return an identity of 20 hexadecimal digits, equal for equal settings and data.
+    """Return an identifier of 20 hexadecimal digits, equal for equal settings and data.
 
     Raises:
-        ConfigError: for a setting that cannot be.
+        ConfigError: for an unknown setting.
     """
     if pca not in PCA:
         raise ConfigError(f"Unknown choice '{pca}' for PCA: accepted are {', '.join(PCA)}.{nearest(pca, PCA)}")
@@ -248,7 +249,7 @@ def comparison_id(
 
 
 def save_baselines(table: dict[str, Any], out: Path) -> None:
-    """Write the comparison to a folder: JSON, CSV (a row a program and split), a page and its picture."""
+    """Write the comparison to a folder: JSON, CSV with a row for each program and split, a page and the figure."""
     from plushsense.experiments.baselines.report import figure, page, score_table
     from plushsense.reports.figures import png
 

@@ -1,8 +1,8 @@
-"""Comparison of several programs on the same windows under several splits: their scores, sizes and times.
+"""Compare several programs on the same windows under several splits: their scores, sizes and times.
 
-Every program × split × fold is one job of the journal. A program is passed in as a picklable callable, as in
-``crossval``, so that this module needs neither scikit-learn nor PyTorch. Sizes and times are measured here, for all
-programs alike.
+Each combination of program, split and fold is one job of the journal. A program is a picklable callable, as in
+``crossval``, so that this module needs neither scikit-learn nor PyTorch. Sizes and times of all programs are measured
+here in the same way.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from plushsense.scoring.metrics import column_metrics
 from plushsense.scoring.splits import Fold, Split, parse_split
 from plushsense.windows.cut import WindowSet
 
-# Part of every job's id: raise it when the meaning of a stored fold changes.
+# Part of every job's id: increase it when the meaning of a stored fold changes.
 _VERSION = 2
-# Number of windows that are read one at a time for a latency, and of those before that warm the caches.
+# Number of single windows that are timed for the latency, and of untimed ones before them that fill the caches.
 _TIMED, _WARM = 20, 3
-# Processor time of this process, which uses one thread: other programs on the machine hardly change it.
+# Processor time of this process, which uses one thread, so that other programs on the machine hardly influence it.
 _clock = time.process_time
 
 
 class Reader(Protocol):
-    """A fitted program: probabilities (N, K) of windows, and how many bytes it would take up."""
+    """A fitted program: a call returns probabilities (N, K) for N windows; ``size_bytes`` is its size when stored."""
 
     @property
     def size_bytes(self) -> int: ...
@@ -45,16 +45,16 @@ class Reader(Protocol):
 
 
 Fit = Callable[[WindowSet, WindowSet], Reader]
-"""Fits a program to training windows; it may use the second windows for validation.
+"""A function that fits a program to the training windows; it may use the second argument, the validation windows.
 
-It is picklable and deterministic. For work that is done once in each process, such as compiling, it may have a method
-``prepare(train)``, which is not timed.
+It must be picklable and deterministic. It may have a method ``prepare(train)`` for work that is done once in each
+process, such as compiling; that method is not timed.
 """
 
 
 @dataclass(frozen=True)
 class Contender:
-    """A program in the comparison: its name, the features that it reads, and the function that fits it.
+    """A program in the comparison: its name, its input features, and the function that fits it.
 
     ``key`` holds everything that ``fit`` depends on besides name, features and PCA.
     """
@@ -68,7 +68,7 @@ class Contender:
 
     @property
     def words(self) -> str:
-        """A description in one line."""
+        """Title, features and PCA in one line, for progress and messages."""
         return f"{self.title}, {self.features}{', PCA' if self.pca else ''}"
 
 
@@ -95,11 +95,11 @@ def compare(
 
     Returns:
         ``context``, ``splits``, ``windows``, ``recordings``, ``subjects``, ``labels``, ``seed``, ``jobs``,
-        ``resumed``; ``models``, one row a contender and split; ``gaps``, one a contender and pair of a leaky split and
-        one that keeps people apart.
+        ``resumed``; ``models``, one row for each contender and split; ``gaps`` (see `gaps`).
 
     Raises:
-        ConfigError, BadInput: for a split that is unknown, given twice or cannot be made.
+        ConfigError: for a contender or split that is given twice, an unknown split, or none of either.
+        BadInput: for a split that the windows do not allow.
         MissingExtraError: without threadpoolctl, which comes with scikit-learn.
     """
     need("threadpoolctl", extra="baselines")
@@ -147,7 +147,7 @@ def compare(
 
 
 def gaps(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return how much higher each program scores in each leaky split than in each split by person."""
+    """Return how much higher each program scores under each leaky split than under each split by person."""
     found = []
     for honest in (row for row in rows if row["apart"]):
         for leaky in (row for row in rows if row["leaky"]):
@@ -205,7 +205,7 @@ def _work(windows: WindowSet, task: _Task, report: Report, /) -> Result:
 
 
 def _latency(reader: Reader, test: WindowSet) -> float:
-    """Return the median time of reading one window alone, in seconds."""
+    """Return the median time in seconds of a prediction for a single window."""
     ones = [test.take(np.array([i % len(test)])) for i in range(_WARM + _TIMED)]
     times = []
     for one in ones:
@@ -217,7 +217,7 @@ def _latency(reader: Reader, test: WindowSet) -> float:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Limit the numeric libraries to one thread, for comparable times and sums in one order."""
+    """Limit the numeric libraries to one thread, for comparable times and sums in a fixed order."""
     with need("threadpoolctl", extra="baselines").threadpool_limits(limits=1):
         yield
 

@@ -1,1 +1,1 @@
-"""The paper's real-time protocol with rules, network and both. Read run, score, report."""
+"""Score rules, network and both together in the paper's real-time protocol. Read run, score, report."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 SIMULATION = "SIMULATION: virtual people touched a virtual toy. These figures say nothing about a real one."
-# Okabe and Ito's; the mark says the same without colour.
+# Okabe and Ito's colours; the marker distinguishes the systems without colour.
 _LOOKS = {"rules": ("#d55e00", "s"), "cnn": ("#0072b2", "o"), "hybrid": ("#009e73", "D")}
 _SHORT = {"rules": "Rules", "cnn": "Network", "hybrid": "Hybrid"}
 _JUDGED = {
@@ -31,7 +31,7 @@ _JUDGED = {
 
 
 def percent(part: int, of: int) -> str:
-    """Format a share with its counts: ``98 % (44/45)``; shares close to 0 % and 100 % have one decimal."""
+    """Format a share with its counts: ``98 % (44/45)``; shares near 0 % or 100 % have one decimal."""
     if not of:
         return DASH
     share = 100.0 * part / of
@@ -40,7 +40,7 @@ def percent(part: int, of: int) -> str:
 
 
 def seconds(value: float | None) -> str:
-    """Return seconds with two decimals."""
+    """Format seconds with two decimals."""
     return DASH if value is None else f"{round(value, 2) + 0.0:.2f}"
 
 
@@ -53,7 +53,7 @@ _CELLS = (
     Column("likelihood", "Likelihood", "right", plain="likelihood"),
     Column("negative", "Called\nnegative", "right", plain="called negative"),
 )
-# What the paper prints, by group and system.
+# The paper's figures by group and system.
 PAPER = {(name, system): figures for name, group in GROUPS.items() for system, figures in group.paper.items()}
 _PRINTED = ("answered", "time", "likelihood")
 _PAPER_CELLS = tuple(
@@ -75,7 +75,7 @@ def _cells(row: Mapping[str, Any], energetic: bool) -> dict[str, str]:
 
 
 def group_table(result: Mapping[str, Any]) -> Table:
-    """Return one row for each group and system, beside the paper's figures where it has any of these groups."""
+    """Return one row for each group and system, with the paper's figures if it has any for these groups."""
     rows: list[dict[str, Any]] = []
     last = None
     for row in result["rows"]:
@@ -132,7 +132,7 @@ def _judgements(counts: Mapping[str, int]) -> str:
 
 
 def judged_table(result: Mapping[str, Any]) -> Table:
-    """Return one row for each group and network system: how the first gesture it named compares with the true one."""
+    """Return one row for each group and system with a network: how its first gesture compares with the true one."""
     rows = tuple(
         {"title": row["title"], "system": _SHORT[row["system"]]}
         | {judged: percent(row["called"][judged], row["trials"]) for judged in _JUDGED}
@@ -145,7 +145,7 @@ def judged_table(result: Mapping[str, Any]) -> Table:
 
 
 def confusion_table(result: Mapping[str, Any]) -> Table:
-    """Return one row for each true family and network system: the families it was recognised as, most often first."""
+    """Return one row for each true family and system with a network: the recognised families, most frequent first."""
     called: dict[tuple[str, str], list[str]] = {}
     for entry in result["confusions"]:
         if entry["system"] != "rules":
@@ -166,7 +166,7 @@ def confusion_table(result: Mapping[str, Any]) -> Table:
 
 
 def between_table(result: Mapping[str, Any]) -> Table:
-    """Return one row for each system: the events that began outside every trial."""
+    """Return one row for each system with its events that began outside all trials."""
     rows = tuple(
         {
             **row,
@@ -232,7 +232,7 @@ def figure_table(result: Mapping[str, Any]) -> Table:
 
 
 def has_paper(result: Mapping[str, Any]) -> bool:
-    """Return whether the paper has figures of any group of the result."""
+    """Return whether the paper has figures for any group and system of the result."""
     return any((row["group"], row["system"]) in PAPER for row in result["rows"])
 
 

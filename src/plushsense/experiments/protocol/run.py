@@ -1,4 +1,4 @@
-"""The paper's real-time protocol with a bundle: on virtual strangers, or on recorded sessions of real ones."""
+"""Run the paper's real-time protocol with a bundle, on new virtual people or on recorded sessions of real ones."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ from plushsense.tuning.rule_baseline import baseline_events, fit_rule_baseline
 from plushsense.workflow.reporting import check_folder
 
 OTHERS = 4
-_ELSEWHERE = 1_000_003  # added to the seed: another population
+_ELSEWHERE = 1_000_003  # added to the seed, for people of another population
 
 
 def virtual_rules(seed: int, layout: Layout, gestures: GestureSet, people: int = OTHERS) -> tuple[Heuristic, str]:
-    """Return the rule baseline tuned on virtual people of another population, and a sentence on it."""
+    """Tune the rule baseline on virtual people of another population; return it and a sentence on the tuning."""
     with tempfile.TemporaryDirectory() as work:
         raw, folder = Path(work) / "raw", Path(work) / "ds"
         simulate(raw, people, (seed + _ELSEWHERE) % 2**31, 2, at_rest=0, layout=layout)
@@ -52,7 +52,7 @@ def virtual_rules(seed: int, layout: Layout, gestures: GestureSet, people: int =
 
 
 def recorded_rules(dataset: Dataset, gestures: GestureSet, scored: Collection[str]) -> tuple[Heuristic | None, str]:
-    """Return the rule baseline tuned on the people who are not scored, or None, and a sentence on it."""
+    """Tune the rule baseline on the people not in ``scored``; return it, or None, and a sentence on the tuning."""
     others: Sequence[str] = [code for code in dataset.subjects if code not in scored]
     if not others:
         return None, "Everybody is scored here, so nobody is left to tune the old rules on: they are left out."
@@ -86,16 +86,16 @@ def protocol(
     """Run the protocol, score rules, network and hybrid, and write table, trials and page.
 
     Args:
-        model: a bundle; its own decision settings, gate and all, are used.
-        people, first, seed, repetitions: of the virtual people: numbers from ``first`` on, of the population ``seed``.
-        dataset, session: recorded sessions instead: a data set, or a folder as a recorder leaves it.
-        subjects: some of its people; default: all whom the network never met.
-        engine: ``float``, or ``int8``: the deployed network's own arithmetic.
-        rules: ask the old heuristic, too; it is tuned first, on people who are not scored.
+        model: a bundle; its own decision settings, including the gate, are used.
+        people, first, seed, repetitions: number of virtual people, first number, population, repetitions of a gesture.
+        dataset, session: recorded sessions instead of virtual people: a data set, or a recorder's output folder.
+        subjects: people of that data set or session; default: all on whom the network was neither trained nor chosen.
+        engine: ``float``, or ``int8`` for the integer arithmetic of the deployed network.
+        rules: also score the old heuristic, after tuning it on people who are not scored.
         out: folder for the JSON, two CSV and the HTML page; None: nothing is written.
 
     Raises:
-        ConfigError: for people on whom the network was trained, sizes that cannot be, a folder that is taken.
+        ConfigError: for people on whom the network was trained, a number out of range, or a folder with other files.
         DatasetError: where nobody has a session stream with recordings in it.
     """
     bundle = model if isinstance(model, Bundle) else Bundle.load(Path(model))
@@ -148,7 +148,7 @@ def _recorded(
     rules: bool,
     progress: Progress | None,
 ) -> dict[str, Any]:
-    """Return the result on recorded sessions."""
+    """Run the protocol on recorded sessions and return the result."""
     if dataset.layout.channels != bundle.layout.channels:
         raise ConfigError(
             f"'{dataset.head.name}' was recorded with layout '{dataset.layout.name}', but the network reads "
@@ -174,7 +174,7 @@ def _recorded(
 
 
 def _with_notes(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, Any]:
-    """Return the result with notes on the network and the settings."""
+    """Return the result with ``about``, rows on network and settings, and ``said``, notes on their limits."""
     settings = DecideSpec.from_dict(bundle.decision)
     provenance = bundle.provenance
     notes = []
@@ -221,7 +221,7 @@ def _with_notes(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, 
 
 
 def _place(out: Path) -> Path:
-    """Return the output folder: a new or empty one, or one that holds an older protocol."""
+    """Check that the output folder is new, empty, or holds the results of an earlier protocol; return it."""
     check_folder(out, "A protocol")
     if out.is_dir() and any(out.iterdir()) and not (out / RESULT).is_file():
         raise ConfigError(f"'{out}' holds something that is not a protocol: give a new or empty folder.")

@@ -1,4 +1,4 @@
-"""Scores of rules, network and both together on the trials of recorded or virtual sessions."""
+"""Score rules, network and both together on the trials of recorded or virtual sessions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class PrintedFigures:
 
 @dataclass(frozen=True)
 class GestureGroup:
-    """A group of gesture families, with the paper's figures by system."""
+    """A group of gesture families, with the paper's figures for each system."""
 
     title: str
     families: tuple[str, ...] = ()
@@ -66,13 +66,13 @@ _PROTOCOL = _read_protocol()
 GROUPS, NOTES = _PROTOCOL.groups, _PROTOCOL.notes
 
 EARLY_S = 0.3
-"""An answer may come so long before the touch, as the sensors detect the approaching hand."""
+"""How long before the touch an answer counts; the sensors already detect the approaching hand."""
 LATE_S = 2.0
-"""An answer counts until so long after the touch, as a network with windows of 2.5 s recognises short blows late."""
+"""How long after the gesture an answer counts; a network with windows of 2.5 s recognises short blows late."""
 AFTER_S = 0.3
-"""A negative event until so long after the end of a gentle gesture counts against that gesture."""
+"""How long after the end of a gentle gesture a negative event is still counted as an error on that gesture."""
 QUICK_S = 0.2
-"""The paper's rules answered blows within 0.1 to 0.2 s."""
+"""Longest reaction time that counts as quick; the paper's rules answered blows within 0.1 to 0.2 s."""
 
 JUDGED = ("right", "family", "affect", "wrong", "unnamed")
 
@@ -80,14 +80,14 @@ Heuristic = Callable[[Frames], Sequence[GestureEvent]]
 
 
 def group_of(gesture: Gesture) -> str:
-    """Return the protocol's group of a gesture (paper, section 4.6); gestures of other toys have two groups."""
+    """Return a gesture's group in the protocol (paper, section 4.6); families outside it are "fast" or "other"."""
     groups = (name for name, group in GROUPS.items() if gesture.family.casefold() in group.families)
     return next(groups, "fast" if gesture.energetic else "other")
 
 
 @dataclass(frozen=True, eq=False)
 class SystemOutput:
-    """Output of a system on a stream: ``events`` in order; the steps of a network as (time in s, best class, share)."""
+    """Events of a system on a stream, in order, and for networks each step's (time in s, best class, its share)."""
 
     events: tuple[GestureEvent, ...]
     answers: tuple[tuple[float, int, float], ...] = ()
@@ -96,10 +96,10 @@ class SystemOutput:
 def system_outputs(
     frames: Frames, model: Bundle | IntegerModel, heuristic: Heuristic | None = None
 ) -> dict[str, SystemOutput]:
-    """Return the events of each system on a stream, by the keys of `SYSTEMS`.
+    """Return the output of each system on a stream, by the keys of `SYSTEMS`.
 
-    Network and gate use the model's own settings; without a gate there is no hybrid. ``heuristic`` are the old rules;
-    None leaves them out.
+    Network and gate use the model's own settings; without a gate there is no hybrid. ``heuristic`` is the rule
+    baseline; None leaves it out.
     """
     trace = trace_of(frames, model)
     if isinstance(model, IntegerModel):
@@ -121,7 +121,7 @@ def system_outputs(
 
 @dataclass
 class _EventSpan:
-    """An event from its beginning to its end; ``gesture`` is known from ``named_s`` on."""
+    """An event with its times in seconds; its ``gesture`` was named at ``named_s``, None if it never was."""
 
     affect: str
     source: str
@@ -150,13 +150,13 @@ class TrialOutcome:
 
     Attributes:
         reaction_s: when an event of the right affect began.
-        gesture_s: when the right gesture was named, in an event that began in the trial or before.
-        called: the gesture of the first event that began, or else of the event that continued; None: it was not named.
+        gesture_s: when the right gesture was named, in an event that began in the trial or before it.
+        called: the gesture of the first event that began in the trial, or else of one already active; None: not named.
         judged: ``right``; ``family``, another of its family; ``affect``, another of its affect; ``wrong``; ``unnamed``.
-        likelihood: highest smoothed probability of ``called`` while it was the best class; of networks only.
-        negative: an event of negative affect began during the gesture, or right after.
-        already: an event of the right affect continued when the trial began, so that none could begin.
-        source: ``gate`` or ``cnn``, which began the right event.
+        likelihood: highest smoothed probability of ``called`` while it was the best class; None for the rules.
+        negative: whether an event of negative affect began during the gesture or within `AFTER_S` of its end.
+        already: whether an event of the right affect was active when the trial began, so that none could begin.
+        source: what began the event of the right affect, ``gate`` or ``cnn``.
     """
 
     who: str
@@ -184,7 +184,7 @@ class TrialOutcome:
 
 @dataclass(frozen=True)
 class Between:
-    """Events of one stream that began outside every trial, by affect, over ``hours``."""
+    """Numbers of events in one stream that began outside all trials, by affect; ``hours`` is the time outside them."""
 
     hours: float
     positive: int
@@ -194,7 +194,7 @@ class Between:
 
 
 def windows_of(trials: Sequence[GestureTrial]) -> list[tuple[float, float]]:
-    """Return the interval in which answers count for each trial; they overlap only where the gestures do."""
+    """Return for each trial the interval in which answers count; intervals overlap only where the gestures do."""
     windows = []
     for n, trial in enumerate(trials):
         before = trials[n - 1].stop_s if n else -math.inf
@@ -207,7 +207,7 @@ def windows_of(trials: Sequence[GestureTrial]) -> list[tuple[float, float]]:
 def score(
     sitting: Sitting, system: str, output: SystemOutput, gestures: GestureSet
 ) -> tuple[list[TrialOutcome], Between]:
-    """Return every trial's outcome, and the events between the trials; an idle gesture is no trial."""
+    """Return the outcome of every trial, and the events between the trials; idle gestures are not trials."""
     trials = [t for t in sitting.trials if not gestures.get(t.label).idle]
     windows = windows_of(trials)
     spans = _event_spans(output.events)
@@ -288,7 +288,7 @@ def run(
     """Run every system on every sitting, and summarise the outcomes.
 
     Args:
-        of: number of sittings, for the progress.
+        of: number of sittings, for ``progress``; 0 if unknown.
 
     Returns:
         ``people``, ``trials``, ``systems``, ``rows`` (a `summary` of each group and of all trials), ``by_gesture``,
@@ -334,7 +334,7 @@ def run(
 
 
 def summary(outcomes: Sequence[TrialOutcome]) -> dict[str, Any]:
-    """Summarise the trials of one system; shares are of all ``trials``, times of those that were answered.
+    """Summarise the trials of one system: shares are of all ``trials``, times only of those that were answered.
 
     ``called`` counts the values of `TrialOutcome.judged`.
     """
@@ -373,7 +373,7 @@ def _times(values: Sequence[float]) -> dict[str, float | None]:
 
 
 def confusions(outcomes: Sequence[TrialOutcome]) -> list[dict[str, Any]]:
-    """Return how often each family was recognised as which family (or none), most often first."""
+    """Count for each true family the recognised families (None: not named), the most frequent first."""
     counts: dict[tuple[str, str | None], int] = {}
     for o in outcomes:
         counts[o.family, o.called_family] = counts.get((o.family, o.called_family), 0) + 1
@@ -386,7 +386,7 @@ def confusions(outcomes: Sequence[TrialOutcome]) -> list[dict[str, Any]]:
 
 
 def _strays(between: Sequence[Between]) -> dict[str, Any]:
-    """Return the events between the trials, summed over all streams; reactions are all but neutral events."""
+    """Return the events between the trials, summed over all streams; all but neutral events are reactions."""
     hours = sum(b.hours for b in between)
     counts = {name: sum(getattr(b, name) for b in between) for name in ("positive", "neutral", "negative", "none")}
     reactions = counts["positive"] + counts["negative"] + counts["none"]
@@ -401,8 +401,8 @@ def _strays(between: Sequence[Between]) -> dict[str, Any]:
 def aims(result: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return this project's aims for the protocol with the measured values.
 
-    Each has ``aim``, ``measured`` (a share, or seconds), ``part`` and ``of`` where it is a share, and ``met``, which is
-    None where its system was not run.
+    Each has ``aim``, ``measured`` (a share or seconds, see ``unit``), ``part`` and ``of``, the counts of a share, and
+    ``met``, which is None where there is no trial to measure it on.
     """
     outcomes = result["outcomes"]
 

@@ -1,4 +1,4 @@
-"""Sessions with known gestures for the real-time protocol, of virtual people or recorded."""
+"""Sessions with known gestures for the real-time protocol, played by virtual people or read from a data set."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from plushsense.models.bundle import known_people
 from plushsense.windows.clock import row_times_us
 
 FIRST_STRANGER = 1001
-"""Number of the first virtual person; data sets of virtual people count from 1."""
+"""Number of the first virtual person in the protocol; data sets of virtual people number theirs from 1."""
 _SESSION = 46  # no other use of the virtual toy has this session number
 _IDLE_S = (1.0, 3.0)
 _VIRTUAL_CODE = re.compile(r"P0*(\d{1,9})")
@@ -33,8 +33,8 @@ Progress = Callable[[int, int], None]
 class GestureTrial:
     """A gesture that a person made; times in seconds since the stream's first frame.
 
-    The hand works from ``start_s`` to ``stop_s``; ``onset_s`` is when there is something to react to: the same, but
-    of a virtual person's blow the blow itself.
+    The gesture lasts from ``start_s`` to ``stop_s``. Reaction times count from ``onset_s``, which equals ``start_s``
+    except for blows of virtual people, where it is the moment of impact.
     """
 
     label: str
@@ -54,13 +54,13 @@ class Sitting:
 
 
 def virtual_numbers(people: int, first: int, provenance: Mapping[str, Any]) -> list[int]:
-    """Return numbers of virtual people who are not among those that a network was trained on.
+    """Return the numbers of ``people`` virtual people from ``first`` on, none of whom the network was trained on.
 
-    A bundle does not say which seed its virtual people came from, so a number among its training or validation people
-    is refused for every seed.
+    A bundle does not record the seed of its virtual people, so that the numbers of its training and validation people
+    are refused for every seed.
 
     Raises:
-        ConfigError: for a number that is out of range or known to the bundle.
+        ConfigError: for a value out of range, or a number among the bundle's training or validation people.
     """
     for name, value, low, high in (("people", people, 1, 1000), ("first", first, 1, 2**31)):
         if not low <= value <= high:
@@ -86,13 +86,13 @@ def virtual_sittings(
     gestures: Sequence[str] = GESTURES,
     world: World = WORLD,
 ) -> Iterator[Sitting]:
-    """Play the paper's protocol with virtual people: 17 gestures, each some times in a row.
+    """Play the paper's protocol with virtual people: 17 gestures, each ``repetitions`` times in a row.
 
-    Between two gestures the toy stands idle, is picked up and turned without a gesture, and stands idle again;
-    between two repetitions the person waits for the recorder's countdown.
+    Between two gestures the toy stands idle, is picked up and turned without a gesture, and stands idle again.
+    Between two repetitions the person waits for the recorder's countdown.
 
     Raises:
-        ConfigError: for a size that cannot be, or a layout that the virtual toy does not speak.
+        ConfigError: for a number out of range, or a layout that the virtual toy does not support.
     """
     for name, value, low, high in (("repetitions", repetitions, 1, 100), ("seed", seed, 0, 2**31)):
         if not low <= value <= high:
@@ -129,7 +129,7 @@ def _play(
 
 
 def recorded_people(dataset: Dataset, asked: Sequence[str] | None, provenance: Mapping[str, Any]) -> list[str]:
-    """Return people of a data set on whom a network was neither trained nor chosen: those asked for, or all.
+    """Return the people of a data set to score: those in ``asked``, or all on whom the network was not trained.
 
     Raises:
         ConfigError: for a person who is not in the data set, or on whom the network was trained or chosen.
@@ -160,12 +160,12 @@ def recorded_people(dataset: Dataset, asked: Sequence[str] | None, provenance: M
 def recorded_sittings(
     dataset: Dataset, people: Sequence[str], gestures: GestureSet
 ) -> tuple[list[Sitting], list[dict[str, str]]]:
-    """Return each person's streams with the located recordings of ``gestures``, onset at the start mark.
+    """Return each person's streams with the recordings of ``gestures`` in them as trials, onset at the start mark.
 
-    The toy at rest is no trial. A person with several streams has a sitting for each.
+    Recordings at rest are not trials. A person with several streams has a sitting for each.
 
     Returns:
-        the sittings, and the people left out (``who``): without a stream that holds such a recording (``why``).
+        the sittings, and the people left out (``who``) because no stream of theirs has such a recording (``why``).
 
     Raises:
         DatasetError: when nobody is left.

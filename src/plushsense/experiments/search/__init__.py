@@ -1,1 +1,1 @@
-"""A search of the smallest good network by successive halving. Read halving, run; its report is the command line."""
+"""Search for small, good networks by successive halving. Read halving, run; the command line prints the results."""

@@ -1,11 +1,11 @@
-"""Successive halving: train all networks for a few epochs, the better ones for more, and the last to the end.
+"""Successive halving: train all networks for a few epochs, the better ones for more, and the best to the end.
 
 After Jamieson and Talwalkar, "Non-stochastic best arm identification and hyperparameter optimization", AISTATS 2016.
-In addition, costs differ by network, the total cost is bounded before anything runs, and networks within one standard
-error of the cut continue as long as the budget allows. A training continues from where it stopped, so that one to the
-end costs the same as in the grid.
+In addition, networks differ in cost, the total cost is bounded before anything runs, and networks within one standard
+error of the cut continue as long as the budget allows. A training continues from where it stopped, so that a complete
+one costs the same as in a sweep of the grid.
 
-Costs are in multiply-accumulates (MAC): of a window × windows × epochs, forward and backward.
+Costs are in multiply-accumulates (MAC), forward and backward: MAC per window × windows × epochs.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Scores = NDArray[np.float64]
 # Default share of the grid's cost.
 QUARTER = 0.25
 
-# Tolerance for sums in another order.
+# Tolerance for the rounding of sums, which depends on their order.
 _SLACK = 1 + 1e-9
 
 # Limits of a search by key: the property of a network, and its unit.
@@ -43,17 +43,17 @@ LIMITS: dict[str, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class SearchSpec:
-    """Settings of a search. Nothing is checked when it is made: `problems` finds everything at once.
+    """Settings of a search. The constructor checks nothing; `problems` reports all errors at once.
 
     Args:
-        rungs: epochs after which networks are compared; the last is the end of a training.
-        folds: number of folds for each rung but the last; empty: all of them.
-        share: limit as a share of the cost of the whole grid (every allowed network, last rung, all folds and seeds).
-            None: a quarter, or if that does not suffice for one network to the end, as much as the first rung and two
-            networks to the end take.
-        eta: of each rung one in so many continues, at least two, if the cost allows.
-        max_parameters, max_state_bytes, max_macs_per_step: networks above are left out before anything runs; the state
-            is that of int8 streaming, a step 50 ms.
+        rungs: numbers of epochs after which networks are compared; the last is the length of a complete training.
+        folds: number of folds for each rung but the last; empty: all folds in every rung.
+        share: limit on the cost, as a share of the whole grid's (all allowed networks, folds and seeds, to the last
+            rung). None: a quarter, or if that cannot pay for one complete training, the cost of the first rung and of
+            training two networks to the end.
+        eta: one in ``eta`` networks of a rung continues, but at least two, if the cost allows.
+        max_parameters, max_state_bytes, max_macs_per_step: networks above a limit are left out before anything runs.
+            The state is that of int8 streaming; a step is 50 ms.
     """
 
     rungs: tuple[int, ...] = (4, 15, 60)
@@ -79,7 +79,7 @@ class SearchSpec:
 
 
 def problems(spec: SearchSpec, folds: int | None = None) -> list[str]:
-    """Return everything that keeps a search from running, one sentence each."""
+    """Return a sentence for each setting with which a search cannot run."""
     found = []
     rungs = spec.rungs
     if not rungs or min(rungs) < 1 or list(rungs) != sorted(set(rungs)):
@@ -106,12 +106,12 @@ def problems(spec: SearchSpec, folds: int | None = None) -> list[str]:
 
 
 def limits_text(over: Mapping[str, tuple[int, int]]) -> str:
-    """Describe the limits that a network exceeds."""
+    """Describe the limits that a network exceeds, given as `SearchSpec.over` returns them."""
     return ", ".join(f"{has:,} {LIMITS[key][1]}, {has - may:,} over {may:,}" for key, (has, may) in over.items())
 
 
 def none_left(spec: SearchSpec, archs: Sequence[Arch]) -> str:
-    """Describe that no network is within the limits, and by how much the nearest exceeds them."""
+    """Return the message that no network is within the limits, and by how much the nearest exceeds them."""
 
     def excess(arch: Arch) -> float:
         return max(has / may for has, may in spec.over(arch).values())
@@ -124,7 +124,7 @@ def none_left(spec: SearchSpec, archs: Sequence[Arch]) -> str:
 
 
 class Rung(NamedTuple):
-    """A rung to train: ``entered`` (indices of networks) on the first ``folds`` folds, up to ``epochs``."""
+    """A stage of the search: train the networks ``entered`` (indices) up to ``epochs`` on the first ``folds`` folds."""
 
     number: int
     epochs: int
@@ -137,9 +137,9 @@ class Rung(NamedTuple):
 class FinishedRung:
     """A finished rung.
 
-    ``scores`` (entered, seeds × folds); ``means`` by network (NaN: its training failed); ``error`` the standard error
-    of the difference of two means, None for a single score each; ``kept`` are the networks that continue, best first
-    (after the last rung, all that did not fail); ``left`` is the reason for the others.
+    ``scores`` has shape (entered, seeds × folds); ``means`` has one mean for each network (NaN: its training failed).
+    ``error`` is the standard error of the difference of two means, or None. ``kept`` are the networks that continue,
+    best first (after the last rung, all that did not fail); ``left`` maps each other network to the reason.
     """
 
     rung: Rung
@@ -152,7 +152,7 @@ class FinishedRung:
 
 @dataclass(frozen=True)
 class Halved:
-    """A finished search: its rungs, the best network, those within one standard error of it, and the cost."""
+    """A finished search: best network, ``equals`` within one standard error, cost, its limit, and the grid's cost."""
 
     rungs: tuple[FinishedRung, ...]
     best: int
@@ -163,7 +163,7 @@ class Halved:
 
 
 class Costs:
-    """The costs of networks over the rungs of a search, from the MAC of one ``epoch`` (networks, folds)."""
+    """The costs of the networks in each rung of a search, computed from the MAC of one ``epoch`` (networks, folds)."""
 
     def __init__(self, epoch: Scores, spec: SearchSpec, seeds: int = 1) -> None:
         self.spec = spec
@@ -185,26 +185,26 @@ class Costs:
         return min(1.0, _up(float(self.step(0).sum() + two) / self.whole))
 
     def step(self, rung: int) -> Scores:
-        """Return the cost from the rung before to this one, by network."""
+        """Return for each network the cost of training it from the previous rung to this one."""
         before = self.until[:, rung - 1] if rung else 0.0
         found: Scores = self.until[:, rung] - before
         return found
 
     def rest(self, rung: int) -> Scores:
-        """Return the cost from this rung to the end, by network."""
+        """Return for each network the cost of training it from this rung to the end."""
         found: Scores = self.until[:, -1] - self.until[:, rung]
         return found
 
     @property
     def least(self) -> float:
-        """The smallest share that suffices for the first rung and any one network to the end."""
+        """The smallest share that pays for the first rung and for training any one network to the end."""
         return float(self.step(0).sum() + self.rest(0).max()) / self.whole
 
     def check(self) -> None:
-        """Check that the bound can be kept.
+        """Check that the share suffices for a search.
 
         Raises:
-            ConfigError: with the share that suffices.
+            ConfigError: if not; the message gives a share that suffices.
         """
         if self.least > self.share * _SLACK:
             raise ConfigError(
@@ -215,12 +215,12 @@ class Costs:
 
 
 def halving(costs: Costs, train: Callable[[Rung], Scores]) -> Halved:
-    """Search; ``train`` returns the scores (entered, seeds × folds) of a rung, higher is better, NaN for a failure.
+    """Run the search. ``train`` returns the scores (entered, seeds × folds) of a rung: higher is better, NaN is failed.
 
-    The bound is never exceeded: it suffices for every network that may be the best of the next rung.
+    The bound is never exceeded: of the networks that continue, any one can be trained to the end within it.
 
     Raises:
-        ConfigError: when the bound does not suffice for any search; TrainingError: when every training failed.
+        ConfigError: when the bound is too small for any search; TrainingError: when every training failed.
     """
     costs.check()
     spec, alive, spent = costs.spec, tuple(range(len(costs.until))), 0.0
@@ -230,7 +230,7 @@ def halving(costs: Costs, train: Callable[[Rung], Scores]) -> Halved:
         rung = Rung(level, epochs, costs.folds[level], alive, cost)
         scores = np.asarray(train(rung), dtype=np.float64)
         spent += cost
-        # A network that failed on one fold has no mean, as that of the other folds would be biased.
+        # The mean of a network that failed on any fold is NaN, because that of its other folds would be biased.
         means = {network: float(scores[i].mean()) for i, network in enumerate(alive)}
         well = [network for network in alive if math.isfinite(means[network])]
         if not well:
@@ -261,10 +261,10 @@ def _go_on(
     entered: int,
     left: dict[int, Literal["score", "cost", "failed"]],
 ) -> tuple[int, ...]:
-    """Return the networks that continue to the next rung, the best first, and enter the others into ``left``."""
+    """Return the networks that continue to ``rung``, the best first, and record in ``left`` why the others do not."""
     allowed = money / (len(costs.spec.rungs) - rung)
     step, rest = costs.step(rung), costs.rest(rung)
-    # At least two, so that the winner was compared in the last rung.
+    # At least two, so that the winner is compared with another network in the last rung.
     wanted = max(2, math.ceil(entered / costs.spec.eta))
     cut = means[order[min(len(order), wanted) - 1]]
     kept: list[int] = []
@@ -285,8 +285,8 @@ def _go_on(
 def standard_error(scores: Scores) -> float | None:
     """Return the standard error of the difference of two networks' means; None for a single network or score.
 
-    All networks were scored on the same folds with the same seeds, so that effects common to all do not count: the
-    spread is that of the residuals of network + fold, pooled over the networks.
+    All networks were scored on the same folds with the same seeds, so that effects common to all networks cancel. The
+    error is estimated from the residuals of an additive model (network + fold), pooled over the networks.
     """
     networks, units = scores.shape
     if networks < 2 or units < 2:
@@ -304,7 +304,7 @@ def _listed(values: Sequence[int]) -> str:
     return ", ".join(map(str, values)) or "(none)"
 
 
-# Draws for each network, after which the space counts as exhausted.
+# Number of draws per wanted network after which the space counts as exhausted.
 _TRIES = 2000
 
 
@@ -312,9 +312,9 @@ _TRIES = 2000
 class Space:
     """A space of networks to draw from.
 
-    The values of ``layers``, ``kernels`` and ``dilations`` are drawn; dilations never fall from layer to layer, as in
-    all of the paper's networks. ``receptive_field`` is the shortest and the longest, in samples (the paper's window has
-    250). ``networks`` different ones are drawn with ``seed``.
+    Numbers of layers, kernel sizes and dilations are drawn from ``layers``, ``kernels`` and ``dilations``; dilations
+    never decrease from layer to layer, as in all of the paper's networks. ``receptive_field`` is the shortest and the
+    longest accepted one, in samples (the paper's window has 250). ``networks`` different ones are drawn with ``seed``.
     """
 
     layers: tuple[int, ...] = (2, 3, 4)
@@ -326,7 +326,7 @@ class Space:
 
 
 def problems_space(space: Space) -> list[str]:
-    """Return everything that keeps networks from being drawn, one sentence each."""
+    """Return a sentence for each setting with which networks cannot be drawn."""
     found = []
     for key, high in (("layers", MAX_LAYERS), ("kernels", None), ("dilations", None)):
         values = getattr(space, key)
@@ -348,7 +348,7 @@ def problems_space(space: Space) -> list[str]:
 
 
 def drawn(space: Space) -> tuple[str, ...]:
-    """Return the symbols of ``networks`` different networks, or of fewer where there are no more."""
+    """Draw ``networks`` different networks, or fewer if the space has no more; return their symbols."""
     chance = random.Random(space.seed)
     found: dict[str, None] = {}
     for _ in range(_TRIES * space.networks):
@@ -380,14 +380,14 @@ DEFAULTS: dict[str, Any] = {
 def load_search(
     grid: GridSpec | str | os.PathLike[str], changes: Mapping[str, Any] | None = None
 ) -> tuple[GridSpec, SearchSpec, list[str]]:
-    """Return a grid and the search in it, with ``changes`` applied; the grid's epochs are the rungs.
+    """Read a grid and its search settings and apply ``changes``; the grid's epochs become the rungs.
 
     Args:
         grid: a grid, its name or the path of a TOML file.
         changes: new values of keys of `SearchSpec` and of the grid; None leaves a key as it is.
 
     Returns:
-        both, and one sentence for each key or value that cannot be read; those are as if they were not there.
+        the grid, the settings, and a sentence for each key or value that cannot be read and is therefore ignored.
 
     Raises:
         ConfigError: for an unknown name, or a file that is missing or not TOML.

@@ -1,8 +1,8 @@
-"""A search: the networks of a grid by successive halving, for at most a given share of the cost of the whole grid.
+"""Search the networks of a grid by successive halving, for at most a given share of the cost of the whole grid.
 
-Its trainings are those of a sweep, with the same ids in the same journal, so that neither repeats what the other has
-done. A training in a later rung starts from its state at the end of the rung before. If the journal holds no such state
-(a sweep saves none), it starts from the beginning, with the same result.
+A search and a sweep give their trainings the same ids in the same journal, so that neither repeats a training of the
+other. In a later rung, a training continues from its state at the end of the previous rung. If the journal has no such
+state (a sweep saves none), the training starts from the beginning, with the same result.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ SUMMARY, SETTINGS = "search.json", "train.toml"
 
 @dataclass(frozen=True)
 class SearchProgress(JobProgress):
-    """Progress of the trainings of a rung (from 1) with its ``networks``; ``share`` is of the cost that is allowed."""
+    """Progress within a rung (numbered from 1) of ``networks`` networks; ``share`` is relative to the allowed cost."""
 
     rung: int = 0
     rungs: int = 0
@@ -76,7 +76,7 @@ class SearchProgress(JobProgress):
 
 @dataclass(frozen=True)
 class Search:
-    """The outcome of `search`: the folder, and its summary (``search.json``)."""
+    """The result of `search`: the output folder, and the summary that is stored there as ``search.json``."""
 
     out: Path
     summary: dict[str, Any]
@@ -96,7 +96,7 @@ class Search:
 
 @dataclass(frozen=True)
 class SearchPlan:
-    """A search before it runs: a plan for each rung with the same networks, their costs, and the networks left out."""
+    """A search that is ready to run: a plan of the same networks for each rung, costs, and the networks left out."""
 
     grid: GridSpec
     spec: SearchSpec
@@ -106,11 +106,11 @@ class SearchPlan:
 
     @property
     def id(self) -> str:
-        """The same for the same data and settings."""
+        """Identifier, equal for equal data and settings."""
         return job_id({"plans": [plan.id for plan in self.plans], "search": self.spec.to_dict()})
 
     def macs(self, rung: int, job: str) -> float:
-        """Multiply-accumulates of a training up to a rung, from the first epoch."""
+        """Return the multiply-accumulates of a training from the first epoch to the end of a rung."""
         return self.plans[rung].macs(self._jobs[rung][job])
 
     @cached_property
@@ -118,7 +118,7 @@ class SearchPlan:
         return [{job.id: job for job in plan.jobs} for plan in self.plans]
 
     def left_out_rows(self) -> list[dict[str, str]]:
-        """Return the networks beyond the limits, and by how much."""
+        """Return a row for each network beyond the limits, with the limits that it exceeds."""
         return [
             {"arch": arch.symbol, "filters": slashed(arch.filters), "why": limits_text(self.spec.over(arch))}
             for arch in self.left_out
@@ -138,7 +138,7 @@ def prepare(
     """
     settled, spec, unreadable = load_search(grid, changes)
     wrong = problems(spec)
-    # Wrong rungs are reported as such, not as the epochs that they become.
+    # Report wrong rungs only once, and not again as wrong epochs of the grid.
     checked = replace(settled, epochs=(1,)) if wrong else settled
     archs: list[Arch] = []
 
@@ -155,7 +155,7 @@ def prepare(
     if wrong := problems(spec, folds):
         raise GridProblems(wrong)
     macs = {job.id: last.macs(job) for job in last.jobs}
-    # One epoch of each network on each fold; all seeds cost alike.
+    # Cost of one epoch of each network on each fold, which is the same for all seeds.
     epoch = np.array([[macs[run.job] / spec.rungs[-1] for run in t.runs[:folds]] for t in last.trials])
     costs = Costs(epoch, spec, len(settled.seeds))
     costs.check()
@@ -178,7 +178,7 @@ def _stops_early(grid: GridSpec) -> list[str]:
     try:
         patience = grid.training.patience
     except (BadInput, KeyError):
-        # It is reported among the problems of the grid.
+        # `plans_by_epochs` reports this error.
         return []
     if patience is None:
         return []
@@ -202,20 +202,21 @@ def search(
 ) -> Search:
     """Find the network with the best macro-F1 within limits, for at most a share of the cost of the whole grid.
 
-    Finished trainings are kept in the data set's ``cache`` folder; a search that was stopped or killed continues there.
+    Finished trainings are kept in the data set's ``cache`` folder, so that a stopped or killed search can be continued.
 
     Args:
         grid: the networks and batches to try: "paper", the path of a TOML file (with a table [search]), or a
-            `GridSpec`. Unless it is a `GridSpec`, what it leaves open is as in `halving.DEFAULTS`.
-        out: default ``evaluations/search-<name>-<hash>`` in the data set.
-        workers: trainings at a time; 0: as many as the processors hold.
+            `GridSpec`. Keys that a name or file does not set have the values of `halving.DEFAULTS`.
+        out: output folder; default ``evaluations/search-<name>-<hash>`` in the data set.
+        workers: number of trainings at a time; 0: as many as the processor cores allow.
         cluster: address of a Ray cluster that trains instead of this machine's processes.
         progress: called when a training reports an epoch or is done.
-        changes: keys of `SearchSpec`, as ``max_parameters=10_000``, ``rungs=(4, 15, 60)``, and of a grid, as
-            ``split="by-subject:5"``, ``architectures=…``, ``seeds=(0, 1)``.
+        changes: new values for keys of `SearchSpec`, such as ``max_parameters=10_000``, ``rungs=(4, 15, 60)``, and of a
+            grid, such as ``split="by-subject:5"``, ``architectures=…``, ``seeds=(0, 1)``.
 
     Raises:
-        ConfigError: with all problems at once, before anything is trained; TrainingError: when every training failed.
+        ConfigError: with all problems at once, before anything is trained.
+        TrainingError: when every training failed.
     """
     began = time.monotonic()
     dataset = as_dataset(dataset)
@@ -240,9 +241,9 @@ def preview_search(
     warn: Warn = silent,
     **changes: Any,
 ) -> dict[str, Any]:
-    """Return what `search` would try and spend, without training.
+    """Return the networks, rungs and costs of a `search` without training anything.
 
-    ``measure``: also ``seconds``, an estimate of the time that it takes at most on this machine.
+    With ``measure``, the result has ``seconds``, an estimate of the longest time that the search takes on this machine.
     """
     dataset = as_dataset(dataset)
     ready = prepare(dataset, grid, changes, warn)
@@ -271,7 +272,7 @@ def preview_search(
 
 
 class _SearchTables(Tables):
-    """The tables of a search. A network that was not trained to the end is partial, whatever its score."""
+    """The tables of a search. A network that was not trained to the end has the status "partial"."""
 
     def _row(self, planned: PlannedTrial) -> dict[str, Any]:
         row = super()._row(planned)
@@ -280,7 +281,7 @@ class _SearchTables(Tables):
 
 
 class _Trainer:
-    """Trains the rungs and, after each, writes the tables of what has been trained."""
+    """Function object that trains a rung and then writes the tables of all networks trained so far."""
 
     def __init__(
         self,
@@ -303,7 +304,7 @@ class _Trainer:
         self._reached: dict[int, PlannedTrial] = {}
 
     def __call__(self, rung: Rung) -> Scores:
-        """Train the networks of a rung; return their macro-F1 (networks, seeds × folds)."""
+        """Train the networks of a rung and return their macro-F1 (networks, seeds × folds)."""
         plan = self._ready.plans[rung.number]
         runs = {n: [run for run in plan.trials[n].runs if run.fold_index < rung.folds] for n in rung.entered}
         run_of = {run.job: run for several in runs.values() for run in several}
@@ -345,7 +346,7 @@ class _Trainer:
 
     @property
     def seconds(self) -> float:
-        """Duration of all training that led to the states which the networks have reached."""
+        """Total training time, in seconds, of the networks up to the epoch that each has reached."""
         jobs = {run.job for planned in self._reached.values() for run in planned.runs}
         return sum(self._outcomes[job].seconds for job in jobs)
 
@@ -359,7 +360,7 @@ class _Trainer:
         return tables
 
     def _jobs_before(self, rung: Rung, runs: Mapping[int, Sequence[PlannedRun]]) -> dict[str, str]:
-        """Return the training of the rung before that each of these continues."""
+        """Return by job id the training of the previous rung that each training continues."""
         if not rung.number:
             return {}
         earlier = self._ready.plans[rung.number - 1].trials
@@ -368,7 +369,7 @@ class _Trainer:
         return {job: old for job, old in pairs if old in self._results}
 
     def _continued(self, job: Job, earlier: str | None, last: bool) -> Job:
-        """Return the job with a task that starts from the state of the ``earlier`` one, if that has been kept."""
+        """Return the job with a task that starts from the final state of the ``earlier`` job, if that was kept."""
         task = replace(job.task, stateful=not last)
         result = {} if earlier is None else self._results[earlier]
         if "random" in result:
@@ -376,7 +377,7 @@ class _Trainer:
         return Job(job.id, task)
 
     def _report(self, rung: Rung) -> Callable[[JobProgress], None]:
-        """Return a callback that reports the trainings of a rung as part of the search."""
+        """Return a callback that converts the progress of a rung's trainings to that of the whole search."""
         progress, bound, spent, plans = self._progress, self._ready.costs.bound, self._spent, self._ready.plans
         assert progress is not None
 
@@ -483,7 +484,7 @@ def _rung(ready: SearchPlan, compared: FinishedRung) -> dict[str, Any]:
 
 
 def _settings(grid: Mapping[str, Any]) -> str:
-    """Return the settings that ``train`` has no option for as a configuration file; empty where all are defaults."""
+    """Return a configuration file of the changed settings that ``train`` has no option for; "" if there are none."""
     usual = GridSpec()
     keys = {
         "training": ("learning_rate", "halve_every", "augment", "turn_deg", "threads"),
@@ -497,7 +498,7 @@ def _settings(grid: Mapping[str, Any]) -> str:
 
 
 def _command(grid: GridSpec, winner: Mapping[str, Any], dataset: Path, out: Path) -> list[str]:
-    """Return the command that trains the winner on everybody."""
+    """Return the command line that trains the winner on all people."""
     words = ["plushsense", "train", str(dataset), "--arch", winner["arch"]]
     words += ["--filters", winner["filters"].replace("/", ","), "--preset", grid.preset]
     words += ["--padding", grid.padding, "--context", grid.context, "--classes", grid.classes]

@@ -1,1 +1,1 @@
-"""The continuous benchmark: events in whole streams of people left out. Read run, score, report."""
+"""The continuous benchmark: score events in whole streams of people left out. Read run, score, report."""

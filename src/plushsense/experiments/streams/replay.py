@@ -1,4 +1,4 @@
-"""Streams as a model reads them, with the true gestures, to score any decision settings on them."""
+"""Read streams once with a model, and score any decision settings on the stored outputs against the true gestures."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ Stretch = tuple[float, float]
 class StreamTruth:
     """The true intervals of one stream.
 
-    ``truths`` are its gestures, ``rest`` idle ones, ``other`` gestures that the model does not know. ``doubtful`` are
-    excluded recordings and those that were not stopped in time: events there are not counted. ``labelled``: every
-    sample of the stream has a label.
+    ``truths`` are gestures that the model has as classes, ``rest`` idle ones, ``other`` gestures that are not among its
+    classes. ``doubtful`` are excluded recordings and those not stopped in time; events there are not counted.
+    ``labelled`` tells whether every sample of the stream has a label.
     """
 
     stream: str
@@ -55,7 +55,7 @@ class StreamTruth:
 
 
 def truth_of(dataset: Dataset, stream: StreamInfo, frames: Frames, gestures: GestureSet) -> StreamTruth:
-    """Return the true gestures in ``stream``, whose rows are ``frames``, by the labels of a model's ``gestures``."""
+    """Return the true intervals of ``stream``, whose rows are ``frames``, with the labels of a model's ``gestures``."""
     in_time = {r.id for r in recordings_in_time(dataset.used)}
     times = row_times_us(frames, dataset.layout.period_us) / 1e6
     truths: list[Interval] = []
@@ -84,26 +84,26 @@ def truth_of(dataset: Dataset, stream: StreamInfo, frames: Frames, gestures: Ges
 
 
 def located(dataset: Dataset, stream: StreamInfo) -> list[RecordingInfo]:
-    """Return the recordings that lie in a stream, in its order."""
+    """Return the recordings that lie in a stream, ordered by position."""
     mine = [r for r in dataset.recordings if r.stream == stream.id and r.stream_row >= 0]
     return sorted(mine, key=lambda r: r.stream_row)
 
 
 def people_with_streams(dataset: Dataset) -> list[str]:
-    """Return the people whose streams can be scored, sorted, without nobody and the unknown."""
+    """Return the sorted codes of people with a recording in a stream, without `NOBODY` and `UNKNOWN_SUBJECT`."""
     with_truth = {r.stream for r in dataset.recordings if r.stream_row >= 0}
     return sorted({s.subject for s in dataset.streams if s.id in with_truth} - {NOBODY, UNKNOWN_SUBJECT})
 
 
-# What an event is scored by: its gesture, the family, the affect, or that there is any event.
+# What an event is compared by: its gesture, the family, the affect, or only that there is an event.
 LEVELS = ("gesture", "family", "affect", "anything")
 PLACES = ("rest", "other", "unmarked")
 
 
 @dataclass(frozen=True, eq=False)
 class StreamTrace:
-    """One stream with its truth: its ``hours``, the ``free_hours`` among them without any truth, and the ``rest_hours``
-    in recordings of rest.
+    """One stream with its truth, and its length: ``hours`` without doubtful stretches, ``free_hours`` without true
+    gestures as well, and ``rest_hours`` in recordings at rest.
     """
 
     truth: StreamTruth
@@ -114,7 +114,7 @@ class StreamTrace:
 
 
 def read_streams(dataset: Dataset, model: Bundle | IntegerModel, subjects: Sequence[str]) -> list[StreamTrace]:
-    """Read every stream of some people once."""
+    """Run the model once over every stream of ``subjects`` that has a recording in it."""
     traces = []
     for stream in dataset.streams:
         if stream.subject not in subjects or not located(dataset, stream):
@@ -135,9 +135,9 @@ def read_streams(dataset: Dataset, model: Bundle | IntegerModel, subjects: Seque
 class StreamScore:
     """Scores of one setting on some streams.
 
-    ``levels`` holds the tallies of each of `LEVELS` by label; ``places`` where the events outside of any truth were:
-    in recordings of rest, in recordings of gestures that the model does not know, anywhere else (``unmarked``, where
-    people may have practised).
+    ``levels`` holds the tallies of each of `LEVELS` by label. ``places`` counts the events outside true gestures: in
+    recordings at rest (``rest``), in recordings of gestures that are not classes of the model (``other``), and
+    elsewhere (``unmarked``, where people may have practised).
     """
 
     levels: dict[str, Tallies] = field(default_factory=lambda: {level: {} for level in LEVELS})
@@ -149,7 +149,7 @@ class StreamScore:
     gate_events: int = 0
 
     def add(self, other: StreamScore) -> None:
-        """Count other streams in."""
+        """Add the counts of ``other`` to this score."""
         for level, tallies in other.levels.items():
             for label, counts in tallies.items():
                 self.levels[level].setdefault(label, Tally()).add(counts)
@@ -169,12 +169,12 @@ class StreamScore:
 
     @classmethod
     def from_journal(cls, table: Mapping[str, Any]) -> StreamScore:
-        """Return the score that `to_journal` gave as plain values."""
+        """Restore a score from the result of `to_journal`."""
         levels = {level: {k: Tally(**t) for k, t in rows.items()} for level, rows in table["levels"].items()}
         return cls(**{**table, "levels": levels})
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the figures of reports, ready for JSON."""
+        """Return the figures that reports show, ready for JSON."""
         gesture = self.total()
         counts = gesture.to_dict()
         errors = ("deletions", "insertions", "fragmentations", "merges")
@@ -197,18 +197,18 @@ class StreamScore:
 
 
 def rate(count: float, hours: float) -> float | None:
-    """Return a count per hour; None where there was no time."""
+    """Return a count per hour; None if ``hours`` is 0."""
     return count / hours if hours > 0 else None
 
 
 def counted_events(stream: StreamTrace, spec: DecideSpec) -> list[ReportedEvent]:
-    """Return the events of a setting, without those that begin in a doubtful stretch."""
+    """Return the events that decision settings give on a stream, without those that begin in a doubtful stretch."""
     doubtful = stream.truth.doubtful
     return [e for e in stream.replayer.events(spec) if not any(a <= e.start_s < b for a, b in doubtful)]
 
 
 def gesture_intervals(events: Sequence[ReportedEvent], gestures: GestureSet) -> list[Interval]:
-    """Return events as intervals of gestures, each from when the gesture was named."""
+    """Return events as labelled intervals, each from the time when its gesture was named."""
     labels = gestures.labels
     return [Interval(e.named_s, e.stop_s, UNNAMED if e.gesture == NO_GESTURE else labels[e.gesture]) for e in events]
 
@@ -225,12 +225,12 @@ class EventCounts:
 
     @property
     def recall(self) -> float:
-        """Hits of the truths; 0 without any."""
+        """Share of the true gestures that were hit; 0 if there are none."""
         return self.hits / self.truths if self.truths else 0.0
 
     @property
     def false_per_hour(self) -> float:
-        """Insertions an hour of stream."""
+        """Insertions per hour of stream; 0 without any stream."""
         return self.insertions / self.hours if self.hours else 0.0
 
     @property
@@ -243,7 +243,7 @@ class EventCounts:
 
 
 def count_events(streams: Sequence[StreamTrace], spec: DecideSpec, late_s: float = LATE_S) -> EventCounts:
-    """Return the counts of gestures alone, as `score` would count them."""
+    """Return only the counts at the level of gestures, equal to those of `score` but faster to compute."""
     counts = EventCounts()
     for stream in streams:
         gestures, truths = stream.replayer.trace.gestures, stream.truth.truths
@@ -264,7 +264,7 @@ def count_events(streams: Sequence[StreamTrace], spec: DecideSpec, late_s: float
 def score(
     stream: StreamTrace, spec: DecideSpec, weights: ErrorCosts | None = None, late_s: float = LATE_S
 ) -> StreamScore:
-    """Return the scores of one setting on one stream."""
+    """Return the scores of one decision setting on one stream."""
     gestures = stream.replayer.trace.gestures
     events = counted_events(stream, spec)
     families = dict(zip(gestures.labels, gestures.families, strict=True))

@@ -13,7 +13,7 @@ from plushsense.reports.table import DASH, Column, Table, number
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours; marker and line style say the same without colour.
+# Okabe and Ito's colours; marker and line style distinguish the systems without colour.
 _LOOKS: dict[str, tuple[str, str, str]] = {
     "argmax": ("#999999", ":", "v"),
     "smoothed": ("#000000", "-", "o"),
@@ -33,7 +33,7 @@ SETTINGS = {
 
 
 def curves(result: Mapping[str, Any]) -> Figure:
-    """Draw recall against false events an hour of every system; a star marks it without a threshold."""
+    """Draw false events per hour against recall for every system; a star marks a system without its threshold."""
     figure = new_figure(8.6, 6.0)
     axes = figure.add_subplot()
     for name, system in result["systems"].items():
@@ -74,9 +74,10 @@ def curves(result: Mapping[str, Any]) -> Figure:
 
 
 def latencies(result: Mapping[str, Any]) -> Figure:
-    """Draw the share of true gestures answered within so many seconds of the onset.
+    """Draw the share of true gestures answered within a time of the onset, against that time.
 
-    Left: with the right gesture. Right: with any event, left out where every sample has a label.
+    The left panel counts answers with the right gesture, the right one any event. The latter is left out where every
+    sample has a label.
     """
     # If every sample has a label, there is always an event.
     panels = [("gesture", "the right gesture"), ("anything", "any event")][: 1 if result["labelled"] else 2]
@@ -166,7 +167,7 @@ def setting_table(result: Mapping[str, Any]) -> Table:
 
 
 def recall_table(result: Mapping[str, Any]) -> Table:
-    """Return the false events an hour of every system at equal recall, with the ratio to the reference."""
+    """Return the false events per hour of every system at equal recall, with the ratio to the reference."""
     rows = []
     for row in result["at_recall"]:
         cells = {"recall": f"{row['recall']:.2f}"}
@@ -226,7 +227,7 @@ def point_table(result: Mapping[str, Any]) -> Table:
 
 
 def rate(value: float | None) -> str:
-    """Return a rate with one decimal below 10."""
+    """Format a rate, with one decimal below 10."""
     return DASH if value is None else f"{value:.0f}" if value >= 10 else f"{value:.1f}"
 
 

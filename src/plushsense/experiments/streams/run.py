@@ -1,4 +1,4 @@
-"""The continuous benchmark from Python: one bundle on whole streams, or every system on people left out."""
+"""Run the continuous benchmark: one bundle on whole streams, or every system on people left out."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ from plushsense.workflow.reporting import check_results, journal_of
 
 @dataclass(frozen=True)
 class Recipe:
-    """Settings to train one of a fold's networks, and of its windows."""
+    """Settings with which one of a fold's networks is trained and its windows are cut."""
 
     arch: Arch
     training: TrainSpec
@@ -61,7 +61,7 @@ class Recipe:
     anywhere: AnywhereSpec | None = None
 
     def key(self) -> dict[str, Any]:
-        """Return what a network depends on besides the data and the fold."""
+        """Return the settings that a network depends on besides the data and the fold."""
         return {
             "arch": self.arch.to_dict(),
             "training": self.training.key(),
@@ -73,7 +73,7 @@ class Recipe:
 
 @dataclass(frozen=True)
 class TrainStreams:
-    """Fits the networks and the gate of a fold; a trained network is kept in ``folder``."""
+    """A function that fits the networks and the gate of a fold; it stores trained networks in ``folder``."""
 
     recipes: Mapping[str, Recipe]
     gate: bool
@@ -96,7 +96,7 @@ class TrainStreams:
         cut = scored = windows_for(dataset, arch, recipe.windows, gestures, anywhere=recipe.anywhere)
         if recipe.anywhere is not None:
             scored = windows_for(dataset, arch, replace(recipe.windows, context="stream"), gestures)
-        # The toy at rest belongs to no person, and is trained on in every fold.
+        # Recordings at rest belong to no person and are used for training in every fold.
         mine = np.isin(cut.subject, [*fold.train, NOBODY])
         train = cut.take(np.flatnonzero(mine & outside_streams(cut, dataset, {*fold.validation, *fold.test})))
         watch = scored.take(np.flatnonzero(np.isin(scored.subject, fold.validation)))
@@ -121,7 +121,7 @@ class TrainStreams:
         return bundle
 
     def key(self) -> dict[str, Any]:
-        """Return what all networks depend on besides the data and the fold."""
+        """Return the settings that the fit depends on besides the data and the fold."""
         return {
             "gate": str(GateSpec()) if self.gate else None,
             **{name: recipe.key() for name, recipe in self.recipes.items()},
@@ -131,9 +131,9 @@ class TrainStreams:
 def recipes_for(
     dataset: Dataset, config: RunConfig, networks: Collection[str], anywhere_pool_s: float | None, warn: Warn = silent
 ) -> dict[str, Recipe]:
-    """Return how each network is trained: alike except for the windows, the epochs and, where given, the pool.
+    """Return the recipe of each network in ``networks``; they differ in windows, classes, epochs and perhaps the pool.
 
-    There are several times as many windows anywhere in a stream, so that half the epochs are still more steps.
+    The context "anywhere" gives several times as many windows, so that half the epochs are still more training steps.
     """
     from plushsense.training.fit import resolve_device
 
@@ -174,13 +174,13 @@ SIMULATED_RATES = (
 
 
 def describe_false_events(dataset: Dataset) -> str:
-    """Explain what a false event means on this data."""
+    """Return a sentence that explains how to read the false events on this data."""
     return TRUE_RATES if dataset.layout.is_labelled else SIMULATED_RATES if dataset.head.simulated else UPPER_BOUND
 
 
 @contextmanager
 def streams_at(path: str | os.PathLike[str], bundle: Bundle) -> Iterator[Dataset]:
-    """Open the data set at a path, or a temporary one made of a folder that the GestureRecorder left."""
+    """Open the data set at ``path``, or import a folder of GestureRecorder files as a temporary data set."""
     place = Path(path)
     if (place / HEAD).is_file() or not place.is_dir():
         yield as_dataset(place)
@@ -202,17 +202,18 @@ def stream_eval(
 
     Args:
         path: a data set, or a folder of recordings with their stream.
-        subjects: by default everybody on whom the bundle was not trained. A person on whom it was trained is scored
-            only when named here, and marked.
-        late_s: how long after its end a gesture may be answered.
+        subjects: people to score; by default all on whom the bundle was not trained. A person on whom it was trained is
+            scored only if named here, and is marked in the result.
+        late_s: longest time in seconds after a gesture's end at which an event still counts as its answer.
         warn: called with a sentence on the people who are left out or were trained on.
 
     Returns:
-        ``events, hits, deletions, insertions, fragmentations, merges, false_events_per_hour, latency_s`` and more of
-        all together (see `replay.StreamScore`), ``per_class``, ``people``, ``trained_on``.
+        the figures of `replay.StreamScore` over all people (``events``, ``hits``, ``deletions``, ``insertions``,
+        ``false_events_per_hour``, ``latency_s``, ``per_class`` and more), ``people`` and ``trained_on``.
 
     Raises:
-        DatasetError, BadInput: where there is no stream with a recording in it, or nobody is left to score.
+        DatasetError: where no stream has a recording in it; BundleError: where the model has other inputs.
+        BadInput: for a person without a stream, or if nobody is left to score.
     """
     bundle = model if isinstance(model, Bundle) else Bundle.load(Path(model))
     with streams_at(path, bundle) as dataset:
@@ -275,8 +276,8 @@ def stream_eval(
 def trained_people(bundle: Bundle, dataset: Dataset) -> set[str]:
     """Return the people of a data set on whom a bundle was trained or tuned, or to whom it was adapted.
 
-    Codes of another data set (another name and other content) stand for other people. The person that a bundle was
-    adapted to always counts, as it does not name the data set.
+    If the bundle comes from a data set of another name and other content, equal codes stand for other people. The
+    person that it was adapted to is always included, because the bundle does not name that person's data set.
     """
     origin = bundle.provenance
     same = origin.get("dataset") in (None, dataset.head.name) or origin.get("dataset_hash") == dataset.hash
@@ -300,19 +301,19 @@ def stream_benchmark(
 ) -> dict[str, Any]:
     """Score every system on the streams of people left out, with settings tuned on other people.
 
-    In each fold, networks are trained on its training people, every system is tuned on its validation people, and the
-    others are scored. Finished folds and networks are kept in the data set's ``cache`` folder.
+    In each fold, networks are trained on the training people, every system is tuned on the validation people, and
+    scored on the test people. Finished folds and networks are kept in the data set's ``cache`` folder.
 
     Args:
-        config, settings, warn: as for `train`, and ``workers``.
+        config, settings, warn: as for `train`; also ``workers``.
         split: "by-subject:5" or "leave-one-subject-out".
         systems: names of `plushsense.experiments.streams.systems.SYSTEMS`; by default all.
         out: a folder for the table as JSON and CSV, a page, and its figures.
-        late_s: how long after its end a gesture may be answered.
-        anywhere_pool_s: over how long the networks of stream training pool (default: as the others).
+        late_s: longest time in seconds after a gesture's end at which an event still counts as its answer.
+        anywhere_pool_s: pooling time in seconds of the networks of stream training (default: that of the others).
 
     Returns:
-        what `score.summed` returns, with ``dataset``, ``simulated``, ``split``, ``note``.
+        what `score.summed` returns, with ``dataset``, ``simulated``, ``split``, ``note`` and the settings.
     """
     dataset = as_dataset(dataset)
     config = config or from_settings(**settings)
@@ -368,7 +369,7 @@ def _named(systems: Sequence[str] | None) -> tuple[str, ...]:
 
 
 def save_benchmark(table: dict[str, Any], out: Path) -> None:
-    """Write a benchmark to a folder: JSON, CSV (a row a point of a curve), a page and its figures."""
+    """Write a benchmark to a folder: JSON, CSV with a row for each point of a curve, a page and its figures."""
     from plushsense.experiments.streams.report import curves, latencies, page, point_table
     from plushsense.reports.figures import png
 

@@ -1,7 +1,7 @@
 """The continuous benchmark: tune systems on some people, score them on whole streams of others, and pool the counts.
 
-The function that fits the networks and the gate of a fold is passed in as a picklable callable, so that this module
-needs no PyTorch. A finished fold is kept in the journal as counts (some kilobytes), without streams and traces.
+The function that fits the networks and the gate of a fold is a picklable argument, so that this module does not need
+PyTorch. The journal stores a finished fold as counts (some kilobytes), without streams and traces.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ from plushsense.scoring.events import LATE_S, ErrorCosts, at_recall
 from plushsense.scoring.metrics import BOOTSTRAP_SEED, summary
 from plushsense.scoring.splits import make_folds, parse_split
 
-# Part of every job's id: raise it when the meaning of a stored fold changes.
+# Part of every job's id: increase it when the meaning of a stored fold changes.
 _VERSION = 2
 SMOOTHING_S = 0.3
 
 
 @dataclass(frozen=True)
 class PeopleFold:
-    """The people of a fold: to train on, to tune on (and to stop the training by), to score."""
+    """The people of a fold: ``train`` for training, ``validation`` for tuning and early stopping, ``test`` to score."""
 
     name: str
     train: tuple[str, ...]
@@ -67,9 +67,9 @@ class PeopleFold:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Models of a fold's training people: ``networks`` by name (`WINDOWS`, `ANYWHERE`) and a gate.
+    """Models fitted to a fold's training people: ``networks`` by name (`WINDOWS`, `ANYWHERE`) and a gate.
 
-    Without a gate the systems that have one are left out. ``report`` describes the fit, as plain values.
+    Systems that need a gate are left out if ``gate`` is None. ``report`` describes the fit in plain values.
     """
 
     networks: Mapping[str, Bundle]
@@ -79,15 +79,15 @@ class Fitted:
 
 EpochReport = Callable[[int, int, dict[str, Any]], None]
 FitStreams = Callable[[Dataset, PeopleFold, EpochReport], Fitted]
-"""Fits networks and gate to the training people of a fold; its validation people may stop the training.
+"""A function that fits networks and gate to the training people of a fold; the validation people may stop it early.
 
-It is picklable and deterministic, does not use the test people, and calls its last argument with (epoch, epochs at
-most, the epoch's row).
+It must be picklable and deterministic, must not use the test people, and calls its last argument with (epoch, maximum
+of epochs, the epoch's row).
 """
 
 
 def people_folds(dataset: Dataset, split: str, seed: int = 0) -> list[PeopleFold]:
-    """Return the folds of a split by person, with the same people as `evaluate`.
+    """Return the folds of a split by person, with the people as in `evaluate`; folds without test streams are omitted.
 
     Raises:
         ConfigError: for a split that does not keep people apart.
@@ -129,7 +129,7 @@ class Settings:
     weights: ErrorCosts = field(default_factory=ErrorCosts)
 
     def key(self, gestures: GestureSet) -> dict[str, Any]:
-        """Return what a stored fold depends on, including the settings that are tried."""
+        """Return the values that a stored fold depends on, including the settings that are tried."""
         grids = {}
         for name in self.systems:
             system = SYSTEMS[name]
@@ -150,13 +150,13 @@ def crossvalidated_streams(
     seed: int = 0,
     progress: Callable[[JobProgress], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Fit, tune and score each fold; return its counts, from which `summed` makes the table.
+    """Fit, tune and score each fold; return the counts of each, from which `summed` makes the table.
 
     Args:
         split: "by-subject:5", "leave-one-subject-out".
-        journal: where finished folds are kept, and looked for first.
-        key: with a journal, everything that ``fit`` depends on besides data, folds and settings.
-        workers: folds at a time, each in a process of its own.
+        journal: stores finished folds, which are then not computed again.
+        key: required with a journal: everything that ``fit`` depends on besides data, folds and settings.
+        workers: number of folds at a time, each in its own process.
 
     Raises:
         ConfigError, BadInput: for a split that cannot be made; PlushSenseError: what ``fit`` raises.
@@ -190,7 +190,7 @@ def crossvalidated_streams(
 
 @dataclass(frozen=True)
 class _FoldWork:
-    """A job that trains and scores one fold."""
+    """The work of one job: fit, tune and score one fold."""
 
     fit: FitStreams
     settings: Settings
@@ -209,7 +209,7 @@ class _FoldWork:
 
 
 def scored_fold(dataset: Dataset, fold: PeopleFold, fitted: Fitted, settings: Settings) -> dict[str, Any]:
-    """Tune every system on a fold's validation people and score it on those left out: counts, ready for JSON."""
+    """Tune every system on a fold's validation people and score it on the test people; return counts for JSON."""
     systems: dict[str, Any] = {}
     for network in (WINDOWS, ANYWHERE):
         if network not in fitted.networks:
@@ -271,7 +271,7 @@ def _scored(
         **{how: {"tuned": _tuned_setting(point), "people": outcome(point.spec)} for how, point in chosen.items()},
     }
     if not system.rounds:
-        # Without any threshold, and with the default smoothing of a bundle.
+        # The system without a threshold, with the default smoothing of a bundle.
         smoothing_s = SMOOTHING_S if any(p.spec.smoothing_s in SMOOTHINGS for p in points) else 0.0
         table["plain"] = {"tuned": None, "people": outcome(argmax_spec(smoothing_s))}
     for h in (*tuning, *testing):
@@ -280,7 +280,7 @@ def _scored(
 
 
 def _tuned_setting(point: TunedPoint) -> dict[str, Any]:
-    """Return a chosen setting and its scores on the tuning people; the gate is part of ``fitted``."""
+    """Return a chosen setting, without its gate, and its scores on the tuning people."""
     spec = {k: v for k, v in vars(point.spec).items() if k not in ("gate", "health", "fitted")}
     return {"spec": spec, "recall": point.recall, "false_events_per_hour": point.false_per_hour, "f1": point.f1}
 
@@ -288,7 +288,7 @@ def _tuned_setting(point: TunedPoint) -> dict[str, Any]:
 def scored_people(
     dataset: Dataset, model: Bundle, subjects: Sequence[str], spec: DecideSpec, settings: Settings | None = None
 ) -> dict[str, StreamScore]:
-    """Return the scores of one model under one setting, person by person; nothing is tuned."""
+    """Return the scores of one model with given decision settings for each person who has streams."""
     settings = settings or Settings(())
     scores: dict[str, StreamScore] = {}
     for person in subjects:
@@ -307,12 +307,12 @@ Folds = Sequence[Mapping[str, Any]]
 
 
 def summed(folds: Folds) -> dict[str, Any]:
-    """Return the benchmark's table, ready for JSON.
+    """Sum the counts of all folds and return the benchmark's table, ready for JSON.
 
-    ``systems``: of each the ``curve`` (a point a target: recall and false events an hour over all people left out),
-    ``balanced`` and ``cheapest`` (the settings of highest F1 and of lowest cost on the tuning people) with all
-    figures, ``plain`` where there is one, ``people``; ``at_recall``: false events an hour of every system at the same
-    recall, and the ratio to smoothed argmax with a 95 % bootstrap interval over people.
+    Each of ``systems`` has a ``curve`` (for each target, recall and false events per hour over all test people) and the
+    figures of the settings ``balanced`` (highest F1 on the tuning people), ``cheapest`` (lowest cost) and perhaps
+    ``plain`` (no threshold). ``at_recall`` has the false events per hour of all systems at equal recall, and their
+    ratio to the reference with a 95 % bootstrap interval over people.
     """
     names = [n for n in SYSTEMS if all(n in fold["systems"] for fold in folds)]
     counts = {n: _counts(folds, n) for n in names}
@@ -340,7 +340,7 @@ def summed(folds: Folds) -> dict[str, Any]:
 
 
 def _counts(folds: Folds, name: str) -> NDArray[np.float64]:
-    """Return (targets, people, 4): hits, truths, insertions, hours."""
+    """Return hits, truths, insertions and hours of a system as an array (targets, people, 4)."""
     rows = []
     for fold in folds:
         curve = fold["systems"][name]["curve"]
@@ -349,13 +349,13 @@ def _counts(folds: Folds, name: str) -> NDArray[np.float64]:
 
 
 def _points(counts: NDArray[np.float64]) -> list[tuple[float, float]]:
-    """Return (recall, false events an hour) of each target over the people of (targets, people, 4)."""
+    """Return (recall, false events per hour) of each target, pooled over people; ``counts`` as from `_counts`."""
     sums = counts.sum(axis=1)
     return [(float(s[HITS] / max(s[TRUTHS], 1)), float(s[FALSE] / s[HOURS])) for s in sums]
 
 
 def _curve(folds: Folds, name: str, counts: NDArray[np.float64]) -> list[dict[str, Any]]:
-    """Return the points of a curve, without targets that the tuning people of no fold reach."""
+    """Return the points of a system's curve, without targets that were not reached in the tuning of any fold."""
     points = []
     targets = [point["target"] for point in folds[0]["systems"][name]["curve"]]
     reach = max(fold["systems"][name]["reach"] for fold in folds)
@@ -366,7 +366,7 @@ def _curve(folds: Folds, name: str, counts: NDArray[np.float64]) -> list[dict[st
 
 
 def _outcome(folds: Folds, name: str, how: str) -> dict[str, Any]:
-    """Return one choice of setting over everybody, and person by person."""
+    """Return the scores of one choice of settings (``how``) over all people, and for each person."""
     whole, people = StreamScore(), []
     for fold in folds:
         for person, stored in sorted(fold["systems"][name][how]["people"].items()):
@@ -392,7 +392,7 @@ def _outcome(folds: Folds, name: str, how: str) -> dict[str, Any]:
 
 
 def _at_recall(counts: Mapping[str, NDArray[np.float64]]) -> list[dict[str, Any]]:
-    """Return every system beside the reference at equal recall, interpolated between the points of its curve."""
+    """Compare the false events of every system with the reference at equal recall, interpolated on their curves."""
     people = counts[REFERENCE].shape[1]
     drawn = np.random.default_rng(BOOTSTRAP_SEED).integers(0, people, size=(_RESAMPLES, people))
     curves = {name: _points(table) for name, table in counts.items()}
@@ -420,7 +420,7 @@ def _at_recall(counts: Mapping[str, NDArray[np.float64]]) -> list[dict[str, Any]
 
 
 def pooled_scores(scores: Mapping[str, StreamScore]) -> dict[str, Any]:
-    """Return several people's `StreamScore` as one table, with a row for each person."""
+    """Return the scores of all people together as one table, with a row for each person."""
     whole = StreamScore()
     for mine in scores.values():
         whole.add(mine)

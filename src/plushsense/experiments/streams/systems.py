@@ -1,7 +1,7 @@
-"""The systems of the continuous benchmark, the settings to choose from, and the choice.
+"""The systems of the continuous benchmark, the decision settings to try, and the choice among them.
 
-Settings are chosen on people who are not scored: for a recall, the setting with the fewest false events that reaches
-it, and for a single figure, the one whose errors cost least.
+Settings are chosen on people who are not scored: for each target recall, the setting that reaches it with the fewest
+false events; for single figures, the setting of highest F1 and the one whose errors cost least.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Grid = Callable[[GestureSet], list[DecideSpec]]
 
 
 def _thresholds(*smoothings: float) -> Grid:
-    """Return the grid of each step's best class where its share is at least ``enter``; 0 takes every step."""
+    """Return a grid of thresholds: each step's best class counts if its share is at least ``enter`` (0: always)."""
 
     def grid(_: GestureSet) -> list[DecideSpec]:
         return [replace(argmax_spec(s), enter=enter, leave=enter) for s in smoothings for enter in ENTERS]
@@ -36,7 +36,7 @@ def _thresholds(*smoothings: float) -> Grid:
 
 
 def _hysteresis(gestures: GestureSet) -> list[DecideSpec]:
-    """Return settings that enter above the leave threshold and delay the end, to start the search of the others."""
+    """Return the first settings to try: events begin above a threshold, end below a lower one, and end with a delay."""
     return [
         DecideSpec(
             smoothing_s=smoothing_s,
@@ -69,7 +69,7 @@ _WAITS = (0.5, 1.5)
 
 
 def _beside(spec: DecideSpec) -> list[DecideSpec]:
-    """Return the settings that differ from one in a single value."""
+    """Return settings that differ from ``spec`` in one value of `_STEPS`, or in the ratio of leave to enter."""
     specs = [replace(spec, **{name: value}) for name, values in _STEPS.items() for value in values]
     specs += [replace(spec, leave=share * spec.enter, leave_affect=share * spec.enter) for share in (0.3, 0.5, 0.8)]
     return [each for each in specs if each != spec]
@@ -79,9 +79,9 @@ def _beside(spec: DecideSpec) -> list[DecideSpec]:
 class System:
     """A system of the benchmark.
 
-    ``network`` names the network of a fold that it uses. The settings of ``grid`` are tried, then ``rounds`` times
-    those that differ from the best in one value. Instead, ``gate_to`` names the system to whose best settings a gate
-    is added.
+    ``network`` names the network of a fold that it uses. The settings of ``grid`` are tried first; then, ``rounds``
+    times, settings that differ from the best ones in one value. A system with ``gate_to`` does no search of its own: it
+    adds a gate to the best settings of the system of that name.
     """
 
     title: str
@@ -105,7 +105,7 @@ REFERENCE = "smoothed"
 
 @dataclass(frozen=True)
 class TunedPoint:
-    """A setting with its recall, false events an hour and F1 on the tuning people."""
+    """A setting with its recall, false events per hour and F1 on the tuning people."""
 
     spec: DecideSpec
     recall: float
@@ -114,7 +114,7 @@ class TunedPoint:
 
 
 def tried(streams: Sequence[StreamTrace], specs: Sequence[DecideSpec], late_s: float = LATE_S) -> list[TunedPoint]:
-    """Score every setting on these streams, grouped by smoothing to save memory."""
+    """Score every setting on these streams; settings of equal smoothing run together to save memory."""
     points: dict[int, TunedPoint] = {}
     order = sorted(range(len(specs)), key=lambda i: specs[i].smoothing_s)
     for _, group in itertools.groupby(order, key=lambda i: specs[i].smoothing_s):
@@ -127,7 +127,7 @@ def tried(streams: Sequence[StreamTrace], specs: Sequence[DecideSpec], late_s: f
 
 
 def searched(streams: Sequence[StreamTrace], system: System, late_s: float = LATE_S) -> list[TunedPoint]:
-    """Return all settings of a system that were tried on these streams, without a gate."""
+    """Try the settings of a system on these streams, without a gate, and return them all with their scores."""
     points = tried(streams, system.grid(streams[0].replayer.trace.gestures), late_s)
     for _ in range(system.rounds):
         known = {_key(p.spec) for p in points}
@@ -139,20 +139,20 @@ def searched(streams: Sequence[StreamTrace], system: System, late_s: float = LAT
 def gated(
     streams: Sequence[StreamTrace], points: Sequence[TunedPoint], gate: GateSettings, late_s: float = LATE_S
 ) -> list[TunedPoint]:
-    """Return the best of these settings with a gate, and how long its events wait for the network.
+    """Score the best of ``points`` with ``gate``, each with several times that a gate's event waits for the network.
 
-    A gate without rules changes nothing, the choice among the settings included.
+    If the gate has no rules, ``points`` are returned unchanged.
     """
     if not gate.rules:
         return list(points)
-    # Every setting that could be chosen without the gate, so that the two systems differ by the gate only.
+    # Use every setting that could be chosen without the gate, so that the two systems differ only in the gate.
     base = {_key(spec): spec for spec in (*_best_specs(points), *(p.spec for p in best_of(points)))}
     specs = [replace(spec, gate=gate, wait_s=wait_s) for spec in base.values() for wait_s in _WAITS]
     return tried(streams, specs, late_s)
 
 
 def _best_specs(points: Sequence[TunedPoint]) -> list[DecideSpec]:
-    """Return the chosen setting of every target, and that of the highest F1."""
+    """Return the setting chosen for each target recall, and the one of the highest F1, without duplicates."""
     best = (*(fewest(points, target) for target in TARGETS), balanced(points))
     return list({_key(p.spec): p.spec for p in best}.values())
 
@@ -162,12 +162,12 @@ def _key(spec: DecideSpec) -> tuple[object, ...]:
 
 
 def best_of(points: Sequence[TunedPoint]) -> list[TunedPoint]:
-    """Return the settings that no other beats in recall and false events, by rising recall."""
+    """Return the Pareto front of recall and false events, ordered by rising recall."""
     return [points[i] for i in front([(p.recall, p.false_per_hour) for p in points])]
 
 
 def fewest(points: Sequence[TunedPoint], recall: float) -> TunedPoint:
-    """Return the setting with the fewest false events at a recall; if none reaches it, that of the highest recall."""
+    """Return the setting with the fewest false events that reaches ``recall``, or else the one of highest recall."""
     reach = [p for p in points if p.recall >= min(recall, max(p.recall for p in points))]
     return min(reach, key=lambda p: (p.false_per_hour, -p.recall))
 
@@ -178,21 +178,21 @@ def cheapest(
     weights: ErrorCosts | None = None,
     late_s: float = LATE_S,
 ) -> TunedPoint:
-    """Return the setting of the lowest cost, the first of equal ones."""
+    """Return the setting of the lowest cost among those of `best_of`; of equal ones, that of lower recall."""
     return min(
         best_of(points), key=lambda point: sum(score(stream, point.spec, weights, late_s).cost for stream in streams)
     )
 
 
 def balanced(points: Sequence[TunedPoint]) -> TunedPoint:
-    """Return the setting of the highest F1."""
+    """Return the setting of the highest F1; of equal ones, that of higher recall."""
     return max(points, key=lambda p: (p.f1, p.recall))
 
 
 def total(
     streams: Sequence[StreamTrace], spec: DecideSpec, weights: ErrorCosts | None = None, late_s: float = LATE_S
 ) -> StreamScore:
-    """Return one setting over several streams."""
+    """Return the summed scores of one setting on several streams."""
     summed = StreamScore()
     for stream in streams:
         summed.add(score(stream, spec, weights, late_s))

@@ -1,1 +1,1 @@
-"""A grid of networks and schedules, trained and scored; the scoring is in `trials`. Read run, results, report."""
+"""Train and score a grid of networks and schedules; the scoring is in `trials`. Read run, results, report."""

@@ -1,4 +1,4 @@
-"""Draw the figures of a sweep, in the order of the paper's. A line below each describes the data and the split."""
+"""Draw the figures of a sweep in the paper's order, each with a line below that describes the data and the split."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours; shape says the same as colour, and dark against light prints in grey.
+# Okabe and Ito's colours; shapes repeat the information of colours, and light and dark tones can be told apart in grey.
 MAX, MEAN, SIZE = "#0072b2", "#a6cfe8", "#d55e00"
 CLASSES = (
     ("o", "#56b4e9"),
@@ -43,7 +43,7 @@ CLASSES = (
 )
 _STYLES = ("-", "--", ":", "-.")
 BARS = 30
-"""Largest number of architectures in a bar chart, the best ones; more would not be legible."""
+"""Largest number of architectures in a bar chart; of more only the best are drawn, so that it stays legible."""
 _LETTERS_AN_INCH = 13
 _NARROWEST_IN = 5.2
 _RANKED = 15
@@ -86,7 +86,7 @@ def score_label(sweep: SweepResults, measure: str) -> str:
 
 
 def by_architecture(sweep: SweepResults) -> Figure:
-    """Draw Figure 7: highest and mean accuracy of each architecture, and its size with the largest filter set."""
+    """Draw the paper's Figure 7: highest and mean accuracy of each architecture, and its size with the most filters."""
     rows = _bars(architectures(sweep))
     figure = _figure(sweep, 9.2, 1.9 + 0.42 * len(rows), "Accuracy of each architecture, and its size")
     axes = figure.add_subplot()
@@ -105,7 +105,7 @@ def by_architecture(sweep: SweepResults) -> Figure:
 
 
 def by_filters(sweep: SweepResults) -> Figure:
-    """Draw Figure 8: the bars of Figure 7 in one panel for each filter set, the largest set first."""
+    """Draw the paper's Figure 8: the bars of Figure 7 in one panel for each filter set, the largest set first."""
     sets = sweep.filter_sets[::-1]
     names = [row["arch"] for row in _bars(architectures(sweep))]
     rows_of_panels = -(-len(sets) // 2)
@@ -129,7 +129,7 @@ def by_filters(sweep: SweepResults) -> Figure:
 
 
 def _bars(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the `BARS` rows of the highest accuracy, in their original order."""
+    """Return the `BARS` rows with the highest accuracy, in their original order."""
     best = sorted(rows, key=lambda r: -(r["highest"] or 0.0))[:BARS]
     return [row for row in rows if row in best]
 
@@ -165,7 +165,7 @@ def _legend(figure: Figure, axes: Axes) -> None:
 
 
 def size_and_accuracy(sweep: SweepResults) -> Figure:
-    """Draw Figure 9: accuracy against the number of parameters, for the networks in Table 4."""
+    """Draw the paper's Figure 9: accuracy against the number of parameters, for the networks of Table 4."""
     rows = table4(sweep).rows
     figure = _figure(sweep, 9.2, 5.2, "Accuracy and size of the best of each size class")
     axes = figure.add_subplot()
@@ -187,7 +187,7 @@ def size_and_accuracy(sweep: SweepResults) -> Figure:
 
 
 def pareto(sweep: SweepResults, cost: str) -> Figure:
-    """Draw the best macro-F1 of each network against a cost, the Pareto front as a line with labelled members."""
+    """Draw the best macro-F1 of each network against a cost, with the Pareto front as a line with labelled points."""
     rows = pareto_points(sweep, cost)
     label = COSTS[cost]
     figure = _figure(sweep, 9.2, 5.2, f"Macro-F1 against {label[0].lower()}{label[1:]}")
@@ -246,7 +246,7 @@ def acr_bars(sweep: SweepResults) -> Figure:
     axes.barh(at, values, 0.62, color=MAX)
     for y, (value, row) in enumerate(zip(values, rows, strict=True)):
         label = f"{value:.1f}   accuracy {100 * row['accuracy']:.1f} %, {count(row['parameters'])} parameters"
-        # Inside a bar where it has the room.
+        # Write the value inside a bar that is long enough.
         inside = value > 0.5 * max(values)
         at_x, ink = (0.01 * max(values), "white") if inside else (value + 0.01 * max(values), "black")
         axes.text(at_x, y, label, va="center", fontsize=7.5, color=ink)
@@ -259,10 +259,10 @@ def acr_bars(sweep: SweepResults) -> Figure:
 
 
 def schedules(sweep: SweepResults) -> Figure:
-    """Draw mean accuracy and macro-F1 over the networks by epochs and batch; bars are standard deviations."""
+    """Draw accuracy and macro-F1 by epochs and batch: means over the networks, with standard deviations as bars."""
     rows = effect(sweep).rows
     lengths, sizes = epochs(sweep), batches(sweep)
-    # What varies goes along the axis; where both do, epochs, and a line for each batch.
+    # The axis shows the epochs, with a line for each batch; if only the batch varies, the axis shows the batch.
     along, lines = (lengths, sizes) if len(lengths) > 1 else (sizes, lengths)
     keys = ("epochs", "batch_asked") if len(lengths) > 1 else ("batch_asked", "epochs")
     what, each = ("Epochs", "batch") if len(lengths) > 1 else ("Batch", "epochs")
@@ -304,7 +304,7 @@ def schedules(sweep: SweepResults) -> Figure:
 
 
 def curves(sweep: SweepResults, trial: Row) -> Figure | None:
-    """Draw the learning curves of a trial, training against validation; None where none were kept."""
+    """Draw the learning curves of a trial in training and validation; None if none were stored."""
     histories = sweep.histories(trial)
     if not histories:
         return None
@@ -314,7 +314,7 @@ def curves(sweep: SweepResults, trial: Row) -> Figure | None:
 
 
 def confusion(sweep: SweepResults, trial: Row) -> Figure | None:
-    """Draw Figures 10 and 11: the confusion matrix of a trial, classes sorted and framed by affect."""
+    """Draw a confusion matrix as in the paper's Figures 10 and 11, with classes sorted and framed by affect."""
     counts = sweep.confusion(str(trial["trial"]))
     if counts is None:
         return None
@@ -343,7 +343,7 @@ def confusion(sweep: SweepResults, trial: Row) -> Figure | None:
 
 
 def affect_order(affects: Sequence[str]) -> list[int]:
-    """Return the classes with equal affects beside each other: positive, neutral, negative, then others."""
+    """Return class indices sorted by affect: positive, neutral, negative, then others."""
     ranks = {affect: i for i, affect in enumerate(dict.fromkeys(("positive", "neutral", "negative", *affects)))}
     return sorted(range(len(affects)), key=lambda i: (ranks[affects[i]], i))
 
@@ -373,7 +373,7 @@ def _log_x(axes: Axes, values: Sequence[float], label: str) -> None:
 
 
 def short(value: float) -> str:
-    """Return ``13k`` for 13 000, ``3.2M`` for 3 200 000."""
+    """Format a number with a unit: ``13k`` for 13 000, ``3.2M`` for 3 200 000."""
     for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if value >= size:
             return f"{value / size:g}{letter}"

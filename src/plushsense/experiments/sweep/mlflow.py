@@ -1,4 +1,4 @@
-"""The finished trials of a sweep as runs in MLflow, for those who keep their experiments there."""
+"""Export the finished trials of a sweep as runs to MLflow, for users who keep their experiments there."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _PAGE = 1000
 
 
 def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> dict[str, Any]:
-    """Log each finished trial as a run; one that is there already is not logged again.
+    """Log each complete trial as a run, unless an earlier export has logged it.
 
     Args:
-        where: a tracking URI (``sqlite:///…``, ``http://…``), or a folder, in which ``mlflow.db`` is made.
+        where: a tracking URI (``sqlite:///…``, ``http://…``), or a folder, in which ``mlflow.db`` is created.
 
     Returns:
-        ``uri``, ``experiment``, and the numbers of trials logged now (``new``) and ``before``.
+        ``uri``, ``experiment``, and the numbers of trials logged now (``new``) and earlier (``before``).
 
     Raises:
-        ConfigError: when MLflow refuses the place; MissingExtraError: when it is not installed.
+        ConfigError: when MLflow cannot use ``where``; MissingExtraError: when it is not installed.
     """
-    # Nothing is to leave this machine but to the place that was named.
+    # MLflow must send data nowhere but to ``where``.
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     os.environ.setdefault("DO_NOT_TRACK", "true")
     mlflow = need("mlflow", "mlflow")
@@ -63,7 +63,7 @@ def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> dict[st
 
 
 def _place(where: str) -> tuple[str, str | None]:
-    """Return the tracking URI and where artifacts go; the folder of a local one is made."""
+    """Return the tracking URI and, for a folder, which is created, the URI of its artifacts."""
     if "://" in where:
         return where, None
     folder = Path(where).absolute()
@@ -75,7 +75,7 @@ def _place(where: str) -> tuple[str, str | None]:
 
 
 def _there(client: Any, experiment: str) -> dict[str, tuple[str, str]]:
-    """Return the trials that have a run: its id and status."""
+    """Return (run id, status) by trial for the trials that already have a run."""
     runs: dict[str, tuple[str, str]] = {}
     token = None
     while True:
@@ -90,7 +90,7 @@ def _there(client: Any, experiment: str) -> dict[str, tuple[str, str]]:
 
 
 def _log(mlflow: Any, client: Any, experiment: str, run: str, sweep: SweepResults, trial: Row) -> None:
-    """Log one run of one trial; a run that an earlier export left unfinished is completed."""
+    """Log a trial as one run; ``run`` is the id of an unfinished run of an earlier export to complete, or ""."""
     entities, head = mlflow.entities, sweep.head
     marks = " [leaky]" * sweep.leaky + " [simulation]" * sweep.simulated
     tags = {

@@ -1,4 +1,4 @@
-"""The report of a sweep: its sections in the paper's order, as a page and as files."""
+"""Write the report of a sweep, with sections in the paper's order, as a page and as files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure with its file name, and what it shows in words for who cannot see it."""
+    """A figure with its file name and ``alt``, a text that describes it to readers who cannot see it."""
 
     name: str
     figure: Figure
@@ -36,7 +36,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page: tables, figures, and sentences; ``dropped`` says what makes no sense here, and why."""
+    """A section of the page: tables, figures, and in ``dropped`` sentences on what is left out, and why."""
 
     key: str
     title: str
@@ -47,7 +47,7 @@ class Section:
 
 
 def sections_of(sweep: SweepResults) -> Iterator[Section]:
-    """Yield all sections of the report in the paper's order; one without any score is a sentence."""
+    """Yield the sections of the report in the paper's order; without any finished trial, only those without scores."""
     if not sweep.done:
         yield Section("best", "The best trials", dropped=("No trial is done yet: there is no score to show.",))
         yield Section("table-3", "Table 3: parameters", (tables.table3(sweep),), scores=False)
@@ -151,7 +151,7 @@ def _effect(sweep: SweepResults) -> Section:
 
 
 def _looked_at(sweep: SweepResults, best: Row) -> list[Row]:
-    """Return the trials with confusions and curves: the paper's two networks if in the grid, and the best."""
+    """Return the trials to show with confusions and curves: the best, and the paper's two networks if in the grid."""
     candidates = [sweep.chosen, sweep.best_of(*SECOND), best]
     return list({t["trial"]: t for t in candidates if t}.values())
 
@@ -174,7 +174,7 @@ def _confusions(sweep: SweepResults, trials: Sequence[Row]) -> Section:
 
 
 def confusion_words(sweep: SweepResults, trial: Row) -> str:
-    """Describe a confusion matrix: right, mistaken for the same affect, mistaken for another affect."""
+    """Describe a confusion matrix in words: shares that are right, wrong within an affect, and wrong across affects."""
     counts = np.asarray(sweep.confusion(str(trial["trial"])), dtype=np.int64)
     total, right = int(counts.sum()), int(np.trace(counts))
     names, by_affect = grouped(counts, sweep.affects)
@@ -230,7 +230,7 @@ _DPI = 120
 
 
 def is_sweep(folder: str | os.PathLike[str]) -> bool:
-    """Return whether this is the results folder of a sweep."""
+    """Return whether ``folder`` is the results folder of a sweep."""
     return (Path(folder) / SUMMARY).is_file()
 
 
@@ -246,8 +246,8 @@ def write_sweep_report(
     Args:
         folder: the results folder of a sweep, which may still be running.
         page: the .html file (default: ``report.html`` in the folder); an older report there is replaced.
-        mlflow: a folder or a tracking URI to log the trials to as well; trials that are there already are not logged
-            again.
+        title: heading of the page.
+        mlflow: a folder or a tracking URI to which the trials are also logged, see `export_trials`.
 
     Returns:
         ``report``, ``files`` (the folder), ``trials``, ``done``, ``mlflow`` ({uri, experiment, new, before} or None),
@@ -264,7 +264,7 @@ def write_sweep_report(
     sections = list(sections_of(sweep))
     drawings = [d for section in sections for d in section.drawings]
     for d in drawings:
-        # Compute the layout once for both formats.
+        # Compute the layout once for PNG and SVG.
         d.figure.draw_without_rendering()
         d.figure.set_layout_engine("none")
     pictures = {d.name: svg(d.figure) for d in drawings}
@@ -363,7 +363,7 @@ def _template_values(sweep: SweepResults, section: Section, pictures: Mapping[st
 def _contents(
     sweep: SweepResults, sections: Sequence[Section], pictures: Mapping[str, bytes]
 ) -> Iterator[tuple[str, bytes]]:
-    """Yield each file's name and content; in each table what the scores are of."""
+    """Yield the name and content of each file; every table includes the data and split of its scores."""
     source = {"dataset": sweep.head.get("dataset"), "split": sweep.head.get("split")}
     source |= {"leaky": "yes" if sweep.leaky else "no", "simulated": "yes" if sweep.simulated else "no"}
     for section in sections:

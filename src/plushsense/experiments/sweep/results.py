@@ -1,4 +1,4 @@
-"""The results folder of a sweep, read for its tables and figures; the sweep may still be running."""
+"""Read the results folder of a sweep, which may still be running, for tables and figures."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _NEEDED = ("trial", "arch", "filters", "filter_set", "epochs", "batch_asked", "p
 
 
 def finite(value: Any) -> bool:
-    """Return whether a cell holds a number; a trial that waits has none."""
+    """Return whether a cell holds a finite number, which it does not before the trial has a score."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def scored(trial: Row, measure: str = "accuracy") -> bool:
-    """Return whether a trial is complete and has that score; a partial one cannot be compared."""
+    """Return whether a trial is complete and has the score ``measure``; partial trials cannot be compared."""
     return finite(trial.get(measure)) and trial.get("status", "done") == "done"
 
 
 @dataclass(frozen=True)
 class SweepNetwork:
-    """One architecture with one filter set: its trials differ in epochs and batch, the hyperparameters."""
+    """One architecture with one filter set; its trials differ only in epochs and batch."""
 
     label: str
     arch: str
@@ -45,7 +45,7 @@ class SweepNetwork:
         return [t for t in self.trials if scored(t)]
 
     def best(self, measure: str = "accuracy") -> Row | None:
-        """Return the trial with the highest value; of equal ones the first of the grid."""
+        """Return the trial with the highest value of ``measure``; of equal ones the first of the grid."""
         there = [t for t in self.trials if scored(t, measure)]
         return max(there, key=lambda t: float(t[measure])) if there else None
 
@@ -56,7 +56,7 @@ class SweepNetwork:
 
 @dataclass(frozen=True)
 class SweepResults:
-    """Results folder of a sweep: ``head`` (sweep.json), and its tables as rows."""
+    """The content of a sweep's results folder: ``head`` is sweep.json; the tables are rows."""
 
     folder: Path
     head: Row
@@ -94,7 +94,7 @@ class SweepResults:
 
     @property
     def filter_sets(self) -> list[str]:
-        """From the smallest to the largest."""
+        """The filter sets, from the smallest to the largest."""
         return sorted({str(t["filter_set"]) for t in self.trials}, key=lambda s: [int(n) for n in s.split("/")])
 
     @property
@@ -108,13 +108,13 @@ class SweepResults:
         return affects if len(affects) == len(self.labels) else ["none"] * len(self.labels)
 
     def confusion(self, trial: str) -> list[list[int]] | None:
-        """Return the windows (K, K) of a trial, truth in rows; None where they were not kept."""
+        """Return a trial's confusion matrix (K, K) in windows, true classes in rows; None if it was not stored."""
         table = (self.head.get("confusions") or {}).get(trial)
         k = len(self.labels)
         return table if table and k and len(table) == k and all(len(row) == k for row in table) else None
 
     def histories(self, trial: Row) -> list[list[Row]]:
-        """Return the epochs of each run of a trial, without those of a longer training that contains it."""
+        """Return the rows of epochs of each run of a trial, only up to its own number of epochs."""
         jobs = sorted({r["run"] for r in self.runs if r["trial"] == trial["trial"]})
         path = self.folder / CURVES
         if not jobs or not path.exists():
@@ -135,7 +135,7 @@ class SweepResults:
 
     @property
     def chosen(self) -> Row | None:
-        """The best trial of the network that the paper chose; None where it has no score."""
+        """The trial with the highest accuracy of the network that the paper chose; None if it has no score."""
         return self.best_of(*CHOSEN)
 
     def best_of(self, arch: str, filters: str) -> Row | None:
@@ -144,7 +144,7 @@ class SweepResults:
 
     @property
     def best(self) -> Row | None:
-        """The trial with the highest accuracy on the test part; of equal ones the smallest network."""
+        """The trial with the highest test accuracy; of equal ones that of the smallest network."""
         return max(self.done, key=lambda t: (float(t["accuracy"]), -int(t["parameters"])), default=None)
 
 
@@ -192,7 +192,7 @@ def _unread(path: Path, cause: Exception) -> BadInput:
 
 
 def _networks(trials: Sequence[Row]) -> tuple[SweepNetwork, ...]:
-    """Group the trials of one network, in the grid's order; padding and norm are named where they vary."""
+    """Group the trials by network, in the grid's order; labels include padding and norm if these vary."""
     varying = [key for key in ("padding", "norm") if len({t.get(key) for t in trials}) > 1]
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for trial in trials:

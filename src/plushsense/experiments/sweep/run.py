@@ -1,8 +1,8 @@
-"""Sweeps: train and score every trial of a grid once, and continue after an interruption.
+"""Train and score every trial of a grid (a sweep), and continue after an interruption.
 
-Windows are held once for each span that the networks need (one set for padding mirror and causal), in this process
-and in each worker; a training adds its fold as float32. Results stay in memory until the end: 4 bytes for each tested
-window × class × scored epoch, 182 kB for each of the paper's 156 trainings.
+Memory: this process and each worker hold one set of windows for each span that the networks need (a single set with
+padding mirror or causal), and each training a copy of its fold as float32. Results stay in memory until the end: 4
+bytes for each tested window × class × scored epoch, 182 kB for each of the paper's 156 trainings.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from plushsense.workflow.reporting import check_results, journal_of
 
 
 def _reporter(planned: Plan, tables: Tables, progress: Callable[[JobProgress], None] | None) -> JobsReporter:
-    """Return a reporter of the trainings; their cost is in multiply-accumulates."""
+    """Return a progress reporter that weights trainings by their cost in multiply-accumulates."""
 
     def best(job: Job, result: Result) -> BestScore | None:
         row = tables.best
@@ -56,25 +56,25 @@ def _reporter(planned: Plan, tables: Tables, progress: Callable[[JobProgress], N
     )
 
 
-# Stop after so many failed trainings if none has succeeded.
+# Number of failed trainings after which a sweep stops if none has succeeded.
 _HOPELESS = 3
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """The outcome of `sweep`: the folder, and its summary (``sweep.json``)."""
+    """The result of `sweep`: the output folder, and the summary that is stored there as ``sweep.json``."""
 
     out: Path
     summary: dict[str, Any]
 
     @cached_property
     def trials(self) -> Any:
-        """The table of trials, a polars frame; one row a network, number of epochs and batch."""
+        """The table of trials, a polars frame with a row for each network, number of epochs and batch."""
         return need("polars", "train").read_parquet(self.out / TRIALS)
 
     @cached_property
     def runs(self) -> Any:
-        """The table of runs, a polars frame; one row a trial, seed and fold."""
+        """The table of runs, a polars frame with a row for each trial, seed and fold."""
         return need("polars", "train").read_parquet(self.out / RUNS)
 
     def to_dict(self) -> dict[str, Any]:
@@ -96,7 +96,7 @@ class Sweep:
 
 
 def best_table(summary: Mapping[str, Any]) -> Table:
-    """Return the best trials of a summary, as the command line and notebooks list them."""
+    """Return the table of the best trials in a summary, which the command line and notebooks show."""
     columns, rows = tuple(listed_columns(terminal=True)), tuple(summary["best"])
     return Table("best", "The best trials", columns, rows, leaky=summary["leaky"], simulated=summary["simulated"])
 
@@ -116,17 +116,17 @@ def sweep(
 ) -> Sweep:
     """Train and score every trial of a grid.
 
-    Finished trainings are kept in the data set's ``cache`` folder, and the tables in ``out`` are updated during the
-    run; a sweep that was stopped or killed continues from there.
+    Finished trainings are kept in the data set's ``cache`` folder, so that a stopped or killed sweep can be continued.
+    The tables in ``out`` are updated during the run.
 
     Args:
         grid: "paper", the path of a TOML file, or a `GridSpec`.
-        out: default ``evaluations/sweep-<name>`` in the data set; with the split and a hash if the grid was changed.
-        workers: trainings at a time; 0: as many as the processors hold.
+        out: output folder; see `default_place` for the default.
+        workers: number of trainings at a time; 0: as many as the processor cores allow.
         cluster: address of a Ray cluster that trains instead of this machine's processes.
         progress: called when a training reports an epoch or is done.
         display: show the trainings, the best score so far and the time left on standard error.
-        changes: keys of a grid, as ``split="by-subject:5"`` (the paper's is "windows:holdout", which is leaky),
+        changes: new values of a grid's keys, such as ``split="by-subject:5"`` (the paper's "windows:holdout" is leaky),
             ``epochs=(20,)``, ``architectures=…``, ``seeds=…``, ``threads=2``.
 
     Raises:
@@ -149,7 +149,7 @@ def sweep(
             raise error
         tables.lose(job.id, str(error) or type(error).__name__)
         reporter.on_failed(job, error)
-        # If the first trainings all fail, the others will fail for the same reason.
+        # If all of the first trainings fail, the others will probably fail for the same reason.
         if len(tables.lost) >= _HOPELESS and len(tables.outcomes) == len(tables.resumed):
             raise error
 
@@ -167,7 +167,7 @@ def sweep(
                 on_failed=failed,
             )
     except BaseException:
-        # Write what has been finished. Without any new training, the earlier tables stay as they are.
+        # Write the tables of finished trainings, unless none of them is new.
         if len(tables.outcomes) > len(tables.resumed):
             tables.write()
         raise
@@ -175,7 +175,7 @@ def sweep(
 
 
 def default_place(dataset: Dataset, grid: GridSpec | str | os.PathLike[str], spec: GridSpec) -> Path:
-    """Return the output folder of a sweep; that of a changed grid has its split and a hash in the name."""
+    """Return ``evaluations/sweep-<name>`` in the data set; with the split and a hash appended for a changed grid."""
     plain, _ = load_grid(grid)
     name = f"sweep-{spec.name}"
     if plain != spec:
@@ -192,9 +192,9 @@ def preview(
     warn: Warn = silent,
     **changes: Any,
 ) -> dict[str, Any]:
-    """Return what `sweep` would train, without training: counts, cost in multiply-accumulates, and all problems.
+    """Return counts of what `sweep` would train, the cost in multiply-accumulates, and all problems, without training.
 
-    ``measure``: also ``seconds``, an estimate of the time that the missing trainings take on this machine.
+    With ``measure``, the result has ``seconds``, an estimate of the time of the missing trainings on this machine.
     """
     dataset = as_dataset(dataset)
     spec, wrong = load_grid(grid, changes)

@@ -1,4 +1,4 @@
-"""The tables of a sweep that mirror the paper's: the best trials, Table 3, Table 4, one trial by gesture."""
+"""Make the tables of a sweep, among them counterparts of the paper's Tables 3 and 4 with its figures beside them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plushsense.scoring.metrics import accuracy_complexity_ratio, column_metrics
 from plushsense.trials.tables import BEST, listed_columns
 
 SHOWN = 20
-"""Rows of a long table on the page; its CSV has all."""
+"""Number of rows of a long table that the page shows; the CSV has all."""
 COSTS: dict[str, str] = {
     "parameters": "Parameters",
     "macs_per_step": "Multiply-accumulates a step",
@@ -55,7 +55,7 @@ TABLE4: dict[tuple[str, str], Table4Row] = {
 
 
 def printed_parameters(arch: str, filters: str) -> str | None:
-    """Return the cell of Table 3 ("13.2k"); None where the paper has none."""
+    """Return a network's number of parameters as printed in Table 3 ("13.2k"); None if the paper does not have it."""
     counts = _filters(filters)
     for column, spec in enumerate(PAPER_FILTERS):
         if arch in TABLE3 and spec[: len(counts)] == counts and len(counts) == arch.count("_") + 1:
@@ -64,24 +64,24 @@ def printed_parameters(arch: str, filters: str) -> str | None:
 
 
 def is_misprint(arch: str, filters: str) -> bool:
-    """Return whether this is the cell of Table 3 that looks like a misprint."""
+    """Return whether the cell of this network in Table 3 is the one that looks like a misprint."""
     return (arch, _filters(filters)) == TABLE3_MISPRINT
 
 
 def count_parameters(arch: str, filters: str) -> int:
-    """Return the parameters at the paper's 11 channels and 18 classes, whatever data a sweep has."""
+    """Return a network's number of parameters with the paper's 11 channels and 18 classes."""
     size = {"channels": PAPER_CHANNELS, "classes": PAPER_CLASSES}
     return Arch.parse(arch, list(_filters(filters)), **size, padding="mirror", norm="batch").parameters
 
 
 def agrees(printed: str, count: int) -> bool:
-    """Return whether a count is what is printed ("13.2k"), rounded or cut off at the last printed digit."""
+    """Return whether ``count``, rounded or cut off at the last printed digit, equals ``printed`` ("13.2k")."""
     unit = 100 if "." in printed else 1000
     return parse_count(printed) in (count // unit * unit, (count + unit // 2) // unit * unit)
 
 
 def parse_count(printed: str) -> int:
-    """Return 13200 for ``13.2k``."""
+    """Parse a printed count: 13200 for ``13.2k``."""
     return round(float(printed.removesuffix("k")) * 1000)
 
 
@@ -90,7 +90,7 @@ def _filters(filters: str) -> tuple[int, ...]:
 
 
 def _metric_columns(*, without: str) -> list[Column]:
-    """Return a column for each metric of a trial but one."""
+    """Return a column for each metric of a trial but ``without``."""
     return [
         Column(key, metric.title, "percent" if metric.percent else "share", score=True)
         for key, metric in column_metrics().items()
@@ -99,7 +99,7 @@ def _metric_columns(*, without: str) -> list[Column]:
 
 
 def architectures(sweep: SweepResults, filter_set: str | None = None) -> list[dict[str, Any]]:
-    """Return highest and mean accuracy of each architecture over all filter sets or one (Figures 7 and 8)."""
+    """Return highest and mean accuracy of each architecture, over one or all filter sets (Figures 7 and 8)."""
     rows = []
     for label in dict.fromkeys(n.label for n in sweep.networks):
         mine = [n for n in sweep.networks if n.label == label and filter_set in (None, n.filter_set)]
@@ -179,14 +179,14 @@ def epochs(sweep: SweepResults) -> list[int]:
 
 
 def compared(sweep: SweepResults) -> tuple[list[SweepNetwork], bool]:
-    """Return the networks that schedules are compared over, and whether each has every schedule scored."""
+    """Return the networks with a score for every schedule and True, or if there are none, those with any and False."""
     every = {(int(t["epochs"]), str(t["batch_asked"])) for t in sweep.trials}
     whole = [n for n in sweep.networks if {(int(t["epochs"]), str(t["batch_asked"])) for t in n.done} == every]
     return (whole, True) if whole else ([n for n in sweep.networks if n.done], False)
 
 
 def effect(sweep: SweepResults) -> Table:
-    """Return mean and spread over the networks for each number of epochs and batch."""
+    """Return mean and standard deviation over the networks for each number of epochs and batch."""
     networks, whole = compared(sweep)
     rows = []
     for e in epochs(sweep):
@@ -237,7 +237,7 @@ def effect(sweep: SweepResults) -> Table:
 
 
 def pareto_points(sweep: SweepResults, cost: str) -> list[dict[str, Any]]:
-    """Return each network with its cost, its best macro-F1, and whether it is on the front."""
+    """Return each network with its cost, its best macro-F1, and whether it is on the Pareto front."""
     rows = [
         {
             "cost": cost,
@@ -258,7 +258,7 @@ def pareto_points(sweep: SweepResults, cost: str) -> list[dict[str, Any]]:
 
 
 def pareto(sweep: SweepResults) -> Table:
-    """Return the members of the three fronts."""
+    """Return the networks on the Pareto fronts of macro-F1 and each of `COSTS`."""
     rows = [{**r, "cost": COSTS[cost]} for cost in COSTS for r in pareto_points(sweep, cost) if r["front"]]
     columns = (
         Column("cost", "Front of macro-F1 against"),
@@ -277,11 +277,11 @@ def pareto(sweep: SweepResults) -> Table:
 
 
 TOP = 3
-"""Networks of a size class in Table 4, as in the paper."""
+"""Number of networks of each size class (a filter set) in Table 4, as in the paper."""
 
 
 def best_trials(sweep: SweepResults) -> Table:
-    """Return the trials with the highest accuracy, of equal ones the smallest first."""
+    """Return the `BEST` trials by accuracy, the highest first; of equal ones the smallest network first."""
     ranked = sorted(sweep.done, key=lambda t: (-float(t["accuracy"]), int(t["parameters"])))[:BEST]
     columns = tuple(c for c in listed_columns() if any(t.get(c.key) is not None for t in ranked))
     notes = ["Ranked on the test part itself, as the paper did: the first of many is flattered by luck."]
@@ -289,7 +289,7 @@ def best_trials(sweep: SweepResults) -> Table:
 
 
 def table3(sweep: SweepResults) -> Table:
-    """Return the parameters for each architecture and filter set, beside the paper's Table 3."""
+    """Return the numbers of parameters by architecture and filter set, beside those of the paper's Table 3."""
     sets = sweep.filter_sets[::-1]
     cells: dict[tuple[str, str], SweepNetwork] = {(n.label, n.filter_set): n for n in sweep.networks}
     rows, met, near, off, seen = [], 0, 0, [], False
@@ -361,7 +361,7 @@ def _table3_words(met: int, near: int, off: Sequence[str], other: bool) -> list[
 
 
 def top_networks(sweep: SweepResults, top: int = TOP) -> list[SweepNetwork]:
-    """Return the ``top`` networks of every size class by their best trial, sorted from the best down."""
+    """Return the ``top`` networks of every filter set by their best trial, the best of all first."""
     best: list[SweepNetwork] = []
     for filter_set in sweep.filter_sets:
         mine = [n for n in sweep.networks if n.filter_set == filter_set and n.done]
@@ -375,7 +375,7 @@ def _rank(network: SweepNetwork) -> tuple[float, int]:
 
 
 def table4(sweep: SweepResults, *, threshold: float = PAPER_THRESHOLD, top: int = TOP) -> Table:
-    """Return the best networks of each size class, beside the paper's Table 4."""
+    """Return the best networks of each size class, beside the figures of the paper's Table 4."""
     rows = [_table4_row(n, threshold) for n in top_networks(sweep, top)]
     beside = any(row["paper_accuracy"] is not None for row in rows)
     over = [n for n in sweep.networks if (b := n.best()) and float(b["accuracy"]) > threshold]
@@ -441,7 +441,7 @@ def _table4_row(network: SweepNetwork, threshold: float) -> dict[str, Any]:
 
 
 def per_class(sweep: SweepResults, trial: Row) -> Table | None:
-    """Return recall, precision and F1 of each gesture in one trial; None where they were not kept."""
+    """Return recall, precision and F1 of each gesture in one trial; None if they were not stored."""
     stored = (sweep.head.get("per_class") or {}).get(trial["trial"])
     if not isinstance(stored, Sequence) or not all(isinstance(row, Mapping) for row in stored) or not stored:
         return None

@@ -1,8 +1,8 @@
-"""Access control of the studio: local requests or those with a one-time token; pages load nothing from elsewhere.
+"""Control access to the studio: admit local requests or those with a one-time token; forbid content from elsewhere.
 
-`Guard` wraps the whole application, including NiceGUI's own routes and its websocket. `limited_protocol` bounds how
-many connections are open at once and how long a request may take to arrive, since each connection holds a file
-descriptor of the process that records.
+`Guard` wraps the whole application, including NiceGUI's own routes and its websocket. `limited_protocol` limits the
+number of open connections and the time a request may take to arrive, because each connection uses a file descriptor
+of the process that also records.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ COOKIE = "plushsense_visitor"
 TOKEN = "token"
 WELCOME = "welcome"
 UPLOAD_BYTES = 501_000_000
-"""The largest body of an upload."""
+"""Maximum size of the body of an upload, in bytes."""
 BODY_BYTES = 4_000_000
-"""The largest body of any other request."""
+"""Maximum size of the body of any other request, in bytes."""
 HEAD_BYTES = 65_536
-"""The longest head of a request."""
+"""Maximum size of the head of a request (request line and headers), in bytes."""
 _UNANSWERED = "No response returned"
-"""Part of Starlette's error message if a visitor disconnected before the response was ready."""
+"""Part of Starlette's error message when a browser disconnected before the response was ready."""
 _LOOPBACK = ("127.0.0.1", "localhost", "[::1]", "::1")
 
 # NiceGUI's Vue templates are compiled in the browser, which needs eval; nothing is loaded from elsewhere.
@@ -70,13 +70,14 @@ def is_loopback(host: str) -> bool:
 
 
 class Visitors:
-    """The admitted browsers: all of this computer if the studio listens only there, else those with a token.
+    """The browsers that may use the studio.
 
-    A token is valid once: the browser that presents it gets a cookie.
+    A studio that listens only on the loopback interface admits every browser of this computer. Any other studio admits
+    a browser that presents a one-time token; the browser receives a cookie that identifies it from then on.
 
     Args:
         host: the address that the studio listens on.
-        names: further names of this computer.
+        names: further host names under which requests are accepted.
     """
 
     def __init__(self, host: str, names: Iterable[str] = ()) -> None:
@@ -86,13 +87,13 @@ class Visitors:
         self._cookies: set[str] = set()
 
     def invite(self) -> str:
-        """Return a new token, which admits one browser."""
+        """Create and return a new token, which admits one browser."""
         token = secrets.token_urlsafe(24)
         self._tokens.add(token)
         return token
 
     def refusal_of(self, headers: dict[str, str]) -> str:
-        """Return why a request must be refused for its host or origin, or ""."""
+        """Return why a request must be refused because of its host or origin, or "" if it is acceptable."""
         origin = headers.get("origin")
         foreign = "This request came from another web page: open the studio by its own address."
         try:
@@ -102,7 +103,7 @@ class Visitors:
             return "The address of this request is not valid: use the address that the studio printed."
         if host.lower() not in self._names and f"[{host.lower()}]" not in self._names:
             return f"This studio does not answer under the name '{host}': use the address that it printed."
-        # Browsers name the requesting page; following a link to the studio is harmless.
+        # Browsers report which page sent the request. A link to the studio on another page is harmless.
         if headers.get("sec-fetch-site") == "cross-site" and headers.get("sec-fetch-mode") != "navigate":
             return foreign
         return foreign if origin and origin_host.lower() != headers.get("host", "").lower() else ""
@@ -118,7 +119,7 @@ class Visitors:
         return cookie is not None and any(hmac.compare_digest(cookie.value.encode(), v.encode()) for v in self._cookies)
 
     def admit(self, query: str) -> str:
-        """Return the cookie value for a valid token, which is then used up, or ""."""
+        """Use up the token in a query string and return a new cookie value, or "" if the token is not valid."""
         given = parse_qs(query).get(TOKEN, [""])[0].encode()
         token = next((t for t in self._tokens if hmac.compare_digest(t.encode(), given)), None)
         if token is None:
@@ -130,7 +131,7 @@ class Visitors:
 
 
 class Guard:
-    """ASGI middleware: admits the browsers that `Visitors` knows, bounds request bodies, and sets security headers."""
+    """ASGI middleware that rejects browsers not admitted by `Visitors`, limits bodies and sets security headers."""
 
     def __init__(self, app: App, visitors: Visitors) -> None:
         self._app, self._visitors = app, visitors
@@ -153,7 +154,7 @@ class Guard:
         elif self._visitors.admits(headers):
             await _bounded(self._app, scope, receive, send, headers)
         elif scope["path"] == "/" and query == WELCOME:
-            # After a link from another page, a browser does not send the new cookie with the first request.
+            # After a link from another page, a browser does not send the SameSite cookie with its first request.
             await _answer(send, 200, b'<!doctype html><meta http-equiv="refresh" content="0;url=/">', "text/html")
         else:
             await _refuse(scope, send, 401, _TOKEN_NEEDED)
@@ -163,7 +164,7 @@ _TOKEN_NEEDED = "This studio can only be opened with the address that it printed
 
 
 async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers: dict[str, str]) -> None:
-    """Call ``app`` with a bounded request body, also of unknown length, and add the security headers."""
+    """Call ``app``, limit the size of the request body (even if its length is unknown) and add security headers."""
     limit = UPLOAD_BYTES if _is_upload(scope) else BODY_BYTES
     refusal = f"This is larger than the {limit / 1e6:g} MB that are accepted here."
     length = headers.get("content-length", "0")
@@ -196,7 +197,7 @@ async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers
     try:
         await app(scope, receiving, sending)
     except Exception as cause:
-        # NiceGUI treats the end of the body as a disconnect; a visitor who has left needs no answer.
+        # NiceGUI treats the end of the body as a disconnect; a browser that has disconnected needs no response.
         if not too_large and not (disconnected and _UNANSWERED in str(cause)):
             raise
     if too_large and not started:
@@ -204,13 +205,13 @@ async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers
 
 
 def _is_upload(scope: Scope) -> bool:
-    """Return whether this is NiceGUI's route for files: ``/_nicegui/client/<page>/upload/<element>``."""
+    """Return whether a request goes to NiceGUI's upload route ``/_nicegui/client/<page>/upload/<element>``."""
     parts: list[str] = scope["path"].split("/")
     return bool(scope["method"] == "POST" and parts[1:3] == ["_nicegui", "client"] and parts[4:5] == ["upload"])
 
 
 async def _to_start(send: Send, visitor: str) -> None:
-    """Redirect to the first page, without the token in the address."""
+    """Redirect to the home page, which removes the token from the address, and set the cookie ``visitor`` if given."""
     headers = [(b"location", f"/?{WELCOME}".encode()), (b"cache-control", b"no-store"), *_HEADERS]
     if visitor:
         headers.append((b"set-cookie", f"{COOKIE}={visitor}; Path=/; HttpOnly; SameSite=Strict".encode()))
@@ -228,7 +229,7 @@ async def _refuse(scope: Scope, send: Send, status: int, message: str) -> None:
 async def _answer(send: Send, status: int, body: bytes, kind: str) -> None:
     headers = [(b"content-type", f"{kind}; charset=utf-8".encode()), (b"cache-control", b"no-store"), *_HEADERS]
     if status != 413:
-        # Close the connection; but after 413 a browser reads the answer only once it has sent the whole body.
+        # Close the connection, except after 413: a browser reads that response only after sending the whole body.
         headers.append((b"connection", b"close"))
     await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": body})
@@ -237,7 +238,7 @@ async def _answer(send: Send, status: int, body: bytes, kind: str) -> None:
 # Connections ------------------------------------------------------------------------------------------------------
 
 _MOST, _MOST_PER_PEER = 256, 32
-"""Default limits of all connections, and of one peer. A browser opens up to six, and a websocket for each page."""
+"""Default limits: all connections, and those of one peer. A browser opens up to six, plus a websocket per page."""
 
 
 @dataclass(frozen=True)
@@ -245,12 +246,12 @@ class ConnectionLimits:
     """Limits on the number of open connections and on how long each may wait.
 
     Attributes:
-        total: connections of all peers; ``per_peer`` of them are reserved for the browser of this computer.
-        per_peer: connections of one peer, see `peer_of`.
-        head_s: time until the head of a request is complete, from the connection or the previous answer.
-        body_s: time without any data while the body of a request is incomplete.
-        keep_alive_s: time after an answer until a connection without a new request is closed.
-        backlog: connections that wait to be accepted, each of which is open for a moment before it can be refused.
+        total: maximum number of connections; ``per_peer`` of them are reserved for browsers on this computer.
+        per_peer: maximum number of connections of one peer, see `peer_of`.
+        head_s: maximum time from connecting, or from the previous response, until the head of a request is complete.
+        body_s: maximum time without new data while the body of a request is incomplete.
+        keep_alive_s: time after a response until a connection without a new request is closed.
+        backlog: maximum number of connections waiting to be accepted; each is open briefly before it can be refused.
     """
 
     total: int = _MOST
@@ -262,7 +263,7 @@ class ConnectionLimits:
 
     @classmethod
     def of_process(cls) -> ConnectionLimits:
-        """Return limits that leave three quarters of this process's file descriptors for everything else."""
+        """Return limits that let connections use at most a quarter of this process's file descriptors."""
         try:
             import resource
         except ImportError:  # Windows, where sockets do not count as open files
@@ -276,8 +277,8 @@ class ConnectionLimits:
 def peer_of(client: str, server: str) -> str:
     """Return the name under which the connections of a client are counted.
 
-    It is "" for this computer, by any of its addresses; else the IPv4 address, or the /64 network of an IPv6 address,
-    because a host can choose the rest of that itself.
+    The name is "" for this computer, whichever of its addresses is used. Otherwise it is the IPv4 address, or the /64
+    network of an IPv6 address, because a host can choose the remaining bits itself.
     """
     try:
         address = ipaddress.ip_address(client.partition("%")[0])
@@ -291,11 +292,11 @@ def peer_of(client: str, server: str) -> str:
 
 
 def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
-    """Return a protocol class for uvicorn's setting ``http`` that enforces these limits.
+    """Return a protocol class that enforces ``limits``, to pass to uvicorn as ``http``.
 
-    uvicorn limits the time *after* an answer and the length of a head, but not the time that a request takes to arrive.
-    Its ``limit_concurrency`` answers 503 to complete requests, while incomplete ones stay. Here a new connection
-    replaces the one that has waited longest for a request.
+    uvicorn limits the time *after* a response and the length of a head, but not the time a request takes to arrive.
+    Its ``limit_concurrency`` answers complete requests with 503 but keeps incomplete ones open. This class closes the
+    connection that has been idle longest to make room for a new one.
     """
     import h11
     from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -305,7 +306,7 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
         return peer_of(client[0] if client else "?", server[0] if server else "")
 
     class LimitedProtocol(H11Protocol):
-        """HTTP connection of a browser until it is closed or becomes a websocket."""
+        """An HTTP connection, until it is closed or upgraded to a websocket."""
 
         _idle_since = _data_at = 0.0
         _timer: Any = None
@@ -333,7 +334,7 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
 
         @property
         def _idle(self) -> bool:
-            """True if nothing but the head of a request is outstanding."""
+            """True if the connection is waiting for the head of a request and has nothing left to send."""
             if self.conn.their_state is h11.SEND_BODY or self.transport.get_write_buffer_size():
                 return False
             return self.cycle is None or self.cycle.response_complete
@@ -344,7 +345,7 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
             others = [(peer(c), c) for c in self.connections if c is not self]
             rivals = [c for name, c in others if name == own_peer]
             if len(rivals) < limits.per_peer:
-                # The share of this computer is never given away.
+                # The connections reserved for this computer are not available to other peers.
                 rivals = [c for name, c in others if name] if own_peer else []
                 if len(rivals) < limits.total - limits.per_peer:
                     return True
@@ -354,12 +355,12 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
             return bool(idle)
 
         def _drop(self) -> None:
-            # Remove it now: the transport reports its end only in the next iteration of the loop.
+            # Remove it now: the transport reports the closing only in the next iteration of the event loop.
             self.connections.discard(self)
             self.transport.abort()
 
         def _expire(self) -> None:
-            """Drop the connection if the rest of a request is overdue, else look again later."""
+            """Drop the connection if the rest of a request is overdue, else check again later."""
             now = self.loop.time()
             if self not in self.connections:
                 return  # it is a websocket now
@@ -382,7 +383,7 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
 
 _CHUNK = 1 << 16
 _MAX_NAME = 255
-"""Longest name of a file, in bytes; file systems refuse longer ones in different ways."""
+"""Maximum length of a file name in bytes; file systems report longer names in different ways."""
 
 
 def download_address(kind: str, name: str) -> str:
@@ -391,7 +392,7 @@ def download_address(kind: str, name: str) -> str:
 
 
 def router(workspace: Workspace) -> APIRouter:
-    """Return the routes for the addresses of `download_address`."""
+    """Return a router that serves the addresses made by `download_address`."""
     routes = APIRouter()
 
     @routes.get("/download/{kind}/{name}.zip", include_in_schema=False)
@@ -416,7 +417,7 @@ def path_in(workspace: Workspace, kind: str, name: str) -> Path:
     """Return the path of ``name`` directly inside the workspace's folder ``kind``.
 
     Raises:
-        ConfigError: for a name that leads elsewhere, also by way of a link.
+        ConfigError: if ``name`` leads to another place (also through a link), or is too long.
     """
     place = workspace.inside(workspace.folder / kind / name)
     if place.parent != workspace.folder / kind or len(place.name.encode()) > _MAX_NAME:
@@ -425,9 +426,9 @@ def path_in(workspace: Workspace, kind: str, name: str) -> Path:
 
 
 def zip_chunks(folder: Path) -> Iterator[bytes]:
-    """Yield a zip of a folder while it is packed; equal files give equal bytes.
+    """Yield a zip archive of a folder in chunks while it is being built; equal files give equal bytes.
 
-    Links that lead out of the folder are left out.
+    Links to places outside the folder are left out.
     """
     pipe = _Pipe()
     with zipfile.ZipFile(pipe, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -443,7 +444,7 @@ def zip_chunks(folder: Path) -> Iterator[bytes]:
 
 
 class _Pipe(io.RawIOBase):
-    """Buffer between `zipfile` and the response; it cannot seek, so that sizes are written after the data."""
+    """Buffer between `zipfile` and the response. It is not seekable, so `zipfile` writes sizes after the data."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()

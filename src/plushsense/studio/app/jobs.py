@@ -1,4 +1,4 @@
-"""Jobs: long tasks in separate processes that can be started, followed, stopped and resumed from any page."""
+"""Run long tasks as jobs: separate processes that any page can start, follow, stop and resume."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from plushsense.core.files import write_file
 from plushsense.studio.app.workspace import WORK, ChangeSignal, Workspace
 
 UNFINISHED = ".unfinished-"
-"""Prefix of temporary folders in the work folder; they are removed at the next start."""
+"""Prefix of temporary folders in the work folder; leftovers are removed when the studio starts."""
 INCOMING = "incoming"
-"""Folder in the work folder for uploaded files that are not imported yet; unused ones are removed at the next start."""
+"""Folder in the work folder for uploaded files not yet imported; unused ones are removed when the studio starts."""
 RUNNING, DONE, REFUSED, STOPPED = "running", "done", "refused", "stopped"
 _MAX_REPORTS = 2000
 # Keys of a spec that are never stored, because they may contain names of people.
@@ -34,11 +34,12 @@ class StudioJob:
     """A task that runs in a separate process, with its progress and outcome.
 
     Attributes:
-        id: unique, in the order of start.
+        id: unique number as a string; later jobs have larger numbers.
         task: a key of `plushsense.studio.tasks.TASKS`.
-        spec: the argument of the task, in plain values.
-        state: `RUNNING`, `DONE`, `REFUSED` (``message`` says why), or `STOPPED` (by a person, or with the studio).
-        progress: the newest report of the task, in plain values; ``reports`` are all of them, up to some thousands.
+        spec: the argument of the task, as JSON values.
+        state: `RUNNING`, `DONE`, `REFUSED` (``message`` is the reason) or `STOPPED` (by a person, or because the
+            process or the studio ended).
+        progress: the newest report of the task, as JSON values; ``reports`` has earlier ones too, thinned out if many.
         result: the value that the task returned.
         begun_s, ended_s: seconds since 1970.
     """
@@ -58,9 +59,9 @@ class StudioJob:
 
 
 class Jobs:
-    """Jobs of a studio, stored in ``<workspace>/work/<id>.json``; `changed` is notified at every report.
+    """The jobs of a studio, stored in ``<workspace>/work/<id>.json``; every report notifies `changed`.
 
-    A job with ``dry`` in its spec is an estimate: it is not stored after its end.
+    A job with ``dry`` set in its spec is an estimate: it is removed when it ends.
     """
 
     def __init__(self, workspace: Workspace) -> None:
@@ -80,7 +81,7 @@ class Jobs:
                 if job.spec.get("dry"):
                     path.unlink()
                     continue
-                # A job that was running has ended with its studio.
+                # A job that was stored as running ended with the studio that started it.
                 job.state = STOPPED if job.state == RUNNING else job.state
                 self._jobs[job.id] = job
         # Keep only uploads that a stopped job needs to resume.
@@ -91,7 +92,7 @@ class Jobs:
                     file.unlink()
 
     def all(self, *tasks: str) -> list[StudioJob]:
-        """Return the jobs of these tasks, or all, the newest first."""
+        """Return the jobs of the given tasks (by default of all tasks), newest first."""
         with self._lock:
             return [job for job in reversed(self._jobs.values()) if not tasks or job.task in tasks]
 
@@ -105,7 +106,7 @@ class Jobs:
     def start(self, task: str, spec: dict[str, Any], title: str) -> StudioJob:
         """Start a task in a separate process."""
         with self._lock:
-            # Ids are in the order of start even if the clock was set back.
+            # Ids increase even if the clock was set back.
             last = max((int(i) for i in self._jobs if i.isdecimal()), default=0)
             identity = str(max(time.time_ns() // 1_000_000, last + 1))
             job = StudioJob(identity, task, spec, title)
@@ -114,7 +115,7 @@ class Jobs:
         return job
 
     def resume(self, identity: str) -> StudioJob:
-        """Start a stopped job again with the same settings; the task continues from what it stored."""
+        """Restart a job that has ended, with the same spec; the task continues from what it has stored."""
         job = self.get(identity)
         with self._lock:
             if job.state == RUNNING:
@@ -124,7 +125,7 @@ class Jobs:
         return job
 
     def drop(self, identity: str) -> None:
-        """Remove a job that has ended from the list; its results stay.
+        """Remove a job that has ended from the list, but keep the files it has created.
 
         Raises:
             ConfigError: for a running job, or an unknown id.
@@ -138,7 +139,7 @@ class Jobs:
         self.changed.notify()
 
     def stop(self, identity: str) -> None:
-        """Interrupt a job as Ctrl-C would, without waiting; does nothing if it has ended."""
+        """Interrupt a job as Ctrl-C would, without waiting for its end; do nothing if it has already ended."""
         process = self._processes.get(identity)
         if process is None or process.poll() is not None:
             return
@@ -156,7 +157,7 @@ class Jobs:
     def _run(self, job: StudioJob) -> None:
         job.begun_s, job.ended_s, job.progress = time.time(), 0.0, {}
         try:
-            # Store it first, so that it is found again after a crash.
+            # Store the job first, so that it is found after a crash.
             self._store(job)
             process = subprocess.Popen(
                 [sys.executable, "-m", "plushsense.studio.tasks"],
@@ -177,7 +178,7 @@ class Jobs:
         self._processes[job.id] = process
         assert process.stdin is not None
         with contextlib.suppress(OSError):
-            # Standard input stays open: the worker ends when it is closed.
+            # Keep standard input open: the worker process ends when it is closed.
             process.stdin.write(json.dumps({"task": job.task, "spec": job.spec}, default=str) + "\n")
             process.stdin.flush()
         self.changed.notify()
@@ -209,7 +210,7 @@ class Jobs:
                 if end is not None:
                     end.close()
         job.ended_s = time.time()
-        # Under the lock: a job that is dropped right after its end must not be stored afterwards.
+        # Hold the lock, so that a job dropped right after its end is not stored afterwards.
         with self._lock:
             if "result" in outcome:
                 job.state, job.result = DONE, outcome["result"]
@@ -218,7 +219,7 @@ class Jobs:
             else:
                 job.state = STOPPED
             with contextlib.suppress(OSError):
-                # The outcome is valid even if it cannot be stored.
+                # Errors are ignored because the outcome is valid even if it cannot be stored.
                 if job.spec.get("dry"):
                     self.drop(job.id)
                 else:

@@ -1,4 +1,4 @@
-"""Run the web application: its pages, access control and address."""
+"""Run the studio's web server: register the pages, control access and choose the address."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ def run(
     """Serve a workspace until interrupted.
 
     Args:
-        host: address to listen on; any other than 127.0.0.1 requires a token of visitors.
-        port: by default `PORT` or the next free one; 0 for any.
-        names: further names under which browsers may reach this computer.
+        host: address to listen on; if it is not a loopback address, visitors need a token.
+        port: port to listen on; by default the first free one from `PORT`, and 0 lets the system choose.
+        names: further host names under which browsers may reach this computer.
         show: whether to open a browser.
-        on_ready: called with the address as soon as it answers.
+        on_ready: called with the address as soon as the server accepts connections.
 
     Raises:
         MissingExtraError: without the extra ``studio``.
-        ConfigError: if the address cannot be listened on, or another studio serves the folder.
+        ConfigError: if the server cannot listen on the address, or another studio serves the folder.
     """
     need("nicegui", "studio")
     # By default, NiceGUI stores files in the working directory or in Redis.
@@ -78,7 +78,7 @@ def run(
         names = (*names, socket.gethostname(), *_addresses())
     visitors = Visitors(host, names)
     inner: Any = app.build_middleware_stack
-    # The guard must be outermost, also around error responses: added middleware runs inside NiceGUI's own.
+    # The guard must be the outermost layer, even around error responses; app.add_middleware would put it further in.
     vars(app)["build_middleware_stack"] = lambda: Guard(inner(), visitors)
     host_name = (_addresses() or [socket.gethostname()])[0] if everywhere else host
     address = f"http://{f'[{host_name}]' if ':' in host_name else host_name}:{port}/"
@@ -86,14 +86,14 @@ def run(
         workspace.invite = lambda: f"{address}?{TOKEN}={visitors.invite()}"
 
     def announce() -> None:
-        # The callback may open a browser immediately, but start-up ends before the port is open.
+        # The callback may open a browser at once, but NiceGUI calls the start-up handlers before the port is open.
         _wait_open(host_name, port)
         on_ready(workspace.invite() if workspace.invite else address)
 
     limits = ConnectionLimits.of_process()
-    # Tasks of NiceGUI may outlive the shutdown; the message about that helps nobody.
+    # NiceGUI warns about its own tasks that are still running at shutdown; users cannot act on that.
     logging.getLogger("nicegui").addFilter(lambda record: "Could not cancel" not in str(record.msg))
-    # Quasar's loading bar has no accessible name.
+    # Switch off Quasar's loading bar, because it has no accessible name.
     app.config.quasar_config["loadingBar"] = {"skipHijack": True}
     app.on_startup(lambda: threading.Thread(target=announce, daemon=True).start())
     app.on_shutdown(workspace.close)
@@ -117,7 +117,7 @@ def run(
 
 
 def _lock_folder(workspace: Workspace) -> FileLock | None:
-    """Lock the folder until this process ends, because each studio removes unfinished work that it does not know.
+    """Lock the folder until this process ends, because a second studio would remove the unfinished work of the first.
 
     Raises:
         ConfigError: if another studio serves the folder.
@@ -131,13 +131,13 @@ def _lock_folder(workspace: Workspace) -> FileLock | None:
             f"A studio is already running in '{workspace.folder}': use that one, or give another folder with --home."
         ) from None
     except (OSError, NotImplementedError):
-        # A folder that cannot be written needs no lock.
+        # A read-only folder needs no lock.
         return None
     return lock
 
 
 def _page(workspace: Workspace, name: str) -> Callable[[], Any]:
-    """Return the function that builds a page; it imports the module of the page at the first visit."""
+    """Return a function that builds the page ``name``; it imports the module of the page on the first visit."""
 
     async def build() -> None:
         from plushsense.studio.app.shell import frame
@@ -152,10 +152,10 @@ def _page(workspace: Workspace, name: str) -> Callable[[], Any]:
 
 
 def _free_port(host: str, port: int | None) -> int:
-    """Return ``port`` if it is free, by default the next free one.
+    """Return ``port`` if it is free; for None, return the first free port from `PORT`.
 
     Raises:
-        ConfigError: if the address is in use, or is not one of this computer.
+        ConfigError: if the port is in use, or ``host`` is not an address of this computer.
     """
     for candidate in (port,) if port is not None else range(PORT, PORT + 20):
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as probe:
@@ -180,7 +180,7 @@ def _addresses() -> list[str]:
     """Return the network addresses of this computer, without sending a packet."""
     addresses = []
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        # Connecting a datagram socket sends no packet, but determines its own address.
+        # Connecting a datagram socket sends no packet but selects the local address.
         probe.connect(("192.0.2.1", 9))
         addresses.append(str(probe.getsockname()[0]))
     with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""The frame of every page (navigation bar, language, colour scheme, messages) and elements that pages share."""
+"""Build the frame of every page (navigation bar, language, colour scheme, messages) and elements that pages share."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _CLICKED = "(e) => emit({seen: document.querySelector('[data-seen]').dataset.see
 
 
 class Keys(Element, component="keys.js"):
-    """Keyboard commands of a page; a key that is held down counts once.
+    """Element that handles the keyboard commands of a page; a key that is held down counts once.
 
     Args:
         keys: the characters that are commands.
-        on_press: called with the key and the state that the browser displayed when it was pressed (see `show`).
-        fields: maps keys that move the focus to a field to the CSS selector of that field.
+        on_press: called with the key and the state that the browser displayed when the key was pressed (see `show`).
+        fields: maps a key to the CSS selector of the field that it moves the focus to.
     """
 
     def __init__(self, keys: str, on_press: Callable[[str, str], Any], fields: Mapping[str, str] | None = None) -> None:
@@ -47,14 +47,14 @@ class Keys(Element, component="keys.js"):
         self.on("press", pressed)
 
     def show(self, seen: str) -> None:
-        """Set the state that the page displays now; it is sent with every later press."""
+        """Set the state that the page now displays; the browser sends it with every later key press."""
         if self._props["seen"] != seen:
             self._props["seen"] = seen
             self.update()
 
 
 def on_click(button: ui.button, call: Callable[[str], Any], once: bool = False) -> None:
-    """Call ``call(seen)`` at a click, with the state set by `Keys.show`; with ``once``, a double click counts once."""
+    """Call ``call`` on a click with the state set by `Keys.show`; with ``once``, a double click counts as one."""
 
     def clicked(event: GenericEventArguments) -> Any:
         if not (once and int(event.args["times"] or 0) > 1):
@@ -74,23 +74,23 @@ PAGES = {
     "export": "/export",
     "publish": "/publish",
 }
-"""The registry of pages: name to path, in the order of the navigation bar.
+"""The pages: maps name to path, in the order of the navigation bar.
 
-A page is one line here and a folder ``pages/<name>`` whose module ``page`` has a function ``show(page)``, which adds
-the content below the title. Its texts are in ``pages/<name>/<language>.toml`` for each of `LANGUAGES`, or in
-``app/words``; required are ``pages.<name>`` (in the navigation bar) and ``<name>.title``.
+To add a page, add a line here and a folder ``pages/<name>`` with a module ``page``, whose function ``show(page)`` adds
+the content below the title. Put its texts in ``pages/<name>/<language>.toml`` for each of `LANGUAGES`, or in
+``app/words``. The texts ``pages.<name>`` (for the navigation bar) and ``<name>.title`` are required.
 """
 
 AFFECT_SIGNS = {"positive": "+", "neutral": "○", "negative": "−", "none": "·"}
-"""Affect is never marked by colour alone, but also by a sign and a word."""
+"""Sign of each affect. Pages never mark affect by colour alone, but also by this sign and a word."""
 AFFECT_COLOURS = {"positive": "#00805c", "neutral": "#3a6ea5", "negative": "#b84a00", "none": "#767676"}
-"""Okabe and Ito's palette for colour-blind people, darkened so that white text is readable on it."""
+"""Colour of each affect, from Okabe and Ito's colour-blind palette, darkened to make white text readable on it."""
 LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8a8a00", "#7f3c8d", "#a06000", "#444444")
-"""Colours of lines in plots (Okabe and Ito, and four more)."""
+"""Colours of lines in plots: Okabe and Ito's palette and a few more."""
 
 _QUASAR = {"en": "en-US", "lv": "lv"}
 _LIGHTS = {"system": "brightness_auto", "light": "light_mode", "dark": "dark_mode"}
-# Background of Quasar's dark pages.
+# The background colour of Quasar's dark pages.
 _DARK_BACKGROUND = "#121212"
 _LOGO = Markup(
     '<svg viewBox="0 0 32 32" width="28" height="28"><g fill="#e0a872"><circle cx="8" cy="8" r="5"/>'
@@ -98,7 +98,7 @@ _LOGO = Markup(
     'r="1.8"/><circle cx="20.5" cy="16" r="1.8"/><ellipse cx="16" cy="21" rx="3" ry="2"/></g></svg>'
 )
 
-# The same design for all fields.
+# Give all fields the same design.
 for _field in (ui.input, ui.number, ui.select, ui.textarea):
     _field.default_props("outlined dense")
 
@@ -110,7 +110,7 @@ _CSS = Path(__file__).with_name("studio.css")
 
 @dataclass
 class Page:
-    """An open page: its workspace, its texts, and the place for messages."""
+    """An open page: its workspace, its texts, and the place where messages appear."""
 
     workspace: Workspace
     name: str
@@ -119,7 +119,7 @@ class Page:
     _messages: Any = None
 
     def say(self, sentence: str, kind: Kind = "info") -> None:
-        """Show a message at the top of the page, also to screen readers; "" removes it."""
+        """Show a message at the top of the page and announce it to screen readers; "" removes the message."""
         self._messages.clear()
         if not sentence:
             return
@@ -143,7 +143,7 @@ class Page:
 
 
 def visitor() -> tuple[Words, bool | None]:
-    """Return the texts and the colour scheme of this visitor: dark (True), light (False), or the system's (None)."""
+    """Return the texts in the visitor's language and the colour scheme: True dark, False light, None the system's."""
     request = context.client.request
     cookies = request.cookies if request is not None else {}
     accepted = request.headers.get("accept-language", "") if request is not None else ""
@@ -154,14 +154,14 @@ def visitor() -> tuple[Words, bool | None]:
 
 @contextmanager
 def frame(workspace: Workspace, name: str) -> Iterator[Page]:
-    """Build the navigation bar and yield an empty page to fill; ``name`` is a key of `PAGES`."""
+    """Build the navigation bar and title of the page ``name`` (a key of `PAGES`), and yield the page to fill."""
     words, dark = visitor()
     page = Page(workspace, name, words, bool(dark))
     _set_appearance(words, dark)
     ui.page_title(f"{words(f'pages.{name}')} · PlushSense")
     ui.add_head_html(f"<style>{_CSS.read_text(encoding='utf-8')}</style>")
     with ui.header().classes("ps-header items-center no-wrap"):
-        # A link made by NiceGUI would reload the page.
+        # Written as HTML because a link made by NiceGUI would reload the page.
         html(Markup('<a class="ps-skip" href="#content">{}</a>').format(words("shell.skip")))
         html(_LOGO, "span").classes("ps-logo").props("aria-hidden=true")
         ui.label("PlushSense").classes("ps-brand")
@@ -179,9 +179,9 @@ def frame(workspace: Workspace, name: str) -> Iterator[Page]:
 
 
 def _set_appearance(words: Words, dark: bool | None) -> None:
-    """Set language and colour scheme in the response itself, so that they apply before scripts run."""
+    """Set language and colour scheme in the HTML of the response, so that they apply before scripts run."""
     client = context.client
-    # The page object belongs to the route and is shared by all visitors: each gets a copy.
+    # The page object belongs to the route and is shared by all visitors, so change a copy.
     own = copy(client.page)
     own.dark, own.language = dark, _QUASAR[words.language]  # type: ignore[assignment]
     client.page = own
@@ -190,7 +190,7 @@ def _set_appearance(words: Words, dark: bool | None) -> None:
     style = f":root {{ color-scheme: dark; background: {_DARK_BACKGROUND}; }}"
     if dark is not False:
         ui.add_head_html(f"<style>{style if dark else f'@media (prefers-color-scheme: dark) {{ {style} }}'}</style>")
-    # Announce a lost connection to screen readers, too.
+    # Announce a lost connection to screen readers.
     ui.add_body_html(
         "<script>addEventListener('DOMContentLoaded', () => document.querySelectorAll('.nicegui-error-popup')"
         ".forEach(box => box.setAttribute('role', 'alert')))</script>"
@@ -198,7 +198,7 @@ def _set_appearance(words: Words, dark: bool | None) -> None:
 
 
 def _choices(words: Words, dark: bool | None) -> None:
-    """Add the choices of language and colour scheme, which are stored in cookies."""
+    """Add the selectors of language and colour scheme; the choices are stored in cookies."""
     language = ui.toggle({code: code.upper() for code in LANGUAGES}, value=words.language)
     language.props(
         f"dense unelevated color=blue-grey-9 toggle-color=blue-grey-1 toggle-text-color=black "
@@ -247,13 +247,13 @@ def address(page: str, **query: str | Path) -> str:
 
 
 def query() -> dict[str, str]:
-    """Return the query of this page's address. Check paths with `Workspace.inside`."""
+    """Return the query parameters of this page's address; check paths in them with `Workspace.inside`."""
     request = context.client.request
     return dict(request.query_params) if request is not None else {}
 
 
 def query_path(workspace: Workspace, key: str, allowed: Iterable[str]) -> str:
-    """Return the path ``key`` of this page's address if it is allowed; else the first allowed path, or ""."""
+    """Return the path in the query parameter ``key`` if it is allowed, else the first allowed path, or ""."""
     paths = list(allowed)
     with suppress(PlushSenseError):
         if (path := str(workspace.inside(query().get(key, "")))) in paths:
@@ -262,7 +262,7 @@ def query_path(workspace: Workspace, key: str, allowed: Iterable[str]) -> str:
 
 
 def set_address(path: str) -> None:
-    """Change the address in the browser without loading a page."""
+    """Change the address displayed by the browser without loading a page."""
     ui.run_javascript(f"history.replaceState(history.state, '', {json.dumps(path)})")
 
 
@@ -272,28 +272,28 @@ def moment(seconds: float) -> str:
 
 
 def html(content: str = "", kind: str = "div") -> ui.html:
-    """Return an HTML element ``kind`` that shows ``content``, now and whenever it is set later.
+    """Add an HTML element with the tag ``kind`` that shows ``content``.
 
-    A plain string is escaped. Only `markupsafe.Markup` is HTML; build it with ``Markup("…{}…").format(…)``, which
-    escapes the values. The studio creates no HTML in any other way.
+    A plain string is escaped, also when the content is set later. Only `markupsafe.Markup` is used as HTML; build it
+    with ``Markup("…{}…").format(…)``, which escapes the values. Pages create HTML elements only with this function.
     """
     return ui.html(content, sanitize=lambda given: str(escape(given)), tag=kind)
 
 
 def tag(element: E, name: str) -> E:
-    """Set the attribute ``data-test`` of an element, by which tests find it; never use it for styles."""
+    """Set the attribute ``data-test``, by which tests find an element; never use it for styles."""
     element.props["data-test"] = name
     return element
 
 
 def named(element: E, label: str) -> E:
-    """Set the name of an element for screen readers; the label may hold any characters."""
+    """Set the name of an element for screen readers; the label may contain any characters."""
     element.props["aria-label"] = label
     return element
 
 
 def section(label: str, classes: str = "ps-card", level: int = 2) -> ui.element:
-    """Add a section with a heading; screen readers find it as a region of that name."""
+    """Add a section with a heading; screen readers list it as a region named ``label``."""
     box = named(ui.element("section").classes(f"{classes} w-full column no-wrap ps-small-gap"), label)
     with box:
         heading(label, level)
@@ -301,13 +301,13 @@ def section(label: str, classes: str = "ps-card", level: int = 2) -> ui.element:
 
 
 def heading(text: str, level: int) -> ui.label:
-    """Add a heading; use `section` where it begins a region."""
+    """Add a heading; use `section` instead for the heading of a region."""
     look = "text-lg" if level < 4 else "text-weight-bold"
     return ui.label(text).classes(look).props(f'role="heading" aria-level="{level}"')
 
 
 def scroll_region(label: str) -> ui.element:
-    """Add a box in which wide content scrolls sideways; it can be reached by keyboard."""
+    """Add a box in which wide content scrolls sideways and which the keyboard can focus."""
     return named(ui.element("div").classes("ps-scroll-x").props('role="region" tabindex="0"'), label)
 
 
@@ -323,10 +323,10 @@ def button(
     """Add a button with text.
 
     Args:
-        name: as for `tag`, or "".
-        call: called at a click.
+        name: the value of ``data-test``, see `tag`; "" for none.
+        call: called on a click.
         look: Quasar properties, such as "outline", "flat", or "unelevated" for the main action.
-        about: the object of the action, which screen readers read after the label.
+        about: what the action applies to; screen readers read it after the label.
         more: further arguments of `ui.button`.
     """
     element = ui.button(label, on_click=call, **more).props(f"no-caps {look}")

@@ -1,4 +1,4 @@
-"""Toys: the search for them, the choice of one, a test of its connection, and a buffer of its samples."""
+"""Search for toys, choose one, test its connection and buffer its samples."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ KEPT_S = 60.0
 
 
 class Samples(NamedTuple):
-    """Samples of a stream: ``seconds`` (N,) by the clock of the toy, ``values`` (N, C) in integer steps, and the
-    position ``end`` after them.
+    """Samples of a stream: ``seconds`` (N,) by the toy's clock since its first sample, ``values`` (N, C) of the C
+    channels as integers, and ``end``, the position in the stream after the last of these samples.
     """
 
     seconds: NDArray[np.float64]
@@ -33,9 +33,9 @@ class Samples(NamedTuple):
 
 
 class SampleBuffer:
-    """The newest ``size`` samples of ``channels`` values; one thread writes, any thread reads.
+    """Ring buffer of the newest ``size`` samples of ``channels`` values; one thread writes, any thread reads.
 
-    ``count`` is the number of samples ever received: the position after the newest.
+    ``count`` is the number of samples received so far, which is the position after the newest sample.
     """
 
     def __init__(self, channels: int, size: int) -> None:
@@ -49,7 +49,7 @@ class SampleBuffer:
         self._offset_ms = 0
 
     def add(self, frames: list[Frame]) -> None:
-        """Append frames; after a reset of the device clock, the time continues from its last value."""
+        """Append frames; if the device clock is reset, the time continues from its last value."""
         with self._lock:
             size = len(self._seconds)
             for frame in frames:
@@ -65,13 +65,13 @@ class SampleBuffer:
                 self.count += 1
 
     def since(self, place: int, most: int = 1 << 30) -> Samples:
-        """Return the samples after position ``place``, at most the newest ``most``."""
+        """Return the samples from position ``place`` on, but only the newest ``most`` of them."""
         with self._lock:
             at = self._places(place, most)
             return Samples(self._seconds[at], self._values[at], self.count)
 
     def frames(self, seconds: float) -> list[Frame]:
-        """Return the frames of the last ``seconds``, as they were received."""
+        """Return the frames of the last ``seconds`` with their original clocks and values."""
         with self._lock:
             at = self._places(0, len(self._seconds))
             at = at[self._seconds[at] >= self._seconds[at[-1:]] - seconds] if len(at) else at
@@ -85,9 +85,9 @@ class SampleBuffer:
 
 
 class TappedDevice(Device):
-    """A device whose frames are also stored in a `SampleBuffer`, for pages.
+    """A device that also stores its frames in a `SampleBuffer`, from which pages display them.
 
-    ``taps`` are called with new frames, in the thread that reads; they must not block.
+    The functions in ``taps`` are called with new frames in the reading thread; they must not block.
     """
 
     def __init__(self, device: Device) -> None:
@@ -101,7 +101,7 @@ class TappedDevice(Device):
 
     @property
     def inner(self) -> Device:
-        """The innermost device."""
+        """The device that reads the toy, without the wrapper that reconnects; None while that is reconnecting."""
         return getattr(self.device, "inner", self.device)
 
     @property
@@ -111,11 +111,11 @@ class TappedDevice(Device):
 
     @property
     def gaps(self) -> list[ConnectionGap]:
-        """Times without a connection."""
+        """The periods without a connection."""
         return list(getattr(self.device, "gaps", ()))
 
     def read(self) -> list[Frame] | None:
-        """Read from the device; new frames go into the buffer and to the taps."""
+        """Read from the device, store new frames in the buffer and pass them to the taps."""
         self.device.wait_s = self.wait_s
         frames = self.device.read()
         self.arrived_s = self.device.arrived_s
@@ -133,14 +133,14 @@ class TappedDevice(Device):
 PERSONS = 25
 TEST_S = 1.0
 _TIMEOUT_S = 6.0
-# With a higher share of malformed lines the toy is taken to have another layout.
+# If the share of malformed lines is higher, the toy probably has another layout.
 _MAX_MALFORMED = 0.2
 _SLOW, _FAST = 0.8, 1.25
 
 
 @dataclass(frozen=True)
 class ConnectionTest:
-    """Result of a connection test: frames and malformed lines in ``seconds`` of device time, and the layout."""
+    """Result of a connection test: the layout, and the frames and malformed lines in ``seconds`` of device time."""
 
     layout: str
     frames: int
@@ -150,17 +150,17 @@ class ConnectionTest:
 
     @property
     def fits(self) -> bool:
-        """True if enough of the lines were frames."""
+        """True if frames arrived and few lines were malformed, so that the layout is probably right."""
         return self.frames > 0 and self.malformed <= _MAX_MALFORMED * (self.frames + self.malformed)
 
     @property
     def on_time(self) -> bool:
-        """True if the frame rate is near that of the layout."""
+        """True if the measured frame rate is close to the rate of the layout."""
         return _SLOW <= self.frames / (self.seconds * self.rate_hz) <= _FAST
 
 
 class Toys:
-    """The list of toys, found by a search in the background; `changed` is notified of each change."""
+    """The toys found by a background search, and the choice of one; every change notifies `changed`."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.changed = ChangeSignal()
@@ -187,7 +187,7 @@ class Toys:
             self.changed.notify()
 
     def choose(self, url: str) -> str:
-        """Choose a toy for all pages; return its URL.
+        """Choose a toy for all pages and return its URL.
 
         Raises:
             ConfigError: for an invalid URL, or a file outside the folders of the studio.
@@ -205,7 +205,7 @@ class Toys:
         return url
 
     def person(self, number: int) -> str:
-        """Choose the virtual toy with this virtual person."""
+        """Choose the virtual toy used by virtual person ``number``, and return its URL."""
         if not 1 <= number <= PERSONS:
             raise ConfigError(f"There is no virtual person {number}: give 1 to {PERSONS}.")
         return self.choose(f"virtual://?person={number}")
@@ -216,10 +216,11 @@ class Toys:
         return bool(self._workspace.toy) and is_virtual(self._workspace.toy)
 
     def test(self, url: str = "") -> ConnectionTest:
-        """Read a toy, by default the chosen one, for a second; blocks for some seconds.
+        """Read from a toy (by default the chosen one) for `TEST_S`; block for up to several seconds.
 
         Raises:
-            DeviceError: if it cannot be reached, or sends nothing.
+            ConfigError: if no URL is given and no toy is chosen.
+            DeviceError: if the toy cannot be reached, or sends no frames.
         """
         url = url or self._workspace.toy
         if not url:

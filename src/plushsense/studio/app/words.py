@@ -1,4 +1,4 @@
-"""Texts of the pages: one TOML file for each language in ``words/``, all with the same keys."""
+"""Load the texts of the pages: one TOML file per language in ``words/``, all with the same keys."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 LANGUAGES = {"en": "English", "lv": "Latviešu"}
-"""Code to name; the texts are in ``words/<code>.toml``."""
+"""Maps language code to name; the texts are in ``words/<code>.toml``."""
 
 
 class Words:
-    """Texts in one language: ``words("record.start", n=3)`` is ``start`` of ``[record]`` with ``{n}`` filled in."""
+    """Texts in one language: ``words("record.start", n=3)`` is ``start`` of ``[record]``, where ``{n}`` becomes 3."""
 
     def __init__(self, language: str) -> None:
         self.language = language if language in LANGUAGES else next(iter(LANGUAGES))
@@ -25,12 +25,12 @@ class Words:
         return text.format(**values) if values else text
 
     def number(self, value: float, digits: int = 0) -> str:
-        """Format a number with this language's decimal point."""
+        """Format a number with the decimal separator of this language."""
         text = f"{value:.{digits}f}"
         return text.replace(".", self._texts["shell.decimal_point"])
 
     def table(self, name: str) -> dict[str, str]:
-        """Return all texts of a table, without its name in the keys."""
+        """Return all texts of the table ``name``; the keys do not include that name."""
         return {key.removeprefix(f"{name}."): text for key, text in self._texts.items() if key.startswith(f"{name}.")}
 
     def get(self, key: str, default: str = "") -> str:
@@ -38,15 +38,15 @@ class Words:
         return self._texts.get(key, default)
 
     def gesture(self, label: str) -> str:
-        """Return a gesture's name in this language, or the label itself."""
+        """Return the name of a gesture in this language, or ``label`` itself if it has none."""
         return self._texts.get(f"gestures.{label}", label)
 
     def unit(self, unit: str) -> str:
-        """Return a unit's name in this language, or the unit itself."""
+        """Return the name of a unit in this language, or ``unit`` itself if it has none."""
         return self._texts.get(f"units.{unit}", unit)
 
     def affect(self, affect: str | None) -> str:
-        """Return an affect's name; "none" and None read the same."""
+        """Return the name of an affect in this language; None means the same as "none"."""
         return self._texts[f"affects.{affect or 'none'}"]
 
 
@@ -54,7 +54,7 @@ class Words:
 def _texts(language: str) -> dict[str, str]:
     text = resources.files(__package__).joinpath(f"words/{language}.toml").read_text(encoding="utf-8")
     texts = dict(_flat(tomllib.loads(text)))
-    # A page may bring its own texts: ``pages/<name>/<language>.toml``.
+    # A page may have its own texts in ``pages/<name>/<language>.toml``.
     for folder in import_module("plushsense.studio.pages").__path__:
         for path in Path(folder).glob(f"*/{language}.toml"):
             texts |= _flat(tomllib.loads(path.read_text(encoding="utf-8")))

@@ -1,4 +1,4 @@
-"""The workspace of a running studio: its folders, its toys, and the services that pages share."""
+"""Define the workspace of a running studio: its folders, its toys and the services that pages share."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FileStamps = tuple[tuple[int, int] | None, ...]
 
 
 def file_stamps(*paths: Path) -> FileStamps:
-    """Return the modification time and the size of each file, None for a missing one, to notice changes."""
+    """Return the modification time (ns) and size of each file, None for a missing one; compare them to see changes."""
     stamps: list[tuple[int, int] | None] = []
     for path in paths:
         try:
@@ -47,11 +47,11 @@ class Workspace:
     Pages may read and write only inside ``folder`` and the data sets given at start.
 
     Attributes:
-        folder: holds `RECORDINGS`, `DATASETS`, `BUNDLES`, `EXPORTS`, `PACKAGES` and `WORK`, created when needed.
+        folder: contains `RECORDINGS`, `DATASETS`, `BUNDLES`, `EXPORTS`, `PACKAGES` and `WORK`, created when needed.
         given: data sets given at start, in any folder.
-        devices: toys given at start; the first is chosen.
-        models: bundles given at start.
-        toy: the URL of the toy that is chosen on the home page.
+        devices: URLs of the toys given at start; the first is chosen.
+        models: bundles (model files) given at start.
+        toy: URL of the chosen toy, "" for none.
         speed: speed of a virtual toy, as a multiple of real time.
         invite: returns an address with a new token for one more visitor; None if no token is needed.
     """
@@ -74,9 +74,9 @@ class Workspace:
         self.toy = self.toy or (self.devices[0] if self.devices else "")
 
     def part(self, kind: Callable[[Workspace], T]) -> T:
-        """Return the shared object of this class; it is created on first use as ``kind(workspace)``.
+        """Return the shared object of the class ``kind``, created on first use as ``kind(workspace)``.
 
-        One that has a ``close`` is closed when the studio ends.
+        If the object has a method ``close``, it is called when the studio ends.
         """
         with self._lock:
             if kind not in self._parts:
@@ -85,40 +85,40 @@ class Workspace:
             return part
 
     def close(self) -> None:
-        """Close all parts, the last created first."""
+        """Close all shared objects, the last created first."""
         with self._lock:
             parts, self._parts = list(self._parts.values()), {}
         for part in reversed(parts):
             if hasattr(part, "close"):
                 part.close()
 
-    # What is there --------------------------------------------------------------------------------------------
+    # Contents -------------------------------------------------------------------------------------------------
 
     @property
     def recordings(self) -> Path:
-        """The folder of recorded sessions: ``recordings/<subject>/<session>/``."""
+        """The folder of recorded sessions, which are at ``<subject>/<session>/`` inside it."""
         return self.folder / RECORDINGS
 
     def datasets(self) -> list[Path]:
-        """Return all data sets: those given at start, then those in the folder by name."""
+        """Return the folders of all data sets: those given at start, then those in the workspace sorted by name."""
         given = [p for p in self.given if (p / _HEAD).is_file()]
         own = sorted(p.parent for p in (self.folder / DATASETS).glob(f"*/{_HEAD}"))
         return [*given, *(p for p in own if p.resolve() not in self.given)]
 
     def bundles(self) -> list[Path]:
-        """Return all bundles, the newest first: those given at start, in the folder, and beside a data set."""
+        """Return all bundles, newest first: those given at start, in the workspace, and in a data set's folder."""
         folders = [self.folder / BUNDLES, *self.datasets()]
         bundles = {p.resolve(): p for p in self.models if p.is_file()}
         bundles |= {p.resolve(): p for folder in folders for p in folder.glob(_BUNDLE)}
         dated = []
         for path in bundles.values():
-            # A file may have been removed since it was listed, or be a broken link.
+            # A file may have been removed after it was listed, or be a broken link.
             with contextlib.suppress(OSError):
                 dated.append((-path.stat().st_mtime, str(path), path))
         return [path for _, _, path in sorted(dated)]
 
     def sessions(self) -> list[Path]:
-        """Return the folders of all sessions in `recordings`, by person and name."""
+        """Return the folders of all sessions in `recordings`, sorted by subject and name."""
         return sorted(p.parent for p in self.recordings.glob(f"*/*/{SESSION_HEAD}"))
 
     def roots(self) -> Iterator[Path]:
@@ -127,13 +127,13 @@ class Workspace:
         yield from self.given
 
     def inside(self, path: str | os.PathLike[str]) -> Path:
-        """Resolve ``path`` (absolute, or relative to ``folder``); every path that a browser sends goes through here.
+        """Resolve ``path`` (absolute, or relative to ``folder``); use this to check every path sent by a browser.
 
         Raises:
-            ConfigError: for a path outside, also by way of ``..`` or a link.
+            ConfigError: for a path outside the folders of `roots`, also if reached through ``..`` or a link.
         """
         with contextlib.suppress(ValueError, OSError, RuntimeError):
-            # Raised for a NUL, a name that cannot be encoded, or circular links.
+            # These are raised for a NUL, a name that cannot be encoded, or circular links.
             real = (self.folder / path).resolve()
             if real in self.models or any(real == root or root in real.parents for root in self.roots()):
                 return real
@@ -143,10 +143,10 @@ class Workspace:
         )
 
     def new(self, kind: str, name: str) -> Path:
-        """Return the path for a new file or folder of this name in ``folder / kind``; create nothing.
+        """Return the path for a new file or folder ``name`` in ``folder / kind``, without creating it.
 
         Raises:
-            ConfigError: for a name that is no plain file name, or one that is taken.
+            ConfigError: if ``name`` is not a plain file name, or exists already.
         """
         plain = name.strip()
         dotted = plain.startswith(".") or plain.endswith(".")
@@ -160,14 +160,14 @@ class Workspace:
         return place
 
     def free_name(self, kind: str, name: str, *suffixes: str, separator: str = "-", taken: Collection[str] = ()) -> str:
-        """Return ``name``, numbered if it is ``taken`` or exists in ``folder / kind`` with one of the suffixes."""
+        """Return ``name``, numbered if it is in ``taken`` or exists in ``folder / kind`` with one of ``suffixes``."""
         free, number = name, 2
         while free in taken or any((self.folder / kind / f"{free}{s}").exists() for s in suffixes or ("",)):
             free, number = f"{name}{separator}{number}", number + 1
         return free
 
     def title(self, dataset: Path) -> str:
-        """Return the name of a data set; its folder's name if it cannot be read."""
+        """Return the name of a data set, or the name of its folder if the data set cannot be read."""
         try:
             stamps = file_stamps(dataset / _HEAD)
             # Cached: pages call this in the event loop for every data set.
@@ -180,19 +180,19 @@ class Workspace:
 
 
 def plain_name(text: str, default: str) -> str:
-    """Return a text as a valid name for `Workspace.new`, with hyphens for other characters; ``default`` if empty."""
+    """Turn a text into a name for `Workspace.new`: replace other characters by hyphens; if empty, use ``default``."""
     return _NOT_PLAIN.sub("-", text).strip(" .")[:56] or default
 
 
 class ChangeSignal:
-    """A signal that something changed: notified from any thread, delivered in the event loop of each subscriber."""
+    """A signal that something changed: sent from any thread, delivered in the event loop of each subscriber."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._subscribers: dict[object, Callable[[], None]] = {}
 
     def notify(self) -> None:
-        """Schedule the callbacks of all subscribers; never blocks."""
+        """Schedule the callbacks of all subscribers, without blocking."""
         with self._lock:
             subscribers = list(self._subscribers.values())
         for notify in subscribers:
@@ -201,9 +201,9 @@ class ChangeSignal:
     def subscribe(
         self, callback: Callable[[], Any], loop: asyncio.AbstractEventLoop | None = None
     ) -> Callable[[], None]:
-        """Call ``callback`` in ``loop`` (by default the running one) after notifications; return how to unsubscribe.
+        """Call ``callback`` in ``loop`` (by default the running one) after each `notify`; return the unsubscriber.
 
-        Notifications that come before it runs are merged into one call. Pages use
+        Notifications that arrive before the callback runs are merged into one call. Pages use
         `plushsense.studio.app.shell.on_change`, which unsubscribes when the page is closed.
         """
         loop = loop or asyncio.get_running_loop()

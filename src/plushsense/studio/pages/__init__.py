@@ -1,1 +1,1 @@
-"""The pages: each is a folder with a module ``page``. `plushsense.studio.app.shell.PAGES` is the registry."""
+"""Pages of the studio: each is a folder with a module ``page`` and is listed in `plushsense.studio.app.shell.PAGES`."""

@@ -1,4 +1,4 @@
-"""Elements that several pages use: facts, tables, plots, pictures of gestures, and the panel of running jobs."""
+"""Provide elements that several pages use: facts, tables, plots, pictures of gestures and a panel of running jobs."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ _TITLES = {
 
 
 def style() -> None:
-    """Add the style sheet; call it once a page."""
+    """Add the style sheet of these elements; call this once per page."""
     ui.add_css(_CSS.read_text(encoding="utf-8"))
 
 
 def scroll_to(name: str) -> None:
-    """Scroll to the element tagged with this name."""
+    """Scroll to the element with this name (see `tag`)."""
     ui.run_javascript(f"document.querySelector('[data-test=\"{name}\"]')?.scrollIntoView()")
 
 
@@ -54,7 +54,7 @@ def notice(message: str, kind: Kind = "warning") -> ui.html:
 
 
 def verdict(good: bool | None, word: str) -> Markup:
-    """Return a verdict as sign, word and colour; None means unknown."""
+    """Render a verdict as a sign and ``word``, in the colour for ``good``; None means unknown."""
     kind, sign = {True: ("good", "✓"), False: ("bad", "✗"), None: ("none", "–")}[good]
     return Markup('<span class="ps-verdict ps-verdict-{}">{} {}</span>').format(kind, sign, word)
 
@@ -73,11 +73,11 @@ def table_html(
     numbers: Collection[int] = (),
     row_heads: bool = False,
 ) -> Markup:
-    """Return a table; cells are text or Markup.
+    """Render a table, whose cells are text or Markup.
 
     Args:
-        numbers: the columns that are aligned right.
-        row_heads: whether the first cell of each row is its heading.
+        numbers: indices of the columns to align right.
+        row_heads: whether the first cell of each row is a heading.
     """
 
     def line(cells: Sequence[Any], heads: Collection[int], scope: str) -> Markup:
@@ -95,19 +95,19 @@ def table_html(
 
 
 def table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = ()) -> ui.element:
-    """Add a table with a caption in a box that scrolls sideways; see `table_html`."""
+    """Add a table (see `table_html`) with a caption, in a box that scrolls sideways."""
     with scroll_region(caption) as box:
         html(table_html(head, rows, caption=caption, numbers=numbers))
     return box
 
 
 def link(message: str, to: str) -> Markup:
-    """Return a link for a table cell."""
+    """Render a link for a table cell."""
     return Markup('<a class="ps-link" href="{}">{}</a>').format(to, message)
 
 
 def size(count: int) -> str:
-    """Format a number of bytes."""
+    """Format a number of bytes with a decimal unit."""
     for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= factor:
             return f"{count / factor:.1f} {unit}"
@@ -115,12 +115,12 @@ def size(count: int) -> str:
 
 
 def title_of(words: Words, job: StudioJob) -> str:
-    """Return the title of a job in the language of this visitor; the stored one is in that of who started it."""
+    """Return the title of a job in this visitor's language; ``job.title`` is in that of the person who started it."""
     return words(_TITLES[job.task], name=Path(job.spec["place"]).name)
 
 
 async def titles(workspace: Workspace) -> dict[str, str]:
-    """Return the data sets to choose from: path to name."""
+    """Return the data sets to choose from; keys are paths, values are names."""
     return await run.io_bound(lambda: {str(p): f"{workspace.title(p)} ({p.name})" for p in workspace.datasets()}) or {}
 
 
@@ -128,18 +128,18 @@ _VENDOR = Path(__file__).parent / "vendor" / "uplot"
 
 
 class Plot(Element, component="plot.js"):
-    """Curves over x with vertical marks and one y-axis, drawn by uPlot.
+    """Plot of curves over x with one y-axis and vertical marks, drawn by uPlot.
 
     Args:
         label: name for screen readers.
-        series: a dictionary for each curve: ``label``, ``stroke`` (a colour), and optionally ``width``, ``dash``,
-            ``points`` (False), ``fill``, ``show``.
+        series: a dictionary for each curve with ``label``, ``stroke`` (a colour), and optionally ``width``, ``dash``,
+            ``points`` (by default False), ``fill`` and ``show``.
         x, y: titles of the axes, with units.
-        height: in pixels; the width is that of the surrounding element.
-        window_s: length of the visible window of a live plot, see `push`.
-        range_y: limits of the y-axis; None to fit the data.
-        values_y: whether the y-axis has values.
-        on_pick: called with (x, "left" or "right", whether shift is held) for every click.
+        height: height in pixels; the width is that of the surrounding element.
+        window_s: length of the visible part of a live plot in seconds, see `push`.
+        range_y: limits of the y-axis, or None to fit the data.
+        values_y: whether the y-axis displays values.
+        on_pick: called on every click with x, "left" or "right", and whether shift is held.
     """
 
     def __init__(
@@ -171,7 +171,7 @@ class Plot(Element, component="plot.js"):
     def begin(
         self, x: Sequence[float], curves: Sequence[Sequence[float | None]], marks: Sequence[dict[str, Any]] = ()
     ) -> Plot:
-        """Set the curves that the plot displays when the page opens; call it while the page is built."""
+        """Set the curves to display when the page opens; call this while building the page."""
         self._props["start"] = {"data": [list(x), *map(list, curves)], "marks": list(marks)}
         return self
 
@@ -182,16 +182,16 @@ class Plot(Element, component="plot.js"):
         marks: Sequence[dict[str, Any]] | None = None,
         series: Sequence[dict[str, Any]] | None = None,
     ) -> None:
-        """Replace all curves, and the marks and the series if given; None in a curve is a gap."""
+        """Replace all curves and, if given, the marks and the series; None in a curve is a gap."""
         self.run_method("show", [list(x), *map(list, curves)], marks, series)
 
     def push(self, x: Sequence[float], curves: Sequence[Sequence[float]]) -> None:
-        """Append samples at the right end of a live plot; those that leave its window are dropped."""
+        """Append samples at the right end of a live plot, and drop those that leave its window."""
         self.run_method("push", list(x), [list(c) for c in curves])
 
     def lines(self, marks: Sequence[dict[str, Any]]) -> None:
-        """Set the vertical lines: ``x``, ``label``, ``stroke``, and optionally ``dash`` ([6, 4]), ``to`` (end of a
-        shaded range) and ``row`` (vertical place of the label).
+        """Replace the vertical lines; each has ``x``, ``label``, ``stroke``, and optionally ``dash`` (such as [6, 4]),
+        ``to`` (end of a shaded range) and ``row`` (vertical position of the label).
         """
         self.run_method("setMarks", list(marks))
 
@@ -199,25 +199,25 @@ class Plot(Element, component="plot.js"):
 # Pictures ---------------------------------------------------------------------------------------------------------
 
 PICTURES = "pictures"
-"""Folder of a user's own pictures in the studio's folder: ``pictures/<label>.svg`` or ``.png``."""
+"""Subfolder of the studio's folder for the user's own pictures: ``pictures/<label>.svg`` or ``.png``."""
 MAX_PICTURE = 1_000_000
-"""Largest accepted file of a user's own picture, in bytes."""
+"""Maximum size of the file of a user's own picture, in bytes."""
 _MIME_TYPES = {".svg": "image/svg+xml", ".png": "image/png"}
 
 
 @cache
 def _drawings() -> dict[str, Markup]:
-    """Return the SVG elements of each gesture by its plain label, and of the toy alone by ""."""
+    """Return the SVG elements of the drawings by plain label of the gesture; "" is the toy alone."""
     template = Path(__file__).with_name("pictures.svg.j2").read_text(encoding="utf-8")
     module = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(template).module
     return {plain_label(label): drawing for label, drawing in module.drawings.items()}  # type: ignore[attr-defined]
 
 
 def picture(label: str, name: str = "") -> Markup:
-    """Return the drawing of a gesture as SVG, for an unknown label that of the toy alone.
+    """Return the drawing of a gesture as SVG, or that of the toy alone if ``label`` is unknown.
 
     Args:
-        name: name for screen readers; the label by default.
+        name: name for screen readers, by default ``label``.
     """
     drawing = _drawings().get(plain_label(label), _drawings()[""])
     return Markup(
@@ -227,9 +227,9 @@ def picture(label: str, name: str = "") -> Markup:
 
 
 def own_picture(home: Path, label: str) -> str:
-    """Return the user's own picture of a gesture as a ``data:`` address for an ``<img>``, or "".
+    """Return the user's own picture of a gesture as a ``data:`` URL for an ``<img>``, or "" if there is none.
 
-    An ``<img>`` runs no scripts of an SVG. Only a regular file in ``pictures`` of at most `MAX_PICTURE` bytes is used.
+    Browsers do not run scripts of an SVG in an ``<img>``. Files larger than `MAX_PICTURE` and links are ignored.
     """
     folder = home / PICTURES
     if not folder.is_dir():
@@ -247,13 +247,13 @@ def own_picture(home: Path, label: str) -> str:
 
 
 class WorkPanel:
-    """The running jobs of some tasks with their progress, a button that stops each, and the outcome of the last one.
+    """Panel of the running jobs of some tasks, with stop buttons, and of the last job if it failed or was stopped.
 
     Args:
         tasks: the tasks whose jobs are displayed.
-        progress_text: returns the progress of a running job as text.
-        ended: called when a job is done that was started here or was running when the page was opened.
-        changed: called when a job was started or has ended.
+        progress_text: function that describes the progress of a running job.
+        ended: called when a job succeeds that was started on this page or was running when the page was opened.
+        changed: called when a job starts or ends.
     """
 
     def __init__(
@@ -272,7 +272,7 @@ class WorkPanel:
         self._state: tuple[Any, ...] | None = None
         self._bars: dict[str, tuple[ui.linear_progress, ui.label]] = {}
         self._box = tag(ui.column().classes("ps-work w-full"), "work")
-        # A parent for timers that is not cleared with the box.
+        # Parent element for timers, because the box is cleared.
         self._after = ui.element("div").classes("hidden")
         on_change(self._jobs.changed, self.refresh)
         self.refresh()
@@ -322,7 +322,7 @@ class WorkPanel:
                     with ui.row().classes("w-full items-center"):
                         text(title_of(words, job), "h2", "col-grow")
                         button("stop", words("export.stop"), lambda job=job: self._jobs.stop(job.id), icon="stop")
-                    # Not a status element: screen readers would read out every step.
+                    # Not a status element, because screen readers would read out every step.
                     where = ui.label("").classes("ps-dim")
                     bar = ui.linear_progress(0.0, show_value=False, size="12px")
                     named(bar, title_of(words, job))

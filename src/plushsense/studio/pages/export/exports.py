@@ -1,4 +1,4 @@
-"""Bundles, export folders, formats and targets as plain values for the export page."""
+"""Read facts of bundles, export folders, formats and targets for the export page."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _NEEDS = {
     "tflite": ("tflite", ("ai_edge_litert", "flatbuffers")),
     "espdl": ("espdl", ("onnx", "esp_ppq", "torch")),
 }
-"""The extra and the modules that a format needs, by the first word of its name."""
+"""The extra and the modules that an export format needs, by the first word of the format's name."""
 
 
 @dataclass(frozen=True)
 class BundleFacts:
-    """A bundle, or None and the ``problem`` why it cannot be read; ``cannot``: why it cannot be exported."""
+    """A bundle, with error messages ``problem`` if it cannot be read, and ``cannot`` if it cannot be exported."""
 
     path: Path
     bundle: Bundle | None = None
@@ -39,7 +39,7 @@ class BundleFacts:
 
     @classmethod
     def of(cls, path: Path) -> BundleFacts:
-        """Read a bundle; return an error as its ``problem``."""
+        """Read a bundle; store an error as ``problem`` or ``cannot``."""
         try:
             bundle = Bundle.load(path)
         except PlushSenseError as refusal:
@@ -53,7 +53,7 @@ class BundleFacts:
 
     @property
     def simulated(self) -> bool:
-        """True if the bundle was trained on a virtual toy."""
+        """True if the bundle was trained on simulated data."""
         return self.bundle is not None and bool(self.bundle.provenance.get("simulated", False))
 
 
@@ -62,9 +62,9 @@ class ExportFacts:
     """Facts of an export folder.
 
     Attributes:
-        problem: why it cannot be read, or "".
-        files: bytes of each file.
-        digest: hash of all files.
+        problem: error message if the folder cannot be read, or "".
+        files: size of each file in bytes.
+        digest: hash of all files, see `folder_digest`.
     """
 
     folder: Path
@@ -80,17 +80,17 @@ class ExportFacts:
 
     @property
     def flash_bytes(self) -> int:
-        """Bytes of flash for the data of the model, without the code."""
+        """Bytes of flash memory for the data of the model, without code."""
         return int(self.facts["model_bytes"])
 
     @property
     def ram_bytes(self) -> int:
-        """Bytes of RAM for one toy with 32-bit pointers."""
+        """Bytes of RAM for one toy, on a processor with 32-bit pointers."""
         return int(self.facts["memory_bytes"]) + TOY_BYTES
 
     @classmethod
     def of(cls, folder: Path) -> ExportFacts:
-        """Read an export folder; return an error as its ``problem``."""
+        """Read an export folder; store an error as ``problem``."""
         try:
             facts = read_facts(folder)
             files = {p.relative_to(folder).as_posix(): p.stat().st_size for p in list_package_files(folder)}
@@ -100,13 +100,13 @@ class ExportFacts:
 
 
 def exports_of(workspace: Workspace) -> list[Path]:
-    """List the export folders of a workspace, the newest first."""
+    """List the export folders of a workspace, newest first."""
     folders = [p.parent for p in (workspace.folder / EXPORTS).glob(f"*/{FACTS}") if not p.parent.name.startswith(".")]
     return sorted(folders, key=lambda p: -(p / FACTS).stat().st_mtime)
 
 
 def folder_digest(folder: Path) -> str:
-    """Return one SHA-256 over the names and the contents of all files of a folder."""
+    """Return a SHA-256 hash over the names and contents of all files in a folder."""
     total = hashlib.sha256()
     for path in list_package_files(folder):
         total.update(f"{path.relative_to(folder).as_posix()}\0{sha256_of(path)}\n".encode())
@@ -114,12 +114,12 @@ def folder_digest(folder: Path) -> str:
 
 
 def newest_job(jobs: Jobs, task: str, place: Path) -> StudioJob | None:
-    """Return the newest finished job of a task whose ``spec["place"]`` is ``place``."""
+    """Return the newest successful job of a task whose ``spec["place"]`` is ``place``, or None."""
     return next((j for j in jobs.all(task) if j.state == DONE and j.spec.get("place") == str(place)), None)
 
 
 def formats() -> dict[str, str]:
-    """Map each export format to the extra that it needs, or "" if that is installed."""
+    """Map each export format to the extra that must be installed for it, or "" if nothing is missing."""
     missing = {}
     for name in CONVERTERS:
         extra, modules = _NEEDS[name.partition("-")[0]]
@@ -128,5 +128,5 @@ def formats() -> dict[str, str]:
 
 
 def targets() -> dict[str, list[str]]:
-    """Map each target of ``verify`` to the Debian packages that are missing. Runs compilers."""
+    """Map each target of ``verify`` to the Debian packages that are missing; this runs compilers."""
     return {name: missing_tools(name) for name in TARGETS}

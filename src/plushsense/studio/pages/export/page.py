@@ -1,4 +1,4 @@
-"""The export page: exports a bundle as C, estimates its cost and verifies it."""
+"""Build the export page, which exports a bundle as C code, estimates its cost and verifies it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _FITS = {"yes": True, "no": False, "unsure": None}
 
 
 def show_cost(page: Page, work: WorkPanel, export: ExportFacts, counted: StudioJob | None) -> None:
-    """Build the card with the cost of an export; ``counted`` is the job that measured it."""
+    """Build the card with the cost of an export; ``counted`` is the job that measured it, if any."""
     words = page.words
     profile: dict[str, Any] = counted.result.get("profile", {}) if counted else {}
     current = profile.get("digest") == export.digest
@@ -97,7 +97,7 @@ def _missing_target(words: Words, title: str, packages: Sequence[str]) -> str:
 
 
 def show_facts(page: Page, export: ExportFacts, made: StudioJob | None) -> None:
-    """Build the card with facts, files and download of an export; ``made`` is the job that wrote it."""
+    """Build the card with facts, files and download of an export; ``made`` is the job that wrote it, if known."""
     words, card = page.words, export.facts
     with tag(ui.column().classes("ps-card w-full"), "export-facts"):
         if card.get("simulated"):
@@ -132,7 +132,7 @@ def show_facts(page: Page, export: ExportFacts, made: StudioJob | None) -> None:
 
 
 def show_next(page: Page) -> None:
-    """Build the card with the next steps of a firmware engineer."""
+    """Build the card with the next steps for a firmware engineer."""
     words = page.words
     with tag(ui.column().classes("ps-card w-full"), "next"):
         text(words("export.next"), "h3")
@@ -143,7 +143,7 @@ def show_next(page: Page) -> None:
 
 
 def verification_verdict(words: Words, export: ExportFacts, proof: StudioJob | None) -> Markup:
-    """Render the last verification as a verdict: equal, unequal, outdated or never run."""
+    """Render the outcome of the last verification: equal, unequal, outdated or never run."""
     if proof is None:
         return verdict(None, words("export.never_proved"))
     if proof.result.get("digest") != export.digest:
@@ -153,14 +153,14 @@ def verification_verdict(words: Words, export: ExportFacts, proof: StudioJob | N
 
 
 def _outcome(words: Words, result: dict[str, Any]) -> tuple[bool | None, str]:
-    """Return whether a verification passed, and its text; None means equal, but with C that is not our own."""
+    """Return whether a verification passed, and its text; None means it passed with C code changed by the user."""
     if not result["passed"]:
         return False, words("export.unequal")
     return (True, words("export.equal")) if result["own"] else (None, words("export.equal_not_own"))
 
 
 class VerificationCard:
-    """The card that verifies one export."""
+    """Card that verifies one export."""
 
     def __init__(self, page: Page, work: WorkPanel, export: ExportFacts) -> None:
         self.page, self.words, self.work, self.export = page, page.words, work, export

@@ -1,4 +1,4 @@
-"""Contents of the workspace as shown on the home page, and the suggested next step."""
+"""Summarise the workspace for the home page and suggest the next step."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from plushsense.recording.session_files import SessionHead
 from plushsense.studio.app.workspace import EXPORTS, Workspace, file_stamps
 
 INDEX = "recordings.csv"
-# The recordings of one session in the paper; fewer of one person are too few to train on.
+# Number of recordings in one session of the paper; fewer than this from a single person are too few to train on.
 _ENOUGH = 51
 
 
 @dataclass(frozen=True)
 class DatasetEntry:
-    """A data set. ``refused`` is the error message if it cannot be read; the other fields are then empty.
+    """Summary of a data set. ``refused`` is the error message if it cannot be read; later fields are then empty.
 
-    ``files`` are the names of the recordings' files; they contain the time of the recording.
+    ``files`` are the file names of the recordings; a name contains the time of recording and so identifies it.
     """
 
     path: Path
@@ -50,7 +50,7 @@ class DatasetEntry:
 
 @dataclass(frozen=True)
 class SessionEntry:
-    """A session in the recordings folder; ``datasets`` are the names of the data sets that contain all of it."""
+    """Summary of a recorded session; ``datasets`` are the names of the data sets that contain all its recordings."""
 
     path: Path
     subject: str
@@ -71,7 +71,7 @@ class SessionEntry:
 
 @dataclass(frozen=True)
 class BundleEntry:
-    """A bundle; ``refused`` is the error message if it cannot be read."""
+    """Summary of a bundle (a model file); ``refused`` is the error message if it cannot be read."""
 
     path: Path
     name: str
@@ -91,7 +91,7 @@ class WorkspaceSummary:
     exports: int = 0
 
     def batches(self) -> list[tuple[SessionEntry, ...]]:
-        """Group the sessions that fit into one data set (one layout, all real or all simulated), real ones first."""
+        """Group sessions that can form one data set: same layout, all real or all simulated; real groups come first."""
         groups: dict[tuple[bool, str], list[SessionEntry]] = {}
         for s in self.sessions:
             if s.recordings and not s.refused:
@@ -104,8 +104,8 @@ class NextStep:
     """The suggested next step.
 
     Attributes:
-        key: key of its text and of the text of its button.
-        page: page that the button opens, "" for none.
+        key: key of the texts of the step and of its button, without prefix and suffix.
+        page: page that the button opens; "" if there is no button or it starts an action.
         values: values to fill into the text.
     """
 
@@ -119,8 +119,8 @@ def next_step(summary: WorkspaceSummary, *, toy: str = "", virtual: bool = False
 
     Args:
         toy: the chosen toy, "" for none.
-        virtual: whether it is the virtual one.
-        making: whether a data set is being made.
+        virtual: whether ``toy`` is virtual.
+        making: whether a job is creating a data set.
     """
     if making:
         return NextStep("making")
@@ -143,13 +143,13 @@ def next_step(summary: WorkspaceSummary, *, toy: str = "", virtual: bool = False
             return NextStep("more", "record", {"name": best.name})
         return NextStep("train", "train", {"name": best.name})
     if unreviewed and all(b.simulated for b in bundles):
-        # All bundles are simulations: continue with the real data.
+        # All bundles come from simulated data: continue with the real data.
         return NextStep("review", "review", {"name": unreviewed[0].name})
     return NextStep("live", "live", {"name": bundles[0].name})
 
 
 class Overview:
-    """Reads the contents of the workspace, and changed files only; do not call it in the event loop."""
+    """Reader of the workspace's contents. It caches results by file; do not call it in the event loop."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
@@ -211,7 +211,7 @@ def _size(path: Path) -> int:
 
 
 def _reviewed(path: Path) -> bool:
-    """Return whether a person has set any mark; marks of the recorder are not a review."""
+    """Return whether a person has set any mark; marks set by the recorder do not count as a review."""
     with contextlib.suppress(OSError):
         for line in (path / MARKS).read_bytes().splitlines():
             with contextlib.suppress(ValueError, AttributeError, RecursionError):

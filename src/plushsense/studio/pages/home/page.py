@@ -1,4 +1,4 @@
-"""Home page: the next step, data sets, networks, uploads, the toy, and jobs."""
+"""Build the home page: the next step, data sets, networks, uploads, the toy and jobs."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from plushsense.studio.pages.home.sections import (
 
 
 def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
-    """Build the section of the toy, and search for toys if that was not done yet."""
+    """Build the section for choosing a toy, and search for toys unless a search was made before."""
     words, workspace = page.words, page.workspace
     with titled_card(page, "home.toy", "toy"):
         chosen = ui.column().classes("w-full ps-small-gap").props('aria-live="polite"')
@@ -124,12 +124,12 @@ def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
 
 
 ARCHIVE_BYTES = UPLOAD_BYTES - 1_000_000
-"""The largest zip; a request is slightly larger than its file."""
+"""Maximum size of an uploaded zip in bytes; the request that carries it is slightly larger."""
 BUNDLE_BYTES = 64_000_000
 
 
 def bundles(page: Page) -> Callable[[WorkspaceSummary], None]:
-    """Build the section of trained networks; return the function that fills it."""
+    """Build the section that lists trained networks; return the function that fills it."""
     box = titled_card(page, "home.bundles", "bundles")
     with box:
         rows = ui.column().classes("w-full ps-small-gap")
@@ -158,11 +158,11 @@ def bundles(page: Page) -> Callable[[WorkspaceSummary], None]:
 
 
 def uploads(page: Page, jobs: Jobs, on_bundle: Callable[[], Awaitable[None]]) -> None:
-    """Build the section for uploads: a zip of recordings, or a bundle, after which ``on_bundle`` is called."""
+    """Build the section for uploads of a zip of recordings or a bundle; call ``on_bundle`` after storing a bundle."""
     words = page.words
 
     async def take(file: events.UploadEventArguments) -> None:
-        """Store the file under a random name, then check a bundle or import a zip."""
+        """Store the uploaded file under a random name; then check and move a bundle, or start to import a zip."""
         name = Path(file.file.name.replace("\\", "/")).name
         kind = Path(name).suffix.lower()
         uploader.reset()
@@ -215,15 +215,16 @@ def uploads(page: Page, jobs: Jobs, on_bundle: Callable[[], Awaitable[None]]) ->
 
 
 def _move_bundle(stored: Path, place: Path, name: str) -> None:
-    """Move an uploaded bundle to its place.
+    """Check an uploaded bundle and move it from ``stored`` to ``place``; ``name`` is the name of the uploaded file.
 
     Raises:
-        BundleError: if it cannot be read. ConfigError: if its name is taken.
+        BundleError: if the bundle cannot be read.
+        ConfigError: if ``place`` exists.
     """
     try:
         Bundle.load(stored)
     except BundleError as cause:
-        # Show the visitor the name of the uploaded file.
+        # The visitor knows the name of the uploaded file, not the path where it is stored.
         raise BundleError(str(cause).replace(str(stored), name)) from None
     place.parent.mkdir(parents=True, exist_ok=True)
     if place.exists():
@@ -232,13 +233,13 @@ def _move_bundle(stored: Path, place: Path, name: str) -> None:
 
 
 def _plain(stem: str) -> str:
-    """Return the stem of a file as a valid name of a data set."""
+    """Turn the stem of a file name into a valid name for a data set."""
     plain = "".join(c if c.isalnum() or c in " _-" else " " for c in stem)
     return " ".join(plain.split())[:60] or "recordings"
 
 
 def invitation(page: Page) -> None:
-    """Build the section that creates one-time addresses for further devices, if the studio accepts any."""
+    """Build the section that creates one-time addresses for further devices, if visitors need a token."""
     invite = page.workspace.invite
     if invite is None:
         return
@@ -258,7 +259,7 @@ def invitation(page: Page) -> None:
 
 MAKING = ("simulate", "import")
 CHANGING = (*MAKING, "check", "train", "sweep", "search", "export", "publish")
-# Enough to train a network, and simulated within seconds.
+# Enough data to train a network, but simulated within seconds.
 _PEOPLE, _REPETITIONS = 6, 2
 _TRY_NAME = "virtual toy"
 
@@ -288,7 +289,7 @@ async def show(page: Page) -> None:
 
     async def refresh() -> None:
         now = await run.io_bound(overview.look)
-        # None means that the studio is ending. The page may have been closed meanwhile.
+        # None means that the studio is ending. The page may also have been closed in the meantime.
         if now is not None and not context.client.is_deleted:
             fill(now)
 
@@ -319,12 +320,12 @@ class NextStepCard:
         self._box = tag(ui.card().classes("ps-card ps-next w-full").props("flat"), "next")
 
     def fill(self, summary: WorkspaceSummary) -> None:
-        """Update the step for new contents of the workspace."""
+        """Display the step that suits new contents of the workspace."""
         self._summary = summary
         self.update()
 
     def update(self) -> None:
-        """Update the step for the current toy and jobs; the card changes only with the step."""
+        """Display the step that suits the current toy and jobs; rebuild the card only if the step changes."""
         making = any(j.state == RUNNING for j in self._jobs.all(*MAKING))
         step = next_step(self._summary, toy=self._page.workspace.toy, virtual=self._toys.simulated, making=making)
         if step == self._step:
@@ -353,7 +354,7 @@ class NextStepCard:
             ui.navigate.to(address(step.page))
 
     def _try(self) -> None:
-        """Simulate a small data set, and choose the virtual toy if there is no other."""
+        """Start to simulate a small data set, and choose the virtual toy if no toy is chosen."""
         workspace = self._page.workspace
         with self._page.show_errors():
             if not workspace.toy:

@@ -1,4 +1,4 @@
-"""Sections of the home page: data sets, recorded sessions, and running and earlier jobs."""
+"""Build sections of the home page: data sets, recorded sessions, and running and earlier jobs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plushsense.studio.app.workspace import DATASETS, WORK
 from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
 
 SMALL = 'outline padding="4px 12px"'
-"""Properties of the buttons in rows."""
+"""Quasar properties of the buttons inside rows of a list."""
 PAGE_OF = {
     "check": "review",
     "import": "review",
@@ -27,14 +27,14 @@ PAGE_OF = {
     "verify": "export",
     "publish": "publish",
 }
-"""The page that displays the result of a task."""
+"""Maps each task to the page that displays its result."""
 _SIGNS = {RUNNING: "▶", DONE: "✓", REFUSED: "✕", STOPPED: "■"}
 _MAX_EARLIER = 6
 _MAX_LINES = 40
 
 
 def titled_card(page: Page, title: str, name: str) -> ui.card:
-    """Add a card with a heading that screen readers find as a region."""
+    """Add a card with a heading; screen readers list it as a region."""
     box = tag(ui.card().classes("ps-card w-full").props("flat"), name)
     named(box.props("role=region"), page.words(title))
     with box:
@@ -43,7 +43,7 @@ def titled_card(page: Page, title: str, name: str) -> ui.card:
 
 
 def simulation_badge(page: Page) -> None:
-    """Add the mark of a simulation."""
+    """Add the label that marks simulated data."""
     ui.label(page.words("home.simulated")).classes("ps-simulated")
 
 
@@ -63,7 +63,7 @@ class DatasetSection:
             self._rows = ui.column().classes("w-full ps-small-gap")
 
     def fill(self, summary: WorkspaceSummary) -> None:
-        """Display the data sets."""
+        """Replace the displayed data sets by those of ``summary``."""
         self._rows.clear()
         with self._rows:
             if not summary.datasets:
@@ -119,7 +119,7 @@ def _findings(page: Page, result: dict[str, Any]) -> str:
 
 
 class SessionSection:
-    """Section that lists the recorded sessions and makes data sets of them."""
+    """Section that lists the recorded sessions and imports them into data sets."""
 
     def __init__(self, page: Page, jobs: Jobs) -> None:
         self._page, self._jobs = page, jobs
@@ -131,7 +131,7 @@ class SessionSection:
         self._box.set_visibility(False)
 
     def fill(self, summary: WorkspaceSummary) -> None:
-        """Display the sessions; the selection stays as long as they do not change."""
+        """Display the sessions; keep the selection if neither they nor the data sets have changed."""
         readable = [d for d in summary.datasets if not d.refused]
         current = (summary.sessions, tuple((d.path, d.name, d.simulated, d.layout) for d in readable))
         if current == self._displayed:
@@ -208,7 +208,7 @@ class SessionSection:
 
 
 class JobList:
-    """Section of running and earlier jobs; rows change in place, so that a focused button keeps the focus."""
+    """Section of running and earlier jobs; progress is updated in place, so that a focused button keeps the focus."""
 
     def __init__(self, page: Page, jobs: Jobs) -> None:
         self._page, self._jobs = page, jobs
@@ -274,7 +274,7 @@ class JobList:
         button(f"job-{key}", self._page.words(f"home.{key}"), clicked, SMALL, about=job.title)
 
     def _progress(self, job: StudioJob) -> tuple[str, float | None]:
-        """Return the progress as text, and as a share if it is known."""
+        """Return the progress as text, and as a fraction from 0 to 1 (None if unknown)."""
         minutes, seconds = divmod(int(max(0.0, time.time() - job.begun_s)), 60)
         text = f"{self._page.words('home.running')} · {minutes}:{seconds:02d}"
         done, total = job.progress.get("done"), job.progress.get("total")

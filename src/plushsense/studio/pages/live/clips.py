@@ -1,7 +1,7 @@
-"""Clips of the live page: sessions that are written immediately and labelled later.
+"""Record clips on the live page: sessions that are written to disk at once and labelled later.
 
-A clip is a session folder ``recordings/<subject>/live-<n>/`` with a stream, as the recorder writes it. A label copies
-rows of the stream into a recording beside it; the stream never changes.
+A clip is a session folder ``recordings/<subject>/live-<n>/`` with a stream file like that of the recorder. Labelling a
+part of the clip copies these rows of the stream into a separate recording file; the stream itself is not changed.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from plushsense.studio.app.workspace import ChangeSignal, Workspace
 from plushsense.studio.pages.live.reader import LiveReader
 
 PROTOCOL = "live"
-"""Name of the protocol in the sessions of clips; nobody was asked to perform anything."""
+"""Name of the protocol in the sessions of clips. It marks clips, in which nobody was prompted to perform a gesture."""
 
 
 @dataclass(frozen=True)
 class Label:
-    """A recording cut from a clip: the rows from ``first`` to before ``last`` of its stream."""
+    """A labelled part of a clip, saved as a recording: stream rows ``first`` (inclusive) to ``last`` (exclusive)."""
 
     file: str
     gesture: str
@@ -52,8 +52,9 @@ class Clip:
     """A clip on disk.
 
     Attributes:
-        seconds: length by the clock of the toy, or from the rate if a crash ended the clip.
-        added: names of the data sets that contain all its recordings.
+        rows: number of rows of the stream.
+        seconds: length by the clock of the toy, or estimated from the frame rate if a crash ended the clip.
+        added: names of the data sets to which all its recordings were added.
     """
 
     folder: Path
@@ -65,17 +66,17 @@ class Clip:
 
     @property
     def key(self) -> str:
-        """Name for pages: subject/session."""
+        """Identifier of the clip, in the form ``subject/session``."""
         return _key(self.folder)
 
     @property
     def layout(self) -> Layout:
-        """The layout of the rows."""
+        """The sensor layout of the rows."""
         return _layout(self.head, self.folder)
 
 
 def read_clip(folder: Path) -> Clip | None:
-    """Return the clip in a folder; None if there is another session, or none.
+    """Read the clip in a folder; return None if the folder has no session, or one that is not a clip.
 
     Raises:
         DatasetError: if the head of the session cannot be read.
@@ -106,7 +107,7 @@ def read_clip(folder: Path) -> Clip | None:
 
 
 def _first_row(recording: Path) -> int:
-    """Return the row of the stream at which a recording begins, from its sidecar; 0 if it is unknown."""
+    """Return the row of the stream at which a recording begins, from its sidecar file, or 0 if unknown."""
     try:
         return int(json.loads(recording.with_suffix(SIDECAR).read_text(encoding="utf-8"))["stream_row"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -114,7 +115,7 @@ def _first_row(recording: Path) -> int:
 
 
 LONGEST_S = 600.0
-"""Length after which a clip ends by itself, by the clock of the toy."""
+"""Maximum length of a clip by the clock of the toy; recording then ends automatically."""
 _SOFTWARE = f"plushsense {__version__}"
 
 
@@ -136,7 +137,7 @@ class _Running:
 
 
 class Clips:
-    """Service that records and labels clips; `changed` is notified when a clip is added or changed."""
+    """Service that records and labels clips; it notifies `changed` when a clip is added or changed."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.changed = ChangeSignal()
@@ -160,10 +161,10 @@ class Clips:
         return running.receiver.toy_ms / 1000.0 if running is not None else 0.0
 
     def keep(self, reader: LiveReader, seconds: float, subject: str) -> str:
-        """Write the last ``seconds`` as a clip; return its key.
+        """Write the last ``seconds`` of the signals as a clip, and return its key.
 
         Raises:
-            ConfigError: if nothing was received. DatasetError: for an invalid code of a person, or if the disk refuses.
+            ConfigError: if nothing was received. DatasetError: for an invalid ``subject``, or if writing fails.
         """
         device, bundle = reader.device, reader.bundle
         frames = device.buffer.frames(seconds) if device is not None else []
@@ -184,10 +185,10 @@ class Clips:
         return running.key
 
     def begin(self, reader: LiveReader, subject: str) -> str:
-        """Start to record a clip, whose samples are on the disk after half a second; return its key.
+        """Start to record a clip and return its key; samples are on disk about half a second after they arrive.
 
         Raises:
-            ConfigError: if no toy is being read, or a clip is being recorded already. DatasetError: as for `keep`.
+            ConfigError: if no toy is being read, or a clip is already being recorded. DatasetError: as for `keep`.
         """
         with self._lock:
             device, bundle = reader.device, reader.bundle
@@ -211,7 +212,7 @@ class Clips:
         return running.key
 
     def end(self, only: _Running | None = None) -> str:
-        """End the clip that is being recorded, or only if it is ``only``; return its key, or ""."""
+        """End the current clip (if ``only`` is given, only if it is that clip); return its key, or "" if none ended."""
         with self._lock:
             running = self._running
             if running is None or only not in (None, running):
@@ -230,7 +231,7 @@ class Clips:
         return running.key
 
     def close(self) -> None:
-        """End the clip when the studio ends."""
+        """End the current clip because the studio ends."""
         self.end()
 
     def _tap(self, frames: list[Frame]) -> None:
@@ -256,7 +257,7 @@ class Clips:
         threading.Thread(target=self.end, args=(running,), daemon=True).start()
 
     def _open(self, reader: LiveReader, device: TappedDevice, bundle: Bundle, subject: str) -> _Running:
-        """Create the session of a new clip; the caller holds the lock."""
+        """Create the session of a new clip; the caller must hold the lock."""
         person = self._workspace.inside(self._workspace.recordings / check_subject(subject.strip()))
         choice = reader.choice
         head = SessionHead(
@@ -272,7 +273,7 @@ class Clips:
         session = OpenSession(person / head.session, head)
         speed = speed_of(with_speed(choice.toy, self._workspace.speed))
         try:
-            # Marked as finished, so that the recorder does not resume it as the last session of the person.
+            # Mark it as finished, so that the recorder does not resume it as the last session of the person.
             session.log.write(
                 [new_event("open", software=_SOFTWARE, device=device.url, speed=speed, row=0), new_event("finished")]
             )
@@ -284,7 +285,7 @@ class Clips:
     # Listing --------------------------------------------------------------------------------------------------
 
     def all(self) -> list[Clip]:
-        """Return every clip on disk, the newest first; reads files, so do not call it in the event loop."""
+        """Return all clips on disk, newest first; this reads files, so do not call it in the event loop."""
         clips = []
         for folder in self._workspace.sessions():
             if folder.name.startswith("live-"):
@@ -308,10 +309,10 @@ class Clips:
     # Labelling ------------------------------------------------------------------------------------------------
 
     def label(self, key: str, gesture: str, first: int, last: int) -> Label:
-        """Save the rows from ``first`` to before ``last`` of a clip as a recording of ``gesture``.
+        """Save the rows ``first`` (inclusive) to ``last`` (exclusive) of a clip as a recording of ``gesture``.
 
         Raises:
-            ConfigError: for an invalid label or range of rows. DatasetError: if the disk refuses.
+            ConfigError: for an invalid label or range of rows. DatasetError: if writing fails.
         """
         clip = self.get(key)
         if key == self.recording:
@@ -351,7 +352,7 @@ class Clips:
         """Import the recordings of a clip into a data set, as ``plushsense import --add`` does.
 
         Raises:
-            ConfigError: if it has no label. DatasetError: as for `import_recordings`.
+            ConfigError: if the clip has no label. DatasetError: as for `import_recordings`.
         """
         clip = self.get(key)
         if not clip.labels:
@@ -388,7 +389,7 @@ def _protocol(bundle: Bundle) -> Protocol:
 
 
 def _count_losses(take: RecordingTake, layout: Layout) -> None:
-    """Count lost frames and gaps from the device clock of the rows."""
+    """Count the lost frames of ``take`` and list its gaps, both derived from the device clock."""
     loss = LossCounter()
     last: Frame | None = None
     for at, frame in enumerate(take.frames):

@@ -1,4 +1,4 @@
-"""The section of the live page that records, lists, labels and imports clips."""
+"""Build the section of the live page that records, lists, labels and imports clips."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ _START, _END = "#009E73", "#D55E00"
 
 
 def show(page: Page, reader: LiveReader) -> None:
-    """Build the part of the page below the live view."""
+    """Build the section for clips, which is below the live view."""
     clips = page.workspace.part(Clips)
     words = page.words
     with section(words("live.hard")):
         ui.label(words("live.hard_about")).classes("ps-dim")
-        # Messages about clips are displayed here and not at the top of the long page.
+        # Display messages about clips here instead of at the top of the page, which may be out of view.
         near = replace(page, _messages=ui.column().classes("w-full ps-messages"))
         _recording_controls(near, reader, clips)
         listing = tag(ui.column().classes("w-full ps-no-gap"), "clips")
@@ -74,7 +74,7 @@ def _recording_controls(page: Page, reader: LiveReader, clips: Clips) -> None:
         length = tag(ui.label("").props('role="timer"').classes("ps-dim"), "record-length")
 
     def code() -> str:
-        """Return the code of the person; ask for it if it is missing."""
+        """Return the code of the person; if it is missing, show a message and return ""."""
         text = str(person.value or "").strip()
         if not text:
             page.say(words("live.person_first"), "warning")
@@ -112,7 +112,7 @@ def _recording_controls(page: Page, reader: LiveReader, clips: Clips) -> None:
         failed = clips.failed
 
     def update_sometimes() -> None:
-        # The reader notifies twenty times a second.
+        # The reader notifies about twenty times a second; update only twice.
         nonlocal updated_s
         if time.monotonic() - updated_s < 0.5:
             return
@@ -151,16 +151,16 @@ def _row(page: Page, clips: Clips, clip: Clip, edit: Callable[[], Awaitable[None
 
 
 class _ClipEditor:
-    """An open clip: its signals, the chosen part, its label, and the data set that it is added to.
+    """Editor of one clip: displays its signals, labels the selected part and adds the clip to a data set.
 
-    The chosen part are the rows from ``_first`` to before ``_last``.
+    The selected part consists of the rows ``_first`` (inclusive) to ``_last`` (exclusive).
     """
 
     def __init__(self, page: Page, clips: Clips, clip: Clip, frames: Frames) -> None:
         self._page, self._clips, self._clip, self._frames = page, clips, clip, frames
         self._seconds = np.maximum.accumulate(frames.device_ms - frames.device_ms[:1]) / 1000.0
         self._first, self._last = 0, len(frames)
-        # Whether the next click sets the end.
+        # Whether the next click sets the end of the selected part.
         self._next_end = False
         self._setting = False
         words = page.words
@@ -207,7 +207,7 @@ class _ClipEditor:
         return tag(field.classes("w-36"), name)
 
     def _lanes(self) -> tuple[list[float], list[list[float]]]:
-        """Return the curves with every channel in a lane of its own, the first on top."""
+        """Return the times and the curves, scaled so that each channel has its own lane, with the first on top."""
         step = max(1, -(-len(self._frames) // _MAX_POINTS))
         values = self._frames.values[::step].astype(float)
         low, high = values.min(axis=0, initial=np.inf), values.max(axis=0, initial=-np.inf)
@@ -232,11 +232,11 @@ class _ClipEditor:
         return float(seconds[min(max(row, 0), len(seconds) - 1)]) if len(seconds) else 0.0
 
     def _row(self, second: float) -> int:
-        """Return the row nearest to a time."""
+        """Return the row nearest to the time ``second``."""
         return int(np.abs(self._seconds - second).argmin()) if len(self._seconds) else 0
 
     def _picked(self, x: float, pressed: str, shift: bool) -> None:
-        """Set the start at the first click, and the end at the next one, or with the right button or shift."""
+        """Set the start with the first click; set the end with the next click, the right button or shift."""
         row = self._row(x)
         if pressed == "right" or shift or (self._next_end and row > self._first):
             self._last, self._next_end = row + 1, False
@@ -265,7 +265,7 @@ class _ClipEditor:
         self._plot.lines(self._marks())
 
     def _update_gestures(self) -> None:
-        """Offer the gestures of the chosen data set."""
+        """Update the selectable gestures to those of the chosen data set."""
         words = self._page.words
         labels: tuple[str, ...] = ()
         if self._dataset.value:

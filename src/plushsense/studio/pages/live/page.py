@@ -1,4 +1,4 @@
-"""Live page: shows the signals of a toy, the answers of a bundle, and events as they happen."""
+"""Build the live page, which shows the signals of a toy, the predictions of a bundle and events as they happen."""
 
 from __future__ import annotations
 
@@ -37,23 +37,23 @@ from plushsense.studio.pages.live.clips import Clips
 from plushsense.studio.pages.live.reader import EventSpan, LatestAnswer, LiveChoice, LiveReader, LiveState
 
 WINDOW_S = 8.0
-"""Displayed seconds of signals."""
+"""Length of the displayed signals, in seconds."""
 STRIP_S = 60.0
-"""Displayed seconds of events on the time line."""
+"""Length of the time line of events, in seconds."""
 PACE_S = 0.04
-"""Shortest time between two messages; shorter than the 50 ms between two decisions at real time."""
+"""Minimum time between two messages to a page; less than the 50 ms between two decisions in real time."""
 _MAX_BEHIND = 60
-"""Messages that a page may be behind before it is sent nothing more; it reports its position once a second."""
+"""Number of unconfirmed messages after which sending pauses; a page confirms messages about once a second."""
 
 Message = dict[str, Any]
 
 
 class Feed:
-    """Messages for one page: holds what the page was sent and whether it keeps up. For use in one thread only.
+    """Source of the messages for one page; it tracks what was sent and whether the page keeps up. Not thread-safe.
 
     Attributes:
-        hidden: whether the page is in the background. It then gets nothing, and the whole state afterwards.
-        away: whether the connection is lost; with the same effect.
+        hidden: whether the page is in the background. It is then sent nothing, and afterwards the whole state.
+        away: whether the connection is lost, which has the same effect.
     """
 
     def __init__(self, reader: LiveReader) -> None:
@@ -69,28 +69,28 @@ class Feed:
         self._watched: tuple[int, float] | None = None
 
     def wait_s(self) -> float:
-        """Return the time until the next message may be sent."""
+        """Return the number of seconds until the next message may be sent."""
         return max(0.0, self._last + PACE_S - time.perf_counter())
 
     @property
     def holds(self) -> bool:
-        """True if the page should be sent nothing now."""
+        """True if no message should be sent now, because the page is hidden, disconnected or too far behind."""
         return self.hidden or self.away or self._sent - self._seen > _MAX_BEHIND
 
     def seen(self, number: int) -> None:
-        """Note that the page has drawn message ``number``."""
+        """Record that the page has drawn message ``number``."""
         if self._watched is not None and number >= self._watched[0]:
             self._round_ms = 1000.0 * (time.perf_counter() - self._watched[1])
             self._watched = None
         self._seen = max(self._seen, number)
 
     def again(self) -> None:
-        """Send the whole state next, after the page was hidden or disconnected."""
+        """Make the next message contain the whole state, after the page was hidden or disconnected."""
         self._generation = -1
         self._seen = self._sent
 
     def scene(self) -> Message:
-        """Return the whole state, for a page that opens or returns, or after a change of toy or bundle."""
+        """Return the whole state, for a page that opens or becomes visible, or after a change of toy or bundle."""
         reader = self._reader
         now, device, bundle = reader.now, reader.device, reader.bundle
         self._generation = now.generation
@@ -110,7 +110,7 @@ class Feed:
         return scene | {"first": self._message(now)}
 
     def message(self) -> tuple[str, Message] | None:
-        """Return the method to call in the page and its argument; None if nothing should be sent."""
+        """Return the method to call in the browser and its argument, or None if nothing should be sent."""
         if self.holds:
             return None
         now = self._reader.now
@@ -136,7 +136,7 @@ class Feed:
             message["x"] = [round(s, 3) for s in piece.seconds.tolist()]
             message["y"] = piece.values.astype(int).T.tolist()
         if now.probabilities is not None:
-            # Integer thousandths are enough for a bar.
+            # Integer thousandths are precise enough for the length of a bar.
             message["p"] = [round(1000.0 * p) for p in now.probabilities]
         if now.network is not None:
             message["net"] = _answer(now.network)
@@ -147,7 +147,7 @@ class Feed:
         if now.changes > self._change:
             message["spans"] = [_span(s) for s in self._reader.spans(self._change)]
             self._change = now.changes
-        # Sent only after a change, which is rare.
+        # These values change rarely, so they are sent only after a change.
         rare = (now.running, now.message, now.state, now.gate, now.event, now.reaction)
         if rare != self._rare:
             self._rare = rare
@@ -187,7 +187,7 @@ def _span(span: EventSpan) -> Message:
 
 
 class LiveView(Element, component="live_view.js"):
-    """Browser component that draws the messages of a `Feed`, with the texts ``words``."""
+    """Browser component that displays the messages of ``feed``, with texts from ``words``."""
 
     def __init__(self, words: Words, feed: Feed) -> None:
         super().__init__()
@@ -199,7 +199,7 @@ class LiveView(Element, component="live_view.js"):
             colours=dict(AFFECT_COLOURS),
             lines=list(LINES),
             locale=words.language,
-            # Latencies can only be measured on one clock.
+            # Latency can be measured only if browser and studio use the same clock.
             sameClock=is_loopback(context.client.ip),
             start=self._named(feed.scene()),
         )
@@ -208,13 +208,13 @@ class LiveView(Element, component="live_view.js"):
         self.on("visible", self._visible)
 
     def push(self) -> None:
-        """Send the next message, if any."""
+        """Send the next message to the browser, if there is one."""
         if (due := self._feed.message()) is not None:
             method, message = due
             self.run_method(method, self._named(message) if method == "scene" else message)
 
     def _named(self, scene: Message) -> Message:
-        """Add the names of the gestures in the language of the page to the scene."""
+        """Add to ``scene`` the names of the gestures in the language of the page."""
         for gesture in scene["classes"]:
             gesture["name"] = self._words.gesture(gesture["label"])
         return scene
@@ -223,7 +223,7 @@ class LiveView(Element, component="live_view.js"):
         held_back = self._feed.holds
         self._feed.seen(int(event.args["n"]))
         if held_back:
-            # A toy that went silent meanwhile causes no further change, so what was held back is sent now.
+            # If the toy has stopped sending, no change would trigger the withheld message, so send it now.
             self.push()
 
     def _visible(self, event: GenericEventArguments) -> None:
@@ -259,7 +259,7 @@ def show(page: Page) -> None:
 
 
 def _follow(view: LiveView, feed: Feed, reader: LiveReader) -> None:
-    """Push to the view after every change, at most at its pace, and not while it is disconnected."""
+    """Push a message to the view after each change, at most every `PACE_S`, and not while it is disconnected."""
     client = context.client
     loop = asyncio.get_running_loop()
     timer: asyncio.TimerHandle | None = None
@@ -330,7 +330,7 @@ def _controls(page: Page, reader: LiveReader) -> None:  # noqa: C901
     busy.set_visibility(False)
 
     async def run(command: Callable[..., None], *args: Any) -> bool:
-        """Run a command in a thread; return whether it succeeded."""
+        """Run ``command`` in a thread, show its errors on the page, and return whether it succeeded."""
         busy.set_visibility(True)
         page.say("")
         done = False
@@ -347,14 +347,14 @@ def _controls(page: Page, reader: LiveReader) -> None:  # noqa: C901
             await run(reader.start, LiveChoice(url, path, engine.value, reactions.value, bool(virtual.value)))
 
     async def change() -> None:
-        # Also called when the page follows the choice of another tab; then there is nothing to do.
+        # Also called when this page displays the choice made in another tab; then there is nothing to do.
         now = reader.choice
         selection = (Path(bundle.value) if bundle.value else None, engine.value, reactions.value)
         if selection != (now.bundle, now.engine, now.reactions) and not await run(reader.choose, *selection):
             follow()
 
     def follow() -> None:
-        """Display the current choice, which another tab may have made."""
+        """Display the current choice, which may have been made in another tab."""
         now = reader.choice
         if now.bundle is not None:
             if str(now.bundle) not in bundles:
@@ -370,7 +370,7 @@ def _controls(page: Page, reader: LiveReader) -> None:  # noqa: C901
     state: tuple[Any, ...] = ("",)
 
     def update() -> None:
-        # Called at every decision, mostly without a change.
+        # Called after every decision, mostly without a change.
         nonlocal state
         message, running = reader.now.problem or reader.now.message, reader.now.running
         if (message, running, reader.choice) == state:
@@ -406,6 +406,6 @@ def _controls(page: Page, reader: LiveReader) -> None:  # noqa: C901
 
 
 def _toy_options(toys: Toys, workspace: Workspace, url: str) -> dict[str, str]:
-    """Return the toys to choose from: ``url``, those given at start, the virtual one, and those that were found."""
+    """Return the toys to choose from (URL to text): ``url``, those given at start, the virtual one and those found."""
     known = {one: one for one in (url, workspace.toy, *workspace.devices, VIRTUAL) if one}
     return known | {d.url: f"{d.name or d.url}: {d.description}" for d in toys.listing.devices}

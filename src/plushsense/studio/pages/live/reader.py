@@ -1,4 +1,4 @@
-"""Reads one toy with one bundle for all live pages, and keeps the events of the last minutes."""
+"""Read one toy and classify its signals with one bundle, for all live pages; keep the events of recent minutes."""
 
 from __future__ import annotations
 
@@ -32,8 +32,10 @@ class LiveChoice:
     """The toy, bundle, engine and reactions in use.
 
     Attributes:
-        reactions: a name, or "" for none.
-        simulated: whether the toy is a virtual one, also behind a port.
+        toy: URL of the toy.
+        engine: arithmetic of the network, "float" or "int8".
+        reactions: name of a set of reactions, or "" for none.
+        simulated: whether the toy is virtual, even if it is connected through a port.
     """
 
     toy: str = ""
@@ -45,7 +47,7 @@ class LiveChoice:
 
 @dataclass(frozen=True)
 class LatestAnswer:
-    """Latest answer of the network, at every step, or of the gate, when one of its rules fires."""
+    """Latest result of the network (at every step) or of the gate's rules (whenever a rule matches)."""
 
     t_s: float
     affect: str | None
@@ -59,9 +61,9 @@ class EventSpan:
     """An event on the time line.
 
     Attributes:
-        number: counts from 1, over all bundles.
-        change: number of its latest change.
-        end_s: None while it lasts.
+        number: consecutive number from 1, continued when the bundle changes.
+        change: number of the latest change of this event; all changes of all events are numbered consecutively.
+        end_s: time of its end, None while it lasts.
     """
 
     number: int
@@ -75,20 +77,20 @@ class EventSpan:
 
 @dataclass(frozen=True)
 class LiveState:
-    """Current state that pages display beside the signals. Times are seconds of the toy since it was opened.
+    """State that pages display next to the signals. Times ``t_s`` are seconds by the toy's clock since it was opened.
 
     Attributes:
-        generation: increases with every new toy or bundle, after which pages are drawn again.
+        generation: increases with every new toy or bundle; pages then redraw everything.
         running: whether a toy is being read.
-        message: why reading ended, or "".
-        problem: why no data arrive now, or "".
-        state: state of the last decision; "" before the first.
-        probabilities: of the classes, in the order of the bundle; None while there is no answer.
-        event: the current event.
-        reaction: the current reaction of the toy, which ends at ``reaction_ends_s``.
-        latency_s: from the arrival of the bytes to the newest decision.
-        arrived: arrival of those bytes, seconds since 1970.
-        changes: number of the newest change of an event.
+        message: the reason why reading ended, or "".
+        problem: the reason why no data arrive at present, or "".
+        state: state in the last decision; "" if no toy is being read.
+        probabilities: class probabilities in the order of the bundle; None while there is no prediction.
+        event: the current event, if any.
+        reaction: the current reaction of the toy, if any; it ends at ``reaction_ends_s``.
+        latency_s: time from the arrival of the bytes to the newest decision.
+        arrived: time of arrival of those bytes, in seconds since 1970.
+        changes: number of the newest change of any event, see `EventSpan`.
     """
 
     generation: int = 0
@@ -111,17 +113,17 @@ class LiveState:
 KEPT_SPANS = 200
 KEPT_SPAN_S = 600.0
 _BETWEEN_S = 0.06
-"""Longest time between two notifications while samples arrive."""
+"""Time in seconds after which new samples cause a notification even without a decision."""
 _JOIN_S = 10.0
 ALONE_S = 60.0
-"""Seconds without an open page after which the toy is closed, so that other programs can use it."""
+"""Time without an open page, in seconds, after which the toy is closed so that other programs can use it."""
 _UNREADABLE = 30
-"""Number of lines without a frame after which the layout is taken to be wrong."""
+"""Number of malformed lines, before any frame has arrived, that indicates a wrong layout."""
 
 
 @dataclass
 class _BundleRun:
-    """A bundle in use; ``offset_s``: the toy's time at its first frame, None before that."""
+    """A bundle in use; ``offset_s`` is the toy's time at the first frame read with it, None before that frame."""
 
     bundle: Bundle
     run: LiveRun
@@ -130,9 +132,9 @@ class _BundleRun:
 
 
 class LiveReader:
-    """Service that all live pages share.
+    """Service, shared by all live pages, that reads and classifies the signals of one toy.
 
-    `changed` is notified after every decision and every change.
+    It notifies `changed` after every decision and every other change of its state.
     """
 
     def __init__(self, workspace: Workspace) -> None:
@@ -153,13 +155,13 @@ class LiveReader:
         self._pages = 0
         self._alone: threading.Timer | None = None
 
-    # Commands: they block, call them outside the event loop -------------------------------------------
+    # Commands. They block, so call them outside the event loop -------------------------------------------
 
     def start(self, choice: LiveChoice) -> None:
-        """Open a toy and read it with a bundle; a toy that is being read is closed once both are valid.
+        """Open a toy and classify its signals; first close the current toy, but only if the bundle is usable.
 
         Raises:
-            ConfigError, DeviceError, BundleError: as for `open_device`, `Bundle.load` and `check_layout`.
+            ConfigError, DeviceError, BundleError: if the toy or bundle cannot be opened, or they do not fit each other.
         """
         with self._changing:
             if choice.bundle is None:
@@ -191,7 +193,8 @@ class LiveReader:
         """Use another bundle, engine or reactions without opening the toy again.
 
         Raises:
-            ConfigError, BundleError: if it does not fit the toy or the gesture set; the current bundle stays in use.
+            ConfigError, BundleError: if the bundle cannot be read, does not fit the toy, or has no gesture in common
+                with the current one, which then stays in use.
         """
         with self._changing:
             device = self.device
@@ -214,7 +217,7 @@ class LiveReader:
         self.changed.notify()
 
     def stop(self) -> None:
-        """Close the toy; its last signals remain visible. Does nothing if no toy is open."""
+        """Close the toy, if one is open; its last signals remain visible."""
         with self._changing:
             thread, device = self._thread, self.device
             self._ends.set()
@@ -225,15 +228,15 @@ class LiveReader:
             self._thread = None
 
     def close(self) -> None:
-        """Stop when the studio ends."""
+        """Close the toy because the studio ends."""
         with self._lock:
             self._pages += 1
         self.stop()
 
     def add_viewer(self, busy: Callable[[], bool]) -> Callable[[], None]:
-        """Register a page that shows the signals; call the returned function when it is closed.
+        """Register a page that shows the signals; return a function to call when the page is closed.
 
-        A toy without pages is closed after `ALONE_S`, unless ``busy`` returns true.
+        If no page is open for `ALONE_S` seconds, the toy is closed, unless ``busy`` returns true.
         """
         with self._lock:
             self._pages += 1
@@ -264,7 +267,7 @@ class LiveReader:
     # For pages -------------------------------------------------------------------------------------
 
     def spans(self, since: int = 0) -> list[EventSpan]:
-        """Return the events of the last minutes that changed after change ``since``, the oldest first."""
+        """Return the events of recent minutes with a change number greater than ``since``, oldest first."""
         with self._lock:
             return [span for span in self._spans if span.change > since]
 
@@ -314,7 +317,7 @@ class LiveReader:
             return
         self._notified_s = host
         newest = device.buffer.since(device.buffer.count - 1).seconds
-        # A device with a clock of its own may give a time in the future.
+        # A device with its own clock may report a time in the future.
         age_s = max(0.0, host - device.arrived_s) if device.arrived_s is not None else 0.0
         with self._lock:
             self.now = replace(
@@ -337,7 +340,7 @@ class LiveReader:
                 self._take_event(event, zero)
             now = self.now
             if decision.source == "gate":
-                # The network's answer stays until its next step.
+                # The network's answer stays displayed until its next step.
                 now = replace(now, gate=answer, state=decision.state)
             else:
                 now = replace(now, network=answer, state=decision.state, probabilities=decision.probabilities)
@@ -364,7 +367,7 @@ class LiveReader:
             self._change_event(affect=event.affect, gesture=event.gesture, end_s=end_s)
 
     def _change_event(self, **changed: Any) -> None:
-        """Change or end the current event; the caller holds the lock."""
+        """Change or end the current event; the caller must hold the lock."""
         span = self.now.event
         assert span is not None
         self._changes += 1
@@ -375,7 +378,7 @@ class LiveReader:
         self.now = replace(self.now, event=None if fresh.end_s is not None else fresh)
 
     def _swap(self, fresh: _BundleRun) -> None:
-        """Continue with another bundle; the current event ends."""
+        """Continue with another bundle, and end the current event."""
         with self._lock:
             self._end_event(self.now.t_s)
             self.bundle = fresh.bundle
@@ -391,14 +394,14 @@ class LiveReader:
         self.changed.notify()
 
     def _end_event(self, t_s: float) -> None:
-        """End the current event; the caller holds the lock."""
+        """End the current event, if any; the caller must hold the lock."""
         if self.now.event is not None:
             self._change_event(end_s=max(t_s, self.now.event.begin_s))
             self.now = replace(self.now, changes=self._changes)
 
 
 def _problem(device: TappedDevice, before: str) -> str:
-    """Return why no frame arrives; ``before``, the last reason, applies until one does."""
+    """Return why no frame arrives; without a new reason, return ``before``, the previous one."""
     if device.state == "waiting":
         return str(device.gaps[-1].reason) if device.gaps else before
     if device.buffer.count == 0 and device.counters.malformed >= _UNREADABLE:
@@ -410,7 +413,7 @@ def _problem(device: TappedDevice, before: str) -> str:
 
 
 def _simulated(url: str) -> bool:
-    """Return whether a URL is that of a virtual toy, or of a recording of one."""
+    """Return whether a URL belongs to a virtual toy, or to a recording of one."""
     address = parse_url(url)
     if address.scheme != "replay":
         return is_virtual(url)

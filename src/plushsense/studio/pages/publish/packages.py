@@ -1,4 +1,4 @@
-"""Facts of data sets and published packages, and the section that lists and validates packages."""
+"""Collect facts of data sets and published packages, and build the section that lists and validates packages."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from plushsense.studio.app.workspace import PACKAGES, Workspace
 from plushsense.studio.widgets.elements import WorkPanel, link, notice, size, table, text, verdict
 
 KEYS = "keys"
-"""Folder of the workspace for secrets: neither in a data set nor in a package."""
-# Shifted dates are later than this (see `dataset.privacy.pseudonyms`).
+"""Subfolder of the workspace for secret key files, which are never part of a data set or package."""
+# Pseudonymised dates are later than this time in ms since 1970 (see `dataset.privacy.pseudonyms`).
 _MOVED_MS = 4_102_444_800_000
 _TOOLS = {
     "publish": ("mlcroissant", "frictionless", "rocrate", "datacite"),
@@ -41,13 +41,13 @@ _TOOLS = {
 
 @dataclass(frozen=True)
 class DatasetFacts:
-    """Facts of a data set before publication.
+    """Facts of a data set to consider before publication.
 
     Attributes:
-        dataset: None if it cannot be read; ``problem`` says why.
-        columns: columns of the table of people that are not always published.
-        own_codes: people whose codes were not drawn by ``pseudonymise``.
-        own_dates: whether the dates may be the true ones.
+        dataset: the data set, or None if it cannot be read; ``problem`` is then the error message.
+        columns: columns of the table of people that are published only on request.
+        own_codes: codes of people that were not drawn at random by ``pseudonymise``.
+        own_dates: whether the recordings may have their true dates.
     """
 
     path: Path
@@ -59,7 +59,7 @@ class DatasetFacts:
 
     @classmethod
     def of(cls, path: Path) -> DatasetFacts:
-        """Read a data set; return an error as its ``problem``."""
+        """Read the facts of a data set; store an error as ``problem``."""
         try:
             dataset = open_dataset(path)
             people = read_people(path)
@@ -80,8 +80,8 @@ class PackageFacts:
     """Facts of a published package, which is a folder, a zip, or both.
 
     Attributes:
-        reidentification: figures of the report, {} if no test was run.
-        contents: (files, bytes) of each folder (its name ends in "/") and top-level file.
+        reidentification: results of the re-identification test, {} if it was not run.
+        contents: numbers of files and bytes of each folder (its name ends in "/") and top-level file.
     """
 
     name: str
@@ -96,14 +96,14 @@ class PackageFacts:
 
     @property
     def place(self) -> Path:
-        """Path to validate: the zip if there is one, because that is what is shared."""
+        """Path to validate: the zip if it exists, because that is what people share."""
         place = self.zip or self.folder
         assert place is not None
         return place
 
     @classmethod
     def of(cls, workspace: Workspace, name: str) -> PackageFacts:
-        """Read a package; leave empty what cannot be read, because the validators report it."""
+        """Read the facts of a package; leave out unreadable ones, because the validators report them."""
         folder, packed = workspace.folder / PACKAGES / name, workspace.folder / PACKAGES / f"{name}.zip"
         existing = folder if (folder / CHECKSUMS).is_file() else None
         zipped = packed if packed.is_file() else None
@@ -123,7 +123,7 @@ class PackageFacts:
 
 
 def packages_of(workspace: Workspace) -> list[str]:
-    """List the names of the packages of a workspace, the newest first."""
+    """List the names of the packages in a workspace, newest first."""
     root = workspace.folder / PACKAGES
     dated = {p.parent.name: p.stat().st_mtime for p in root.glob(f"*/{CHECKSUMS}") if not p.parent.name.startswith(".")}
     dated |= {p.stem: p.stat().st_mtime for p in root.glob("*.zip") if p.is_file()}
@@ -131,7 +131,7 @@ def packages_of(workspace: Workspace) -> list[str]:
 
 
 def missing_extras() -> list[str]:
-    """Return the missing extras: ``publish`` for publication, ``baselines`` for re-identification tests."""
+    """Return the extras not installed: ``publish`` for publication, ``baselines`` for re-identification tests."""
     return [extra for extra, modules in _TOOLS.items() if not all(importlib.util.find_spec(m) for m in modules)]
 
 
@@ -152,7 +152,7 @@ def _contents(folder: Path | None, packed: Path | None) -> dict[str, tuple[int, 
     grouped: dict[str, tuple[int, int]] = {}
     for path, bytes_ in _files(folder, packed).items():
         parts = path.split("/")
-        # Folders in the data folder are listed separately.
+        # Group by the first two levels, so that subfolders of the data folder are listed separately.
         depth = min(len(parts) - 1, 2)
         top = "/".join(parts[:depth]) + "/" if depth else path
         files, total = grouped.get(top, (0, 0))
@@ -161,7 +161,7 @@ def _contents(folder: Path | None, packed: Path | None) -> dict[str, tuple[int, 
 
 
 def _zip_root(packed: Path | None) -> zipfile.Path | None:
-    """Return the only folder in a zip, or None if the zip cannot be read."""
+    """Return the top-level folder in a zip, or None if the zip cannot be read."""
     try:
         return next(zipfile.Path(packed).iterdir()) if packed is not None else None
     except (OSError, StopIteration, zipfile.BadZipFile):
@@ -180,7 +180,7 @@ _MAX_PROBLEMS = 20
 
 
 class PackagesSection:
-    """The section with the list of packages and one open package."""
+    """Section with the list of packages and the details of one of them."""
 
     def __init__(self, page: Page, work: WorkPanel, lacking: list[str]) -> None:
         self.page, self.words, self.workspace, self.work, self.lacking = page, page.words, page.workspace, work, lacking
@@ -188,7 +188,7 @@ class PackagesSection:
         self._list = tag(ui.column().classes("w-full"), "packages")
 
     async def build(self, name: str) -> None:
-        """Build the section and open the package ``name``, unless it is ""."""
+        """Build the list and show the package ``name``, unless it is ""."""
         if name:
             await self.show(name)
         await self.refresh()
@@ -223,7 +223,7 @@ class PackagesSection:
         return verdict(good, f"{self.words('publish.valid' if good else 'publish.invalid')}, {moment(job.ended_s)}")
 
     async def show(self, name: str) -> None:
-        """Open a package."""
+        """Show the details of a package."""
         words = self.words
         with self.page.show_errors():
             if name not in (await run.io_bound(lambda: packages_of(self.workspace)) or []):
@@ -314,7 +314,7 @@ class PackagesSection:
 
 
 def newest_validation(jobs: Jobs, package: PackageFacts) -> StudioJob | None:
-    """Return the newest job that validated this package since it was written."""
+    """Return the newest job that validated this package after it was written, or None."""
     places = {str(p) for p in (package.folder, package.zip) if p is not None}
     return next(
         (
@@ -327,7 +327,7 @@ def newest_validation(jobs: Jobs, package: PackageFacts) -> StudioJob | None:
 
 
 def reidentification_text(words: Words, figures: dict[str, Any]) -> list[str]:
-    """Summarise a re-identification test in sentences; ``figures`` is {} if none was run."""
+    """Summarise the results ``figures`` of a re-identification test in sentences; {} means none was run."""
     trials = {(t["design"], t["sees"]): t for t in figures.get("trials", ())}
     head = trials.get(("recordings", "everything"))
     if head is None:

@@ -1,4 +1,4 @@
-"""The publish page: turns a data set into a validated package on this computer."""
+"""Build the publish page, which turns a data set into a validated package on this computer."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MAX_CODES = 5
 
 
 class StatementsForm:
-    """Fields for licence, contact and consent, filled from the data set or the last publication."""
+    """Fields for licence, contact and consent, pre-filled from the data set or the last publication."""
 
     def __init__(self, page: Page, path: Path, head: DatasetHead) -> None:
         words, contact = page.words, head.about.contact
@@ -37,7 +37,7 @@ class StatementsForm:
         licences = {s: s if s == each.title else f"{s}: {each.title}" for s, each in LICENCES.items()}
         value = head.licence or last.get("licence") or None
         if value is not None:
-            # A licence that the library refuses stays visible.
+            # Display a current licence even if it is not in the list and will be rejected.
             licences.setdefault(value, value)
         licence = ui.select(licences, value=value, label=words("publish.licence"), with_input=False).classes("w-full")
         self._licence = tag(licence, "licence")
@@ -54,7 +54,7 @@ class StatementsForm:
         self._save = tag(ui.checkbox(words("publish.save")), "save")
 
     def values(self) -> dict[str, Any]:
-        """Return the fields as arguments of `publish_dataset`."""
+        """Return the values as arguments of `publish_dataset`."""
         name, mail = (self._name.value or "").strip(), (self._mail.value or "").strip()
         return {
             "licence": self._licence.value or "",
@@ -65,10 +65,11 @@ class StatementsForm:
 
 
 class PseudonymsForm:
-    """The advice to replace codes and dates of people, and the form that does so.
+    """Advice to pseudonymise the data set, and the form that starts it.
 
     Args:
-        start: called with the names of the new data set and the key file, words to remove, whether to drop notes.
+        start: called with the names of the new data set and the key file, the words to remove, and whether to drop
+            notes.
     """
 
     def __init__(
@@ -226,7 +227,7 @@ class _Publishing:
             if place.with_name(f"{place.name}.zip").exists():
                 raise ConfigError(f"'{place.name}.zip' exists already: give another name, nothing is replaced.")
             statements = self.statements.values()
-            # Check now, while the form is visible, and not only in the job.
+            # Check the statements now, while the form is visible; otherwise errors appear only in the job.
             head = await run.io_bound(lambda: DatasetHead.read(dataset))
             assert head is not None
             complete_head(head, dataset, statements["licence"], statements["contact"], statements["consent"])
@@ -241,7 +242,7 @@ class _Publishing:
             await self.work.start("publish", spec)
 
     def _key_path(self, name: str) -> Path:
-        """Return the path of a key file, new or existing."""
+        """Return the path of the key file ``name``, which may exist; raise ConfigError for an invalid name."""
         path = self.workspace.folder / KEYS / name
         if name and path.parent == self.workspace.folder / KEYS and path.is_file():
             return self.workspace.inside(path)

@@ -1,4 +1,4 @@
-"""Recording sessions of the studio, which any page can start, resume and control."""
+"""Manage the recording sessions of a studio, which any page can start, resume and control."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import VIRTUAL, ChangeSignal, Workspace
 
 PROTOCOLS, LAYOUTS = "protocols", "layouts"
-"""Folders of the workspace for a user's own files."""
+"""Folders of the workspace for the user's own protocols and layouts."""
 NO_CONSENT, PSEUDO = "no_consent", "pseudo"
-"""Notices before recording: keys of texts in the table ``record``."""
+"""Notices shown before recording; each is the key of a text in the table ``record``."""
 SOFTWARE = f"plushsense {__version__} studio"
 
 
@@ -44,9 +44,9 @@ class ActiveSession:
     """A session that is being recorded.
 
     Attributes:
-        name: ``<subject>/<session>``, as in the address of the page.
-        notices: some of `NO_CONSENT` and `PSEUDO`.
-        repairs: descriptions of what was repaired after a crash.
+        name: ``<subject>/<session>``, as used in the address of the page.
+        notices: those of `NO_CONSENT` and `PSEUDO` that apply.
+        repairs: descriptions of repairs made to the files after a crash.
     """
 
     name: str
@@ -59,17 +59,17 @@ class ActiveSession:
 
     @property
     def head(self) -> SessionHead:
-        """The head of the session."""
+        """The session's metadata."""
         return self.recorder.session.head
 
     def press(self, key: str, seen: str) -> bool:
-        """Run a command if the status is still the one that was displayed; return whether it was run.
+        """Run a command, but only if the status is still the displayed one; return whether it was run.
 
-        Therefore simultaneous presses on two pages, or a delayed press, give one command.
+        This way, simultaneous presses on two pages run only one command, and a delayed press runs none.
 
         Args:
-            key: " ", "r", "s", "b", "p" as in the terminal, or ``go:<number of the step>``.
-            seen: `plushsense.recording.states.RecorderStatus.seen` of the displayed status.
+            key: " ", "r", "s", "b" or "p" as in the terminal recorder, or ``go:<number of the step>``.
+            seen: `plushsense.recording.states.RecorderStatus.seen` of the status that the page displayed.
 
         Raises:
             ConfigError: for an unknown command.
@@ -96,7 +96,7 @@ class ActiveSession:
 
 
 class RecordController:
-    """Starts, resumes and ends the sessions of a studio; `changed` is notified whenever one changes.
+    """Service that starts, resumes and ends recording sessions; any change of one notifies `changed`.
 
     `begin`, `resume`, `close_session` and `sessions` block: do not call them in the event loop.
     """
@@ -109,27 +109,27 @@ class RecordController:
         self._active: dict[str, ActiveSession] = {}
 
     def active_sessions(self) -> list[ActiveSession]:
-        """Return the sessions that are being recorded now."""
+        """Return the sessions that are open now."""
         with self._lock:
             return list(self._active.values())
 
     def get(self, name: str) -> ActiveSession | None:
-        """Return the active session of this name, or None."""
+        """Return the active session with this name, or None."""
         with self._lock:
             return self._active.get(name)
 
     def sessions(self) -> list[SessionSummary]:
-        """Return all sessions in the studio's folder, the newest first."""
+        """Return all sessions in the studio's folder, newest first."""
         return list_sessions(self._workspace.recordings)
 
     def begin(self, request: SessionRequest, anew: bool = False) -> ActiveSession:
-        """Start a session, or return this person's active one.
+        """Start a session, or return the active session of the same person.
 
         Args:
-            anew: whether to begin another one although the last one of the person is unfinished.
+            anew: whether to start another session even if the last one of the person is unfinished.
 
         Raises:
-            PlushSenseError: if the recorder or the toy refuses, or the last session is unfinished.
+            PlushSenseError: if the request is invalid, the toy cannot be opened, or the last session is unfinished.
         """
         self._check(request)
         with self._opening:
@@ -145,7 +145,7 @@ class RecordController:
             return self._open(request, folder, None)
 
     def _active_of(self, request: SessionRequest, subject: str) -> ActiveSession | None:
-        """Return the active session of a person, if any; end finished sessions of this person or toy."""
+        """Return the active session of ``subject``, if any; first end finished ones of this person or toy."""
         for session in self.active_sessions():
             ended = session.recorder.status().state in ("finished", "stopped")
             if ended and (session.head.subject == subject or session.request.device == request.device):
@@ -155,13 +155,13 @@ class RecordController:
         return None
 
     def resume(self, name: str, device: str = "") -> ActiveSession:
-        """Resume an unfinished session, or return it if it is active.
+        """Resume an unfinished session, or return it if it is already active.
 
         Args:
-            device: the URL of the toy, by default the one that the session was begun with.
+            device: the URL of the toy, by default the one with which the session was started.
 
         Raises:
-            PlushSenseError: if the recorder or the toy refuses.
+            PlushSenseError: if the session cannot be resumed, or the toy cannot be opened.
         """
         folder = self._folder(name)
         with self._opening:
@@ -179,7 +179,7 @@ class RecordController:
             return self._open(request, folder, known)
 
     def close_session(self, name: str) -> None:
-        """Close a session; only a running recording is discarded. May be called twice."""
+        """Close a session and discard only the recording in progress; do nothing if it is closed already."""
         with self._opening:
             with self._lock:
                 session = self._active.get(name)
@@ -194,36 +194,36 @@ class RecordController:
         self.changed.notify()
 
     def close(self) -> None:
-        """End all sessions."""
+        """Close all active sessions."""
         for session in self.active_sessions():
             self.close_session(session.name)
 
     # Choices --------------------------------------------------------------------------------------------------
 
     def speed_for(self, url: str, simulated: bool) -> float:
-        """Return the speed at which a toy runs, as a multiple of real time; 1 for a real toy."""
+        """Return the speed of a toy as a multiple of real time, which is 1 for a real toy."""
         if not simulated and not is_virtual(url):
             return speed_of(url)
         return speed_of(url) if "speed" in parse_url(url).query else self._workspace.speed
 
     def toys(self) -> list[str]:
-        """Return the toys to choose from: the chosen one, those given at start, the virtual one."""
+        """Return the URLs of the toys to choose from: the chosen one, those given at start, and the virtual one."""
         return list(dict.fromkeys(u for u in (self._workspace.toy, *self._workspace.devices, VIRTUAL) if u))
 
     def protocols(self) -> dict[str, str]:
-        """Return the protocols to choose from: name or path to title."""
+        """Return the protocols to choose from; keys are names or paths, values are titles."""
         names = sorted(builtin_names("protocols"), key=lambda n: (n != "plush-17", n))
         return {n: n for n in names} | self._own_files(PROTOCOLS)
 
     def layouts(self) -> dict[str, str]:
-        """Return the layouts to choose from: name or path to title."""
+        """Return the layouts to choose from; keys are names or paths, values are titles."""
         return {n: n for n in layout_names()} | self._own_files(LAYOUTS)
 
     def _own_files(self, folder: str) -> dict[str, str]:
         return {str(p): p.name for p in sorted((self._workspace.folder / folder).glob("*.toml"))}
 
     def _check(self, request: SessionRequest, known_device: str = "") -> None:
-        """Refuse toys, protocols and layouts that refer to files outside this studio."""
+        """Raise ConfigError if the toy, protocol or layout is unknown or refers to a file that was not allowed."""
         check_speed(request.speed)
         if request.protocol and request.protocol not in self.protocols():
             raise ConfigError(f"'{request.protocol}' is not a protocol of this studio: choose one from the list.")

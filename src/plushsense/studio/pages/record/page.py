@@ -1,4 +1,4 @@
-"""Record page: the sessions to resume and the form for a new one, or the session that is being recorded."""
+"""Build the record page: a list of sessions to resume and a form for a new one, or the session being recorded."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _SCAN_S = 3.0
 
 
 def toy_name(words: Words, url: str) -> str:
-    """Return the name of a toy in a list: its address, and a word if it is virtual."""
+    """Return the text for a toy in a list: its URL, marked if the toy is virtual."""
     return f"{words('record.virtual_toy')} · {url}" if is_virtual(url) else url
 
 
 async def show(page: Page) -> None:
-    """Show the session that the address names, or the only active one; else the page to start one."""
+    """Show the session named in the address, or the only active one; otherwise show the page to start one."""
     controller = page.workspace.part(RecordController)
     chosen = query()
     active = controller.active_sessions()
@@ -41,10 +41,11 @@ async def show(page: Page) -> None:
 
 
 async def show_start(page: Page, controller: RecordController, requested: str, ended: str) -> None:
-    """Build the page before a session: sessions to resume, and the form for a new one.
+    """Build the page shown before a session: sessions to resume, and the form for a new one.
 
     Args:
-        requested: a session that the address names and that is not open; ``ended``: one that was just closed.
+        requested: name of the session in the address, which is not open, or "".
+        ended: name of a session that was just closed, or "".
     """
     sessions = await run.io_bound(controller.sessions) or []
     mine = {s.name: s for s in sessions}
@@ -112,7 +113,7 @@ def _one_unfinished(page: Page, controller: RecordController, session: SessionSu
 
 
 async def _open_session(page: Page, begin: ui.button, work: Callable[[], ActiveSession]) -> None:
-    """Open the toy, which may take a while, and go to the session; show why if that is refused."""
+    """Open the toy, which may take a while, and go to the session; show an error message if that fails."""
     begin.disable()
     page.say(page.words("record.opening"))
     try:
@@ -125,7 +126,7 @@ async def _open_session(page: Page, begin: ui.button, work: Callable[[], ActiveS
 
 
 class _Form:
-    """A new session."""
+    """Form for a new session."""
 
     def __init__(self, page: Page, controller: RecordController) -> None:
         self._page, self._controller, words = page, controller, page.words
@@ -170,7 +171,7 @@ class _Form:
         return tag(field, key).style("width: 27rem; max-width: 100%")
 
     def _choose_words(self) -> None:
-        """Offer the wordings of the chosen protocol, the page's language first."""
+        """Update the selectable wordings to those of the chosen protocol; preselect the page's language."""
         try:
             known = wordings(str(self._protocol.value))
         except PlushSenseError as refusal:

@@ -1,4 +1,4 @@
-"""Record page during a session: the current step, the recorder's state, and the commands."""
+"""Build the record page during a session: the current step, the state of the recorder, and the commands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from plushsense.studio.pages.record.controller import ActiveSession, RecordContr
 from plushsense.studio.widgets.elements import Plot, own_picture, picture
 
 _WINDOW_S = 10.0
-# Largest number of points that are sent to a plot at once.
+# Approximate maximum number of points to send to a plot at once.
 _MAX_POINTS = 12
 _SIGNAL_STYLES = {
     "good": ("✔", "#00664a"),
@@ -27,23 +27,23 @@ _SIGNAL_STYLES = {
     "none": ("✖", "#6b1d1d"),
     "unreadable": ("?", "#6b1d1d"),
 }
-"""Sign and colour of each value of `plushsense.recording.takes.SIGNAL`."""
+"""Sign and colour of each signal quality in `plushsense.recording.takes.SIGNAL`."""
 
 
 def percent(share: float, words: Words) -> str:
-    """Format a share in per cent, with one decimal place below ten."""
+    """Format a share (0 to 1) in per cent, with one decimal place if it is below ten per cent."""
     text = words.number(100 * share, 1 if share < 0.1 else 0)
     return text.removesuffix(f"{words('shell.decimal_point')}0")
 
 
 def summary(text: str) -> None:
-    """Add the visible heading of a folded part of the page."""
+    """Add the heading of a collapsible part of the page, which stays visible when the part is folded."""
     style = "display: list-item; list-style-position: inside; cursor: pointer; font-weight: 600"
     html(text, "summary").style(style)
 
 
 class SignalPanel:
-    """Signal quality, and plots of the last seconds, one for each kind of channel."""
+    """Panel with the signal quality and plots of the last seconds, one plot for each kind of channel."""
 
     def __init__(self, page: Page, session: ActiveSession) -> None:
         self._page, self._device = page, session.device
@@ -89,7 +89,7 @@ class SignalPanel:
         return plots
 
     def draw(self, s: RecorderStatus) -> None:
-        """Display the current signal quality; called whenever the page is drawn."""
+        """Display the current signal quality."""
         words = self._page.words
         if self._drawn_signal != s.signal:
             self._drawn_signal = s.signal
@@ -97,7 +97,7 @@ class SignalPanel:
             self._quality.text = f"{sign} {words(f'record.signal_{s.signal}')}"
             self._quality.style(f"background: {colour}; color: #fff").props(f'data-signal="{s.signal}"')
         shares = {"recent": percent(s.bad_share, words), "ever": percent(s.bad_share_total, words)}
-        # Without a signal, the figures of the last seconds have no meaning.
+        # Without a signal, these figures are meaningless.
         has_signal = s.signal not in ("none", "unreadable")
         self._lost.text = words("record.signal_lost", **shares) if has_signal else ""
         self._rate.text = words("record.signal_rate", rate=f"{s.rate_hz:.0f}") if has_signal else ""
@@ -110,7 +110,7 @@ class SignalPanel:
         self._place = samples.end
         if not len(samples.seconds):
             return
-        # At high speed a toy sends more samples than can be seen.
+        # At high speed, a virtual toy sends more samples than are visible in the plot.
         step = max(1, len(samples.seconds) // _MAX_POINTS)
         seconds, values = samples.seconds[::step].tolist(), samples.values[::step]
         channels = self._device.layout.channels
@@ -126,7 +126,7 @@ _SIGNS = {"now": "▶", "made": "✓", "skipped": "–", "open": "○"}
 
 
 class StepList:
-    """List of all steps: a button for each recording, a row for each gesture; ``go(number, seen)`` jumps to a step."""
+    """List of all steps, with a row per gesture and a button per recording that calls ``go(number, seen)``."""
 
     def __init__(self, page: Page, session: ActiveSession, go: Callable[[int, str], Any]) -> None:
         self._page, self._session = page, session
@@ -157,7 +157,7 @@ class StepList:
         return step
 
     def draw(self, status: RecorderStatus) -> None:
-        """Update the state of each step if anything has changed."""
+        """Update the displayed state of the steps if the status has changed."""
         if not self._buttons or status.seen == self._seen:
             return
         self._seen = status.seen
@@ -185,10 +185,10 @@ _GREEN, _BLUE, _RED, _AMBER, _GREY = "#00664a", "#0b4f9e", "#9d2b00", "#7a4e00",
 
 
 class ConnectionAlert(Element, component="connection.js"):
-    """An alert that displays ``text`` and hides elements of class ``ps-current`` while the studio does not answer.
+    """An alert that displays ``text`` and hides elements of class ``ps-current`` while the studio does not respond.
 
-    The connection counts as lost when the socket is closed or there was no answer for five seconds. Only an answer
-    restores it, so that the page is up to date then.
+    The connection counts as lost when the socket closes, or when there was no response for five seconds. It counts as
+    restored only after a response, because the page is up to date then.
     """
 
     def __init__(self, text: str) -> None:
@@ -199,7 +199,7 @@ class ConnectionAlert(Element, component="connection.js"):
 
 
 def show_session(page: Page, controller: RecordController, session: ActiveSession) -> None:
-    """Build the page of a session."""
+    """Build the page of a session and update it until it is closed."""
     view = _View(page, controller, session)
     on_change(controller.changed, view.draw)
     ui.timer(_DRAW_S, view.tick, immediate=False)
@@ -207,7 +207,7 @@ def show_session(page: Page, controller: RecordController, session: ActiveSessio
 
 
 def _state_text(page: Page, s: RecorderStatus) -> tuple[str, str]:
-    """Return the text of the state, which says what to press, and its colour."""
+    """Return the text that describes the state and what to press, and its colour."""
     words = page.words
     if s.state == "idle":
         if s.signal in ("none", "unreadable"):
@@ -224,7 +224,7 @@ def _state_text(page: Page, s: RecorderStatus) -> tuple[str, str]:
 
 
 class _View:
-    """The elements of the page; `draw` updates them to the state of the session."""
+    """The elements of the page; `draw` updates them to the current state of the session."""
 
     def __init__(self, page: Page, controller: RecordController, session: ActiveSession) -> None:
         self._page, self._controller, self._session = page, controller, session
@@ -282,7 +282,7 @@ class _View:
             self._state = tag(ui.label(), "state").style("font-size: 1.5rem; line-height: 1.25; font-weight: 700")
         self._message = tag(ui.label(), "recorder-message").classes("ps-current").props('role="status"')
         self._message.style("font-size: 1.15rem; min-height: 1.6rem")
-        # For screen readers: what to do, announced once, without the changing numbers.
+        # For screen readers: announce each instruction once, without the changing numbers.
         self._announcement = tag(ui.label(), "announcement").props('aria-live="polite"').classes("ps-current")
         self._announcement.style("position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%)")
 
@@ -346,7 +346,7 @@ class _View:
         if text:
             self._session.recorder.note(text)
             self._note.value = ""
-        # The space bar is a command again.
+        # Leave the note field, so that the space bar is a command again.
         focus(self._main)
 
     def _ask_end(self) -> None:
@@ -369,7 +369,7 @@ class _View:
         self._left = False
 
     async def _reopen(self) -> None:
-        """Resume the session; if that fails, offer the start page, where another toy can be chosen."""
+        """Resume the session; if that fails, let the button lead to the start page to choose another toy."""
         if self._left:
             ui.navigate.to(address("record", session=self._session.name))
             return
@@ -390,7 +390,7 @@ class _View:
             self._signals.push()
 
     def draw(self) -> None:
-        """Update the page to the state of the session."""
+        """Update the page to the current state of the session."""
         if self._left:
             return
         if self._controller.get(self._session.name) is not self._session:
@@ -459,7 +459,7 @@ class _View:
         self._small["s"].set_visibility(state not in ("finished", "stopped"))
         for key in "rb":
             self._small[key].set_visibility(state != "stopped")
-        # When all is recorded, the main button ends the session.
+        # When everything is recorded, the main button ends the session.
         self._end_button.set_visibility(state != "finished")
         if state == "finished":
             folder = str(self._session.recorder.session.folder.relative_to(self._page.workspace.folder))
@@ -468,7 +468,7 @@ class _View:
         self._done.set_visibility(state == "finished")
         step = f"{words.gesture(s.step.gesture)}, {self._repetition.text}. {s.step.prompt}. "
         announcement = (step if state == "idle" else "") + text
-        # While recording, announce only a lost toy and not the remaining seconds.
+        # While recording, announce only a lost connection to the toy, not the remaining seconds.
         still_recording = state == self._announced[0] == "recording" and not s.away
         if self._announced != (state, announcement) and not still_recording:
             self._announced = (state, announcement)

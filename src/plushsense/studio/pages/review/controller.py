@@ -1,4 +1,4 @@
-"""State of one open review page: view, filter, order of recordings and decisions."""
+"""Hold the state of one open review page: view, filter, order of recordings and decisions."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ NO_FINDING = "no-finding"
 
 @dataclass(frozen=True)
 class RecordingFilter:
-    """Conditions that a recording must meet to be listed; "" accepts all.
+    """Conditions that a recording must meet to be listed; "" means no condition.
 
-    ``state``: one of `STATES`, or `TO_DO` or `DONE`. ``severity``: least severity of the most urgent open finding, or
-    `NO_FINDING`. ``check``: a check with a finding, accepted or not. ``text``: part of the id or of a finding.
+    ``state``: one of `STATES`, `TO_DO` or `DONE`. ``severity``: minimum severity of the worst finding not accepted, or
+    `NO_FINDING`. ``check``: a check with a finding, accepted or not. ``text``: part of the id or a finding's message.
     """
 
     person: str = ""
@@ -46,7 +46,7 @@ class RecordingFilter:
     text: str = ""
 
     def fits(self, row: ReviewedRecording) -> bool:
-        """Return whether a recording passes the filter."""
+        """Return whether a recording meets all conditions."""
         return (
             self.person in ("", row.info.subject)
             and self.gesture in ("", row.info.gesture)
@@ -72,7 +72,7 @@ class RecordingFilter:
 
     @classmethod
     def of(cls, query: Mapping[str, str]) -> RecordingFilter:
-        """Read a filter from the query of an address; ignore unknown values."""
+        """Create a filter from the query parameters of an address; ignore unknown values."""
         values = {f.name: query[f.name] for f in fields(cls) if query.get(f.name)}
         for key, allowed in (("state", (TO_DO, DONE, *STATES)), ("severity", (NO_FINDING, *SEVERITIES))):
             if values.get(key) not in allowed:
@@ -93,7 +93,7 @@ SORTS: dict[str, Callable[[ReviewedRecording], Any]] = {
     "findings": lambda r: (_URGENCY[r.worst], -len(r.open)),
     "state": lambda r: (STATES.index(r.state), r.confidence),
 }
-"""Sort keys of the columns; equal recordings are sorted by id."""
+"""Sort key of each column; recordings with equal keys are sorted by id."""
 
 
 def filter_and_sort(
@@ -103,7 +103,7 @@ def filter_and_sort(
     by: str = "recording",
     down: bool = False,
 ) -> list[str]:
-    """Return the ids of the recordings that pass a filter, sorted."""
+    """Return the sorted ids of the recordings that pass ``filter`` and, unless ``only`` is None, are in ``only``."""
     fitting = [r for r in rows if (only is None or r.id in only) and filter.fits(r)]
     fitting.sort(key=lambda r: r.id, reverse=down and by == "recording")
     if by != "recording":
@@ -112,7 +112,7 @@ def filter_and_sort(
 
 
 class ReviewView(Protocol):
-    """A view of the page: the table, one recording, or the overlay of a gesture."""
+    """Interface of the views of the page: the table, one recording, and the overlay of a gesture."""
 
     @property
     def place(self) -> ui.element:
@@ -122,18 +122,18 @@ class ReviewView(Protocol):
         """Display the current selection of the controller."""
 
     def refresh(self) -> None:
-        """Update what has changed since it was drawn."""
+        """Update the parts that have changed since the view was drawn."""
 
 
 class ReviewController:
-    """Controls one open review page: which recordings it displays, in which order, and who decides.
+    """Controller of one open review page: which recordings it displays, in which order, and who decides.
 
     Attributes:
-        visit: id of the browser tab; its decisions can be undone one by one, also after a reload.
+        visit: id of the browser tab, whose decisions can be undone one by one, even after a reload.
         current: id of the displayed recording, "" for none.
-        order: ids that passed the filter when it was set; `next` skips those that no longer pass.
-        first_row: place in ``order`` of the first row of the table's page.
-        ends: whether a suggested stop is accepted, too.
+        order: sorted ids that passed the filter when it was set; `next` skips those that no longer pass.
+        first_row: index in ``order`` of the first row on the current page of the table.
+        ends: whether accepting a suggestion also accepts the suggested stop.
     """
 
     def __init__(self, page: Page, review: Review, query: Mapping[str, str]) -> None:
@@ -156,7 +156,7 @@ class ReviewController:
         self._address = ""
 
     def limit(self, title: str, only: list[str]) -> None:
-        """Limit the page to a selection of recordings, and report those that do not exist."""
+        """Limit the page to the recordings ``only``, if any, and report those that do not exist."""
         if not only:
             return
         self.only, self.title = {i: None for i in only if i in self.review.infos}, title
@@ -230,7 +230,7 @@ class ReviewController:
         )
 
     async def begin(self, recording: str) -> None:
-        """Open the view that the address names, with ``recording`` or the first one."""
+        """Open the initial view with ``recording``, or the first recording if that is "" or unknown."""
         self.arrange()
         if recording and recording not in self.review.infos:
             with self.page.show_errors():
@@ -241,7 +241,7 @@ class ReviewController:
         self.changed()
 
     def person(self, subject: str) -> str:
-        """Return the code of a person as the page displays it."""
+        """Return the text that the page displays for a person's code."""
         return self.words("review.nobody") if subject == "none" else subject
 
     def _who(self) -> str:
@@ -257,7 +257,7 @@ class ReviewController:
 
     @property
     def name(self) -> str:
-        """Name of the person who decides; raise ConfigError if neither the field nor the login gives a name."""
+        """Name of the person who decides; raise ConfigError if neither the field nor the login provides one."""
         return author_name((self.who.value or "").strip() or None)
 
     # Views and navigation -----------------------------------------------------------------------------------------
@@ -276,7 +276,7 @@ class ReviewController:
         await self.turn_to(self.view)
 
     async def turn_to(self, view: str) -> None:
-        """Switch to the table, the single recording or the overlay."""
+        """Switch to ``view``, one of `VIEWS`."""
         self.view = view
         if self.toggle.value != view:
             self.toggle.value = view
@@ -292,12 +292,12 @@ class ReviewController:
         self._update_address()
 
     async def open(self, identity: str) -> None:
-        """Open the view of one recording."""
+        """Switch to the view of one recording and display ``identity``."""
         self.current = identity
         await self.turn_to(ONE)
 
     async def go(self, identity: str, *, remember: bool = False) -> None:
-        """Display a recording in the recording view, and read the next ones ahead."""
+        """Display a recording in the recording view, and read the following ones in the background."""
         with self.page.show_errors():
             if identity and not self.review.is_read(identity):
                 await run.io_bound(self.review.signals, identity)
@@ -319,14 +319,14 @@ class ReviewController:
                 return
 
     def following(self, count: int = 1) -> list[str]:
-        """Return up to ``count`` next recordings of the order that still pass the filter."""
+        """Return the ids of up to ``count`` recordings that follow in the order and still pass the filter."""
         rows = self.review.rows
         start = self.order.index(self.current) + 1 if self.current in self.order else 0
         fitting = (i for i in self.order[start:] if i in rows and self.filter.fits(rows[i]))
         return list(itertools.islice(fitting, count))
 
     async def next(self) -> None:
-        """Go to the next recording of the order."""
+        """Go to the next recording in the order."""
         async with self._turn:
             await self._next()
 
@@ -339,7 +339,7 @@ class ReviewController:
             self.page.say(self.words("review.last"), "good")
 
     async def back(self) -> None:
-        """Return to the recording displayed before, else to the previous one of the order."""
+        """Return to the recording displayed before, or if there is none, to the previous one in the order."""
         async with self._turn:
             while self.trail and self.trail[-1] not in self.review.infos:
                 self.trail.pop()
@@ -349,7 +349,7 @@ class ReviewController:
                 await self._previous(remember=False)
 
     async def previous(self) -> None:
-        """Go to the previous recording of the order."""
+        """Go to the previous recording in the order."""
         async with self._turn:
             await self._previous(remember=True)
 
@@ -360,9 +360,9 @@ class ReviewController:
     # Deciding -----------------------------------------------------------------------------------------------------
 
     async def decide(self, recording: str, decision: Callable[[], Any], *, move: bool = False) -> None:
-        """Run a decision about the displayed recording; with ``move``, go to the next one after success.
+        """Call ``decision``, which is about ``recording``; with ``move``, go to the next recording after success.
 
-        Do nothing if another recording is displayed by now.
+        Do nothing if another recording has been displayed in the meantime.
         """
         async with self._turn:
             if recording != self.current:
@@ -376,7 +376,7 @@ class ReviewController:
             self.views[ONE].refresh()
 
     async def undo(self) -> None:
-        """Discard the draft of the displayed recording, else undo the last decision of this browser tab."""
+        """Discard the draft of the displayed recording; if there is none, undo this tab's last decision."""
         async with self._turn:
             with self.page.show_errors():
                 if self.view == ONE and self.review.drop(self.current):
@@ -394,7 +394,7 @@ class ReviewController:
                     await self.go(last.recording)
 
     def changed(self) -> None:
-        """Update the page after a change, made here or elsewhere."""
+        """Update the page after a change of the review, made on this page or elsewhere."""
         self._update_progress()
         rows = self.review.rows
         if rows is self._rows:

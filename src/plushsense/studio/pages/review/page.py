@@ -1,13 +1,13 @@
-"""The review page: the recordings of a data set as a table, one by one, and as overlays.
+"""Build the review page, which shows the recordings of a data set as a table, one by one, and as overlays.
 
-The address holds the state of the page, so that it can be linked to and survives a reload:
+The query parameters of the address contain the state of the page, for links and reloads:
 
 ``/review?dataset=DIR``
-    a data set inside the folders of the studio, absolute or relative to the home folder; the first one by default.
+    a data set in the folders of the studio, as an absolute path or relative to the home folder; by default the first.
 ``recordings=ID`` (several times), ``title=TEXT``
-    only these recordings, and what they have in common. Unknown ids are left out with a message.
+    show only these recordings, under this title. Unknown ids are left out and reported.
 ``selection=KEY``
-    the same, stored under a key. `plushsense.studio.pages.review.review.Reviews.address` chooses between both.
+    the same, but stored under a key. `plushsense.studio.pages.review.review.Reviews.address` chooses one of these.
 ``person, gesture, state, severity, check, text``
     the filters (`plushsense.studio.pages.review.controller.RecordingFilter`).
 ``view=table | one | overlay``, ``recording=ID``

@@ -1,4 +1,4 @@
-"""The views of one recording and of the overlay of a gesture."""
+"""Define the view of one recording and the view that overlays all recordings of a gesture."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _VENDOR = Path(__file__).parents[2] / "widgets" / "vendor" / "uplot"
 
 
 class ReviewPlot(Element, component="review_plot.js"):
-    """Browser component that plots curves over seconds with marks, and reports clicks and keys.
+    """Browser component that plots curves over time (in seconds) with marks, and reports clicks and keys.
 
     Args:
         label: text alternative while nothing is plotted.
-        on_pick: called with {x, y, button ("left" or "right"), shift, recording (id of the plotted one)}.
+        on_pick: called on a click with {x, y, button ("left" or "right"), shift, recording (id of the plotted one)}.
         on_key: called with {key, shift, recording}, except for keys typed into a field or a dialog.
         on_zoom: called with {low, high, recording} after zooming into thinned curves.
     """
@@ -63,15 +63,15 @@ class ReviewPlot(Element, component="review_plot.js"):
         thinned: bool = False,
         keep: bool = False,
     ) -> None:
-        """Plot another set of curves.
+        """Replace the plotted curves.
 
         Args:
-            identity: id sent back with every click and key.
+            identity: id that is sent back with every click and key.
             label: text alternative.
-            lanes: (position, name) that replace the numbers of the y-axis.
+            lanes: pairs (position, name) that replace the numbers of the y-axis.
             limits: range of the y-axis.
             marks: vertical lines with ``x``, ``label``, ``stroke`` and ``dash``.
-            cut: shaded ranges (from, to).
+            cut: ranges (from, to) to shade because they are trimmed off.
             keep: whether to keep the zoom if the recording is the same.
         """
         plot = {"id": identity, "label": label, "data": [x, *curves], "series": series, "from": x[0] if x else 0.0}
@@ -81,7 +81,7 @@ class ReviewPlot(Element, component="review_plot.js"):
     def remark(
         self, identity: str, marks: Sequence[dict[str, Any]], cut: Sequence[tuple[float, float]], label: str
     ) -> None:
-        """Move the marks of the plotted recording."""
+        """Replace the marks, shaded ranges and text alternative of the plotted recording."""
         self.run_method("remark", identity, marks, cut, label)
 
     def zoom(self, factor: float) -> None:
@@ -94,7 +94,7 @@ _GREY = "#8a9099"
 
 
 class GestureOverlayView:
-    """The overlay of one gesture; a click on a curve or a name opens the recording."""
+    """View that overlays the recordings of one gesture; a click on a curve or a name opens the recording."""
 
     def __init__(self, desk: ReviewController) -> None:
         self.desk = desk
@@ -124,7 +124,7 @@ class GestureOverlayView:
         self.draw()
 
     def draw(self) -> None:
-        """Plot the gesture; a gesture chosen in the filter replaces the one displayed."""
+        """Plot the gesture; if the filter specifies a gesture, switch to that one."""
         desk = self.desk
         if desk.filter.gesture and desk.filter.gesture != self._gesture:
             self._gesture = desk.filter.gesture
@@ -180,7 +180,7 @@ class GestureOverlayView:
                 ui.label(words("review.more_outliers", n=len(outliers) - _MAX_OUTLIERS)).classes("ps-dim")
 
     async def picked(self, event: dict[str, Any]) -> None:
-        """Open the recording whose curve is nearest to a click."""
+        """Open the recording whose curve is nearest to the click."""
         if self._overlay is not None and (nearest := self._overlay.nearest(float(event["x"]), float(event["y"]))):
             await self.desk.open(nearest)
 
@@ -199,8 +199,8 @@ KEYS = (
     ("u", "undo"),
     ("+ − 0", "zoom"),
 )
-"""Keyboard commands: the keys, and the key of the text that describes them."""
-# The commands for recordings that cannot be trimmed.
+"""Keyboard commands: pairs of the keys to press and the key of the text that describes the command."""
+# Commands available for recordings that cannot be trimmed.
 _PLAIN = ("accept", "back", "pass", "exclude", "undo", "zoom")
 _SET, _DRAFT = "--ps-set", "--ps-draft"
 _STEPS = {"ArrowLeft": -1, "ArrowRight": 1, ",": -10, "<": -10, ";": -10, ".": 10, ">": 10, ":": 10}
@@ -209,7 +209,7 @@ _DASHES: tuple[list[int], ...] = ([], [7, 4], [2, 3])
 
 
 class RecordingView:
-    """The view of one recording: signals, marks, findings and actions."""
+    """View of one recording: its signals, marks, findings and actions."""
 
     def __init__(self, desk: ReviewController) -> None:
         self.desk = desk
@@ -257,7 +257,7 @@ class RecordingView:
             self._button("undo", desk.undo, "undo")
 
     def _marks(self) -> None:
-        """Build the controls that set marks without the plot or the keyboard."""
+        """Build the buttons that set start and stop, as an alternative to the plot and the keyboard."""
         words = self.desk.words
         with ui.row().classes("w-full items-center gap-2"):
             side = ui.toggle({START: words("review.sets_start"), STOP: words("review.sets_stop")}, value=START)
@@ -289,7 +289,7 @@ class RecordingView:
     # Drawing ------------------------------------------------------------------------------------------------------
 
     def draw(self, *, keep: bool = False, low: float | None = None, high: float | None = None) -> None:
-        """Plot the current recording."""
+        """Plot the current recording, with all rows from ``low`` to ``high`` seconds if these are given."""
         desk, words = self.desk, self.desk.words
         identity = desk.current
         self._drawn = None
@@ -322,7 +322,7 @@ class RecordingView:
         self.refresh()
 
     def refresh(self) -> None:
-        """Update marks, state and findings of the current recording; its curves stay."""
+        """Update the marks, state and findings of the current recording, but not its curves."""
         desk, words, review = self.desk, self.desk.words, self.desk.review
         row = review.rows.get(desk.current)
         if row is None or not review.is_read(row.id):
@@ -367,7 +367,7 @@ class RecordingView:
         return f"{row.id}, {words.gesture(row.info.gesture)}, {words(f'review.state_{row.state}')}. {self._about()}"
 
     def _lines(self) -> list[dict[str, Any]]:
-        """Return the vertical lines: suggestions dotted, drafts and marks solid."""
+        """Return the vertical lines to plot: dotted for suggestions, solid for drafts and marks."""
         desk, words, review = self.desk, self.desk.words, self.desk.review
         if review.is_labelled:
             return []
@@ -435,7 +435,7 @@ class RecordingView:
         elif key == "u":
             await desk.undo()
         elif event["recording"] != desk.current:
-            # Another recording is displayed by now: the key was not meant for it.
+            # Another recording is displayed now, for which the key was not meant.
             return
         elif key == "Enter":
             await self.accept(str(event["recording"]))
@@ -451,7 +451,7 @@ class RecordingView:
             self.step(_STEPS[key], shift)
 
     def picked(self, event: dict[str, Any]) -> None:
-        """Set the start or the stop at a click in the plot."""
+        """Set the start or the stop to the row nearest to the click in the plot."""
         desk = self.desk
         if event["recording"] != desk.current or desk.review.is_labelled:
             return
@@ -461,7 +461,7 @@ class RecordingView:
             self._set(**{STOP if stop else START: row})
 
     def step(self, by: int, stop: bool) -> None:
-        """Move the start or the stop by some rows."""
+        """Move the start, or with ``stop`` the stop, by ``by`` rows."""
         with self.desk.page.show_errors():
             start, end = self.desk.review.kept_rows(self.desk.current, self.desk.ends)
             self._set(**{STOP: end + by} if stop else {START: start + by})
@@ -474,7 +474,7 @@ class RecordingView:
         self.refresh()
 
     async def accept(self, recording: str = "") -> None:
-        """Mark the displayed trim as accepted and go to the next recording."""
+        """Accept the displayed start and stop, and go to the next recording."""
         desk = self.desk
         identity = recording or desk.current
         if desk.review.is_labelled:
@@ -511,6 +511,6 @@ class RecordingView:
         self.draw(keep=True)
 
     def zoomed(self, event: dict[str, Any]) -> None:
-        """Plot a long recording again with all rows of the visible range."""
+        """Plot a thinned recording again, with all rows of the visible range."""
         if event["recording"] == self.desk.current:
             self.draw(keep=True, low=float(event["low"]), high=float(event["high"]))

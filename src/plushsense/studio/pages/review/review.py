@@ -1,7 +1,7 @@
-"""The review of a data set: states of its recordings, drafts, and decisions with undo.
+"""Manage the review of a data set: states of its recordings, drafts, and decisions with undo.
 
-All pages share one `Review` of a data set. Rows that were set but not accepted are a draft, which a reload or a second
-tab displays, too. Every decision is written as a mark at once.
+All pages share one `Review` per data set. A start or stop that was set but not yet accepted is a draft, which other
+tabs display too and which survives a reload. Every decision is written immediately as a mark.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ DECIDED = (ACCEPTED, ADJUSTED, EXCLUDED)
 
 @dataclass(frozen=True)
 class ReviewedRecording:
-    """A recording in the review table."""
+    """A recording as listed in the review table."""
 
     info: RecordingInfo
     state: str
@@ -64,23 +64,23 @@ class ReviewedRecording:
 
     @property
     def open(self) -> list[Finding]:
-        """Findings of errors and warnings that nobody accepted."""
+        """Errors and warnings that have not been accepted."""
         return [f for f in self.findings if not f.accepted and f.severity != "info"]
 
     @property
     def worst(self) -> str:
-        """Severity of the most urgent finding that nobody accepted, or ""."""
+        """Severity of the most urgent finding that has not been accepted, or ""."""
         return min((f.severity for f in self.findings if not f.accepted), key=SEVERITIES.index, default="")
 
     @property
     def done(self) -> bool:
-        """True if no decision about the recording is open."""
+        """True if the recording needs no further decision."""
         return self.state in DECIDED or (self.state == LABELLED and not self.open)
 
 
 @dataclass(frozen=True)
 class ReviewDecision:
-    """A decision of a browser tab, with the marks of the recording before and after it."""
+    """A decision made in a browser tab, with the state of the marks before and after it."""
 
     recording: str
     action: str
@@ -106,8 +106,8 @@ _MAX_VISITS = 50
 class Review:
     """A data set under review, shared by all pages.
 
-    Methods may be called from any thread; those that read files may take seconds. `changed` is notified of each change,
-    and ``version`` counts the changes.
+    Methods may be called from any thread; those that read files may take seconds. Each change notifies `changed` and
+    increases ``version``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -138,7 +138,7 @@ class Review:
         self.prepared.close()
 
     def renew(self) -> None:
-        """Read recordings added since the last call, and check again if decisions were made since the last check."""
+        """Read the data set again if files were added; repeat the checks if files or decisions are new."""
         with self._lock:
             now = current_stamp(self.path)
             new = now | {"marks": ""} != self._stamp | {"marks": ""}
@@ -151,13 +151,13 @@ class Review:
 
     @property
     def is_labelled(self) -> bool:
-        """True if the recordings are cut from labels, so that they cannot be trimmed."""
+        """True if labels define where recordings start and stop, so that they cannot be trimmed."""
         return self.dataset.layout.is_labelled
 
     # Marks and findings -------------------------------------------------------------------------------------------
 
     def look(self) -> None:
-        """Read marks that other programs wrote, and notify subscribers if there are any.
+        """Read marks written by other programs, and notify subscribers if there are new ones.
 
         Raises:
             DatasetError: if the file of marks is invalid.
@@ -178,17 +178,17 @@ class Review:
         return self._standing.get(identity, MarkState())
 
     def as_marked(self) -> Dataset:
-        """Return the data set with the current marks, as an object for use in another thread."""
+        """Return a copy of the data set with the current marks applied, for use in another thread."""
         bare = [replace(r, start=0, stop=r.rows, excluded=False) for r in self.dataset.recordings]
         return Dataset(self.path, self.dataset.head, apply_marks(bare, dict(self._standing)), self.dataset.streams)
 
     def check(self) -> None:
-        """Start the checks again in the background."""
+        """Start to repeat the checks in the background."""
         self.prepared.begin(self.as_marked())
 
     @property
     def unchecked(self) -> int:
-        """Number of recordings decided since their last check."""
+        """Number of recordings whose trim or exclusion has changed since the last check."""
         checked = self.prepared.checked
         if checked is None:
             return 0
@@ -197,7 +197,7 @@ class Review:
 
     @property
     def rows(self) -> dict[str, ReviewedRecording]:
-        """Recordings by id in the order of the index; the same dictionary until something changes."""
+        """Recordings by id, in the order of the index; the same dictionary object until something changes."""
         with self._lock:
             source = (self.version, id(self.prepared.checked), len(self.prepared.shapes), id(self.dataset))
             if source != self._rows_source:
@@ -260,7 +260,7 @@ class Review:
     # One recording ------------------------------------------------------------------------------------------------
 
     def signals(self, identity: str) -> RecordingSignals:
-        """Read the signals of a recording; the last 48 are cached."""
+        """Return the signals of a recording; those read last are cached."""
         self.prepared.step_back()
         info = self.info(identity)
         cached = self._read.get(identity)
@@ -278,25 +278,25 @@ class Review:
         return identity in self._read
 
     def trim(self, identity: str) -> trim.Trim:
-        """Return the suggestion (an empty one until it is computed) and the marks of a recording."""
+        """Return the marks of a recording and its suggestion, which is empty until it has been computed."""
         info = self.info(identity)
         empty = Suggestion(0, info.rows, False, False, 0.0, 0.0, 1.0)
         suggestion = self.prepared.suggestions.get(identity, empty)
         return trim.Trim(info, suggestion, self.standing(identity), self.signals(identity).seconds)
 
     def draft(self, identity: str) -> tuple[int, int] | None:
-        """Return the rows (start, stop) that are set but not accepted yet."""
+        """Return the rows (start, stop) that were set but not yet accepted, or None."""
         return self._drafts.get(identity)
 
     def kept_rows(self, identity: str, ends: bool = False) -> tuple[int, int]:
-        """Return the rows that `accept` would keep: the draft, else the marked rows, else the suggestion."""
+        """Return the rows (start, stop) to keep: those of the draft, else the marks, else the suggestion."""
         return self._drafts.get(identity) or self.trim(identity).current_rows(ends)
 
     def set(self, identity: str, start: int | None = None, stop: int | None = None, ends: bool = False) -> None:
-        """Set the start or the stop of the draft to a row, limited to the recording.
+        """Set the start or stop of the draft to a row; rows outside the recording are moved to its edge.
 
         Raises:
-            DatasetError: if the start is not before the stop, or the recording cannot be trimmed.
+            DatasetError: if the start is not before the stop, or the recording is excluded or cannot be trimmed.
         """
         info = self.info(identity)
         if self.is_labelled:
@@ -317,7 +317,7 @@ class Review:
         self._changed()
 
     def drop(self, identity: str) -> bool:
-        """Discard a draft, and return whether there was one."""
+        """Discard the draft of a recording, and return whether there was one."""
         with self._lock:
             dropped = self._drafts.pop(identity, None) is not None
         if dropped:
@@ -327,7 +327,7 @@ class Review:
     # Decisions ----------------------------------------------------------------------------------------------------
 
     def _decide(self, visit: str, about: str, action: str, make: Callable[[], object], check: str = "") -> bool:
-        """Write marks, remember how to undo them, and return whether the state changed."""
+        """Call ``make`` to write marks, store how to undo them, and return whether the state changed."""
         with self._lock:
             self._standing = self._marks.states()
             before = self.standing(about)
@@ -344,13 +344,13 @@ class Review:
         return now != before
 
     def accept(self, visit: str, identity: str, who: str, ends: bool = False) -> bool:
-        """Mark the rows to keep, and return False if there is nothing to mark.
+        """Mark the draft or the suggested rows as the rows to keep; return whether the marks changed.
 
-        Suggested rows are marked as suggested. Without a visible or a set start, the whole recording is marked as set
-        by hand.
+        Rows that equal the suggestion are marked as accepted suggestion, all others as set by hand. Without a draft or
+        a suggested start, the whole recording is kept.
 
         Raises:
-            DatasetError: if the marks cannot be written, or the suggestion is still being computed.
+            DatasetError: if the marks cannot be written, or the suggestion has not been computed yet.
         """
         with self._lock:
             current, draft = self.trim(identity), self._drafts.get(identity)
@@ -377,7 +377,7 @@ class Review:
         return changed
 
     def exclude(self, visit: str, identity: str, who: str, why: str) -> bool:
-        """Exclude a recording; raise ConfigError without a reason."""
+        """Exclude a recording; raise ConfigError if the reason ``why`` is empty."""
         return self._mark(visit, Mark(self.info(identity).id, "exclude", who, _check_reason(why)))
 
     def include(self, visit: str, identity: str, who: str) -> bool:
@@ -385,11 +385,11 @@ class Review:
         return self._mark(visit, Mark(self.info(identity).id, "include", who))
 
     def untrim(self, visit: str, identity: str, who: str) -> bool:
-        """Remove a trim, so that the suggestion applies again."""
+        """Remove the trim marks of a recording, so that the suggestion applies again."""
         return self._mark(visit, Mark(self.info(identity).id, "untrim", who))
 
     def accept_finding(self, visit: str, finding: Finding, who: str, why: str) -> bool:
-        """Mark a finding as known and harmless; raise ConfigError without a reason."""
+        """Mark a finding as known and harmless; raise ConfigError if the reason ``why`` is empty."""
         return self._mark(visit, Mark(finding.about, "accept", who, _check_reason(why), check=finding.check))
 
     def reopen_finding(self, visit: str, finding: Finding, who: str) -> bool:
@@ -409,14 +409,14 @@ class Review:
         return self._decide(visit, mark.recording, mark.action, partial(append_marks, self.path, [mark]), mark.check)
 
     def history(self, visit: str) -> Sequence[ReviewDecision]:
-        """Return the decisions of a browser tab that can be undone, the oldest first."""
+        """Return the decisions of a browser tab that can be undone, oldest first."""
         return tuple(self._histories.get(visit, ()))
 
     def undo(self, visit: str, who: str, why: str = "") -> ReviewDecision | None:
-        """Undo the last decision of a browser tab by a new mark; return None if there is none.
+        """Undo the last decision of a browser tab by writing the inverse mark; return None if there is none.
 
         Raises:
-            DatasetError: if there is a newer decision; that one stays, and older ones can be undone.
+            DatasetError: if the mark was changed elsewhere since. It stays, and the next call undoes an older decision.
         """
         with self._lock:
             history = self._histories.get(visit)
@@ -439,14 +439,14 @@ class Review:
     # Overlay ------------------------------------------------------------------------------------------------------
 
     def overlay(self, gesture: str) -> GestureOverlay:
-        """Return the overlay of all used recordings of a gesture, with the checks that flagged some."""
+        """Return the overlay of all recordings of a gesture that are not excluded; name the checks that flag them."""
         curves = []
         for identity, row in self.rows.items():
             shape = self.prepared.shapes.get(identity)
             if row.info.gesture != gesture or row.state == EXCLUDED or shape is None:
                 continue
             standing = self.standing(identity)
-            # Even steps are accurate enough for a plot, and no file is read.
+            # Assume evenly spaced rows: this is accurate enough for a plot and needs no file access.
             per_row = shape.seconds / max(1, row.info.rows)
             stop = row.info.rows if standing.stop < 0 else standing.stop
             odd = dict.fromkeys(f.check for f in row.open if f.check in ODD)
@@ -465,7 +465,7 @@ _MAX_ADDRESS = 1500
 
 
 class Reviews:
-    """The reviews of the studio, one for each data set, and stored selections of recordings."""
+    """Service that provides the reviews, one per data set, and stores selections of recordings."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
@@ -474,10 +474,10 @@ class Reviews:
         self._opened: OrderedDict[Path, Review] = OrderedDict()
 
     def open(self, path: str | os.PathLike[str]) -> Review:
-        """Open the review of a data set inside the folders of the studio; may take seconds.
+        """Open or update the review of a data set; this may take seconds.
 
         Raises:
-            ConfigError: for a folder outside the studio. DatasetError: for a folder that is no valid data set.
+            ConfigError: for a folder outside the studio. DatasetError: if the folder is not a valid data set.
         """
         place = self._workspace.inside(path)
         with self._lock:
@@ -498,7 +498,7 @@ class Reviews:
             review.close()
 
     def address(self, dataset: Path, recordings: Sequence[str], title: str = "") -> str:
-        """Return the address of the review page for a selection of recordings; ``title`` stands above the table.
+        """Return the address of the review page for a selection of recordings; the page displays ``title``.
 
         A long list is stored in ``<home>/selections/`` under its hash, so that the address stays short and valid.
         """
@@ -513,7 +513,7 @@ class Reviews:
         return f"/review?{urlencode({'dataset': str(dataset), 'selection': key})}"
 
     def selection(self, key: str) -> tuple[str, list[str]]:
-        """Read a stored selection: its title and the ids; raise ConfigError for an unknown key."""
+        """Return the title and the recording ids of a stored selection; raise ConfigError for an unknown key."""
         try:
             if not key.isalnum():
                 raise ValueError

@@ -1,8 +1,8 @@
-"""Signals, deviation curves and overlays of recordings, and the background thread that prepares a review.
+"""Compute signals, deviation curves and overlays of recordings, and prepare a review in a background thread.
 
-Trim suggestions and deviation shapes depend only on raw files. They are cached in the folder ``cache/`` of the data
-set, which may be deleted, is not part of backups, and is emptied when a person is forgotten. Findings also depend on
-the marks and are computed again on request.
+Trim suggestions and deviation shapes depend only on the raw files. They are cached in the folder ``cache/`` of the
+data set, which may be deleted, is not part of backups, and is emptied when a person's data are erased. Findings also
+depend on the marks; they are not cached but computed again on request.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from plushsense.studio.app.workspace import ChangeSignal
 
 ALL, ACTIVITY = "all", "activity"
 BEFORE_S = 2.0
-"""Seconds of the stream plotted before a recording."""
+"""Length of the part of the stream plotted before a recording, in seconds."""
 _POINTS = 3000
 _LANE = 2.1
 _GRID = 240
@@ -44,14 +44,14 @@ _GRID = 240
 
 @dataclass(frozen=True)
 class RecordingSignals:
-    """The signals of one whole recording.
+    """The signals of one untrimmed recording of T rows.
 
     Attributes:
-        seconds: (T + 1,) device clock since the first row, at each row and at the end.
-        at: (K + T,) seconds of ``values``.
-        values: (K + T, C) in the units of the channels, NaN for invalid values; the first K rows precede the
+        seconds: (T + 1,) time by the device clock since the first row, of each row and of the end.
+        at: (K + T,) times of the rows of ``values``, in seconds.
+        values: (K + T, C) values in the units of the C channels, NaN if invalid; the first K rows precede the
             recording in its stream.
-        activity: (T,) deviation of all channels from rest, typically 1; NaN while the scale is unknown.
+        activity: (T,) deviation of all channels from rest, where 1 is typical; NaN while the scale is unknown.
     """
 
     info: RecordingInfo
@@ -67,13 +67,13 @@ class RecordingSignals:
         return np.asarray(self.values - np.nanmedian(np.where(whole, 0.0, self.values), axis=0))
 
     def row_at(self, second: float) -> int:
-        """Return the row nearest to a time, or T for the end."""
+        """Return the row nearest to a time; T means the end of the recording."""
         return int(np.abs(self.seconds - second).argmin())
 
     def curves(self, group: str, low: float | None = None, high: float | None = None) -> dict[str, Any]:
-        """Return the curves of a group from ``low`` to ``high`` seconds, thinned to at most 3000 rows.
+        """Return the curves of a group from ``low`` to ``high`` seconds, thinned to about 3000 points.
 
-        Channels of several kinds are plotted in lanes above each other, scaled by the largest deviation of each kind.
+        If there are several kinds of channels, each kind has its own lane and is scaled by its largest deviation.
 
         Returns:
             A dictionary with ``x``, ``curves`` (None for a gap), ``names``, ``unit`` ("" for scaled values),
@@ -97,7 +97,7 @@ class RecordingSignals:
         if low is not None and high is not None:
             first, last = np.searchsorted(at, (low, high))
             part = slice(max(0, int(first) - 1), int(last) + 1)
-            # Keep both ends, so that the plot can zoom out to the whole recording.
+            # Keep the first and last row, so that the plot can zoom out to the whole recording.
             keep = np.unique(np.r_[0, np.arange(len(at))[part], len(at) - 1])
             at, table = at[keep], table[keep]
         thinned = len(at) > _POINTS
@@ -134,14 +134,14 @@ def read_signals(dataset: Dataset, info: RecordingInfo, scale: NDArray[np.float6
 
 
 def _before(dataset: Dataset, info: RecordingInfo, frames: Frames) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the stream rows just before a recording, back to the last gap, and their negative seconds."""
+    """Return the stream rows of the last `BEFORE_S` before a recording, but none before a gap, and their times < 0."""
     nothing = frames.values[:0], np.empty(0)
     if info.stream_row <= 0 or not len(frames):
         return nothing
     stream = dataset.read_stream(info.stream)
     many = int(np.ceil(BEFORE_S * max(info.rate_hz, 1.0)))
     past = stream.slice(max(0, info.stream_row - many), info.stream_row)
-    # Use the clock of the stream: a recording that holds only delays begins at 0.
+    # Use the clock of the stream, because the clock of a recording stored as delays begins at 0.
     clock = np.append(past.device_ms, stream.device_ms[info.stream_row])
     steps = np.diff(clock)
     broken = np.flatnonzero((steps < 0) | (steps > max(dataset.layout.gap_ms, 3000 / max(info.rate_hz, 1.0))))
@@ -150,7 +150,7 @@ def _before(dataset: Dataset, info: RecordingInfo, frames: Frames) -> tuple[NDAr
 
 
 def _thinned(at: NDArray[np.float64], table: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Keep the lowest and the highest value of each channel per block of rows, and the last row."""
+    """Reduce each block of rows to the lowest and highest value of each channel; keep the last row."""
     size = -(-len(at) // (_POINTS // 2))
     whole = len(at) // size * size
     blocks = table[:whole].reshape(-1, size, table.shape[1])
@@ -172,7 +172,7 @@ def _plain(column: NDArray[np.float64]) -> list[float | None]:
 
 @dataclass(frozen=True)
 class DeviationCurve:
-    """A recording in an overlay: ``size`` (N,) at even steps over ``seconds``; ``why`` names flagging checks."""
+    """A recording in an overlay: deviations ``size`` (N,), evenly spaced over ``seconds``; ``why`` names its flags."""
 
     recording: str
     seconds: float
@@ -190,7 +190,7 @@ def trimmed_curve(identity: str, shape: DeviationShape, start_s: float, stop_s: 
 
 @dataclass(frozen=True)
 class GestureOverlay:
-    """Recordings of a gesture on one time axis ``x`` (G,), with one curve (G,) for each recording."""
+    """Recordings of a gesture on a common time axis ``x`` (G,); ``curves`` (R, G) has one row per recording."""
 
     drawn: tuple[DeviationCurve, ...]
     x: NDArray[np.float64]
@@ -198,7 +198,7 @@ class GestureOverlay:
 
     @property
     def top(self) -> float:
-        """Upper limit of the y-axis, from high percentiles so that one outlier does not flatten the others."""
+        """Upper limit of the y-axis, computed from percentiles so that one outlier does not flatten the others."""
         heights = [float(np.percentile(c.size, 99.5)) for c in self.drawn if len(c.size)]
         return 1.25 * float(np.percentile(heights, 98)) if heights else 1.0
 
@@ -215,10 +215,10 @@ class GestureOverlay:
 
 
 def build_overlay(curves: Sequence[DeviationCurve]) -> GestureOverlay:
-    """Put curves onto one time axis, with flagged recordings last so that they are drawn on top."""
+    """Resample curves to a common time axis; flagged recordings come last, so that they are drawn on top."""
     drawn = tuple(sorted((c for c in curves if len(c.size) > 1), key=lambda c: bool(c.why)))
     lengths = np.array([c.seconds for c in drawn]) if drawn else np.ones(1)
-    # A recording that was never stopped would compress all others.
+    # Limit the axis, because a recording that was never stopped would compress all others.
     end = min(float(lengths.max()), 4.0 * float(np.median(lengths))) or 1.0
     x = np.linspace(0.0, end, _GRID)
     table = [np.interp(x, np.linspace(0.0, c.seconds, len(c.size)), c.size, right=np.nan) for c in drawn]
@@ -227,25 +227,25 @@ def build_overlay(curves: Sequence[DeviationCurve]) -> GestureOverlay:
 
 CACHE_FILE = "review.json"
 FULL = 1000
-"""Value of `DeviationShape.size` at the typical deviation."""
+"""Value in `DeviationShape.size` that stands for a typical deviation."""
 _BATCH = 25
-# Shortest time between two notifications of progress.
+# Minimum time between two notifications of progress.
 _NOTIFY_S = 0.3
-# Pauses between two recordings, so that pages get the interpreter; longer while a page was used in the last seconds.
+# Pauses after each recording, so that other threads can run; longer for `_BUSY_S` after a page was used.
 _PAUSE_S = 0.0005
 _LONG_PAUSE_S = 0.015
 _BUSY_S = 1.5
 
 
 class _Closed(Exception):
-    """Raised in the worker thread when the studio closes."""
+    """Raised in the background thread when the review closes."""
 
 
 @dataclass(frozen=True)
 class DeviationShape:
-    """The deviation of a whole recording from rest, in a few points.
+    """The deviation of an untrimmed recording from rest, reduced to a few points.
 
-    ``size`` (≤ 160,): deviation of all channels from rest, `FULL` where it is typical, at even steps over ``seconds``.
+    ``size`` (at most 160 points): deviation of all channels, where `FULL` is typical, evenly spaced over ``seconds``.
     """
 
     seconds: float
@@ -254,11 +254,11 @@ class DeviationShape:
 
 @dataclass
 class ReviewPreparation:
-    """Results computed so far by one background thread.
+    """Background thread that prepares a review, and its results so far.
 
     Attributes:
-        scale: (C,) typical deviation of each channel; empty until it is known.
-        progress: (step, done, total), or None if nothing runs; ``step`` is "suggestions" or "checks".
+        scale: (C,) typical deviation of each channel; empty until it has been computed.
+        progress: (step, done, total), or None if the thread is idle; ``step`` is "suggestions" or "checks".
         message: error message of the last run, or "".
     """
 
@@ -277,9 +277,9 @@ class ReviewPreparation:
     _used_s: float = 0.0
 
     def begin(self, dataset: Dataset) -> None:
-        """Start computing missing results and checking ``dataset`` with its marks; return at once.
+        """Start to compute missing results and to check ``dataset`` with its marks, in the background.
 
-        A call during a run starts another run after it.
+        If a run is in progress, another run with the latest ``dataset`` follows it.
         """
         with self._lock:
             if self._thread is not None and self._thread.is_alive():
@@ -289,16 +289,16 @@ class ReviewPreparation:
             self._thread.start()
 
     def step_back(self) -> None:
-        """Slow the background thread for a while, because a page needs the interpreter."""
+        """Slow the background thread down for a while, so that pages respond quickly."""
         self._used_s = time.monotonic()
 
     def wait(self, seconds: float) -> None:
-        """Wait until the background thread is done, at most ``seconds``."""
+        """Wait until the background thread has ended, but at most ``seconds``."""
         if self._thread is not None:
             self._thread.join(seconds)
 
     def close(self) -> None:
-        """Stop the background thread and wait for it."""
+        """Stop the background thread and wait a few seconds for its end."""
         self._closed = True
         self.wait(5.0)
 
@@ -375,7 +375,7 @@ class ReviewPreparation:
             for identity, key in keys.items()
         }
         content = json.dumps({"made_by": _made_by(), "scale": self.scale.tolist(), "recordings": recordings})
-        # On a disk that cannot be written, everything is computed again each time.
+        # If the cache cannot be written, the results are computed again each time.
         with contextlib.suppress(OSError, ForgottenError), dataset.generation.writing():
             (dataset.path / CACHE).mkdir(exist_ok=True)
             write_file(dataset.path / CACHE / CACHE_FILE, content)
@@ -396,6 +396,6 @@ def _made_by() -> str:
 
 
 def _key(r: RecordingInfo) -> str:
-    """Return a hash of everything that a trim suggestion depends on."""
+    """Return a hash of everything in the index on which a trim suggestion depends."""
     source = repr((r.sha256, r.first_row, r.rows, r.gesture, r.stream, r.stream_row))
     return hashlib.sha256(source.encode()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""The table of recordings and the list of findings about sessions, people and the data set."""
+"""Build the table of recordings and the list of findings about sessions, people and the data set."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from plushsense.studio.pages.review.review import ReviewedRecording
 
 
 class ReviewTable(Element, component="review_table.js"):
-    """Browser component that displays rows of recordings.
+    """Browser component that displays a table of recordings.
 
     Args:
         words: the texts of the page.
-        on_sort: called with the key of a column.
-        on_open: called with the id of a recording.
+        on_sort: called with the key of a column to sort by.
+        on_open: called with the id of a recording to open.
     """
 
     def __init__(self, words: Words, on_sort: Callable[[str], Any], on_open: Callable[[str], Any]) -> None:
@@ -33,7 +33,7 @@ class ReviewTable(Element, component="review_table.js"):
         self.on("open", lambda event: on_open(str(event.args)))
 
     def show(self, rows: list[dict[str, Any]], sort: str, down: bool, current: str) -> None:
-        """Display rows, each with the texts of the columns, ``findings``, ``points`` and ``kept``."""
+        """Display rows, each made by `RecordingTableView._cells`."""
         self._props.update({"rows": rows, "sort": sort, "down": down, "current": current})
         self.update()
 
@@ -44,12 +44,12 @@ _ACCEPTING = ("looked", "person", "known")
 
 
 def finding_text(words: Words, finding: Finding) -> str:
-    """Return a short text for a finding: sign, severity and check."""
+    """Return a short text for a finding: its sign, severity and check."""
     return f"{SEVERITY_SIGNS[finding.severity]} {words(f'review.severity_{finding.severity}')}: {finding.check}"
 
 
 def finding_button(desk: ReviewController, finding: Finding, recording: str = "") -> ui.button:
-    """Add the button that accepts a finding, or reopens an accepted one, while ``recording`` is displayed."""
+    """Add a button that accepts or reopens a finding; with ``recording``, it works only while that is displayed."""
 
     async def reopen() -> None:
         await desk.decide(recording or desk.current, lambda: desk.review.reopen_finding(desk.visit, finding, desk.name))
@@ -59,7 +59,7 @@ def finding_button(desk: ReviewController, finding: Finding, recording: str = ""
 
 
 def ask_reason(desk: ReviewController, finding: Finding | None = None) -> None:
-    """Open a dialog for a reason, then exclude the displayed recording or accept the finding."""
+    """Ask for a reason in a dialog; then accept ``finding``, or exclude the displayed recording if it is None."""
     words, recording = desk.words, desk.current
     if finding is None:
         title = words("review.why_exclude", id=recording)
@@ -80,7 +80,7 @@ def ask_reason(desk: ReviewController, finding: Finding | None = None) -> None:
             await desk.decide(recording, lambda: review.accept_finding(visit, finding, desk.name, why))
 
     with desk.page_slot, ui.dialog() as dialog:
-        # Close without a transition, because the next key is a command of the page again.
+        # Close without a transition, because the next key press is a command of the page again.
         dialog.props(f'aria-label="{words("review.reason")}" transition-duration=0')
         with tag(ui.card().classes("w-full"), "reason"):
             ui.label(title).classes("text-lg font-bold").style("overflow-wrap: anywhere")
@@ -112,7 +112,7 @@ SIGNS = {
     "excluded": "✕",
     "labelled": "▤",
 }
-"""Sign of each state; the word follows it."""
+"""Sign of each state, displayed before its name."""
 
 
 class RecordingTableView:
@@ -204,7 +204,7 @@ class RecordingTableView:
                     finding_button(desk, f)
 
     def turn(self, by: int) -> None:
-        """Move by some pages of the table."""
+        """Move by ``by`` pages of the table."""
         self.desk.first_row += by * PER_PAGE
         self.draw()
 

@@ -1,4 +1,4 @@
-"""The jobs of the train page: requests from the form, cards with progress and curves, and a list of earlier jobs."""
+"""Handle jobs of the train page: requests from the form, cards with progress and curves, a list of earlier jobs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PAPER = "paper"
 GRIDS = "grids"
 SPLITS = ("leave-one-subject-out", "by-subject:5", "by-recording:5", "windows:5", "windows:holdout")
 
-# Settings of `train` and `evaluate` in the form; each is an option of the command of the same name.
+# Settings of `train` and `evaluate` in the form; the commands have options with the same names.
 _SETTINGS = ("preset", "context", "arch", "filters", "padding", "norm", "classes", "epochs", "batch", "seed", "device")
 _CHANGES = ("split", "epochs", "batches", "architectures", "filters", "padding", "context", "classes", "device")
 _LIMITS = ("max_parameters", "max_state_bytes", "max_macs_per_step")
@@ -53,35 +53,35 @@ class JobRequest:
 
     @property
     def dry(self) -> dict[str, Any]:
-        """The spec of an estimate of its cost."""
+        """The spec of a job that only estimates the cost of this one."""
         return {**self.spec, "dry": True}
 
     @property
     def key(self) -> str:
-        """A text that is equal for equal jobs."""
+        """Text that identifies the job; it is equal for jobs that differ only in the output file."""
         return json.dumps([self.task, {k: v for k, v in self.spec.items() if k != "out"}], sort_keys=True)
 
 
 def grids(workspace: Workspace) -> list[Path]:
-    """List the TOML files with grids in the home folder and in its `GRIDS` folder."""
+    """List the TOML files of grids in the studio's folder and in its subfolder `GRIDS`."""
     return sorted([*workspace.folder.glob("*.toml"), *(workspace.folder / GRIDS).glob("*.toml")])
 
 
 def free_name(workspace: Workspace, jobs: Jobs, name: str) -> str:
-    """Return a name for a bundle that neither a file nor a running job uses."""
+    """Return a name for a bundle, based on ``name``, that no file and no running job uses."""
     reserved = {Path(job.spec["out"]).stem for job in jobs.all(TRAIN) if job.state == RUNNING and "out" in job.spec}
     plain = "".join(c for c in name if c.isalnum() or c in " _-").strip()[:50] or "model"
     return workspace.free_name(BUNDLES, plain, ".plush", separator=" ", taken=reserved)
 
 
 def job_request(workspace: Workspace, jobs: Jobs, form: Mapping[str, Any]) -> JobRequest:
-    """Convert the fields of the form into a job; empty fields are left out.
+    """Convert the fields of the form into a job; leave out empty fields.
 
     Args:
-        form: ``kind``, ``dataset``, and the fields of that kind under the names of the command-line options.
+        form: ``kind``, ``dataset``, and the fields of that kind, named like the command-line options.
 
     Raises:
-        ConfigError: for a folder outside the studio, a name in use, or invalid settings.
+        ConfigError: for a folder outside the studio, a name in use, invalid settings, or a job that is already running.
     """
     kind = form["kind"]
     if not form.get("dataset"):
@@ -165,7 +165,7 @@ def _of_grid(workspace: Workspace, kind: str, dataset: Path, given: Mapping[str,
 
 
 def _whole(name: str, value: Any, least: int) -> int:
-    """Return the value if it is an integer of at least ``least``; raise ConfigError otherwise."""
+    """Return ``value`` if it is an integer of at least ``least``; otherwise raise ConfigError."""
     if not isinstance(value, int) or value < least:
         raise ConfigError(f"{name} is {value!r}: give a whole number of at least {least}.")
     return value
@@ -189,7 +189,7 @@ LOSS, ACCURACY, BEST = "loss", "accuracy", "best"
 
 
 class ProgressChart(NamedTuple):
-    """Data of one progress plot: ``x`` and one line for each of ``names``; None is a gap."""
+    """Data of one progress plot: ``x`` and a line of y values for each of ``names``, where None is a gap."""
 
     what: str
     names: tuple[str, ...]
@@ -198,7 +198,7 @@ class ProgressChart(NamedTuple):
 
 
 def progress_charts(job: StudioJob) -> list[ProgressChart]:
-    """Return the plots of a job, always the same ones for a task; they are empty at first."""
+    """Return the progress plots of a job; their number depends only on its task, and they are empty at first."""
     if job.task == "train":
         return _of_one(job.reports)
     if job.task == "evaluate":
@@ -232,7 +232,7 @@ def _by_fold(reports: Sequence[dict[str, Any]], what: str, key: str) -> Progress
 
 
 def _best(job: StudioJob) -> ProgressChart:
-    """Return the best score over the finished trainings; of a search, after each rung."""
+    """Plot the best score so far over the number of finished trainings, counted over all rungs of a search."""
     scores: dict[float, float] = {}
     score = "accuracy" if job.task == "sweep" else "macro_f1"
     before, last = 0, (0, 0)
@@ -254,9 +254,9 @@ _BADGES = {RUNNING: "#3a6ea5", DONE: "#00805c", REFUSED: "#b84a00", STOPPED: "#6
 
 
 class JobsSection:
-    """The section with cards of running and opened jobs, and a list of the others.
+    """Section with a card for each running or opened job, and a list of the others.
 
-    ``open_result`` is called with the id of a result that a visitor wants to see.
+    ``open_result`` is called with the id of a result to display.
     """
 
     def __init__(self, page: Page, jobs: Jobs, open_result: Callable[[str], Any]) -> None:
@@ -315,7 +315,7 @@ class JobsSection:
             button("", w("train.show"), lambda: self.open(job.id), "flat dense", about=job.title)
 
     def open(self, identity: str) -> None:
-        """Display the card of a job."""
+        """Move a job from the list to a card."""
         self._open.add(identity)
         self._closed.discard(identity)
         self.refresh()
@@ -327,7 +327,7 @@ class JobsSection:
         self.refresh()
 
     def stop(self, identity: str) -> None:
-        """Stop a job; it can be resumed."""
+        """Stop a job, which can be resumed later."""
         self._jobs.stop(identity)
 
     def resume(self, identity: str) -> None:
@@ -338,7 +338,7 @@ class JobsSection:
 
 
 class _Card:
-    """The card of one job."""
+    """Card of one job."""
 
     def __init__(self, jobs: JobsSection, job: StudioJob) -> None:
         self._jobs, self._job, self._words = jobs, job, jobs._words
@@ -411,7 +411,7 @@ class _Card:
             charts = {chart.what: chart for chart in progress_charts(job)}
             for i, (what, plot, names) in enumerate(self._plots):
                 chart = charts[what]
-                # The first epochs are drawn as dots; a new fold adds a line.
+                # The series change when a new fold adds a line, and after the first epochs, which are drawn as dots.
                 form = (*chart.names, str(len(chart.x) < 3))
                 plot.show(chart.x, chart.lines, series=self._lines(chart) if form != names else None)
                 self._plots[i] = (what, plot, form)
@@ -456,7 +456,7 @@ class _Card:
 
 
 def result_text(w: Words, job: StudioJob) -> str:
-    """Summarise the result of a job, with the data that it was scored on."""
+    """Summarise the result of a job: its scores and the data on which they were computed."""
     r = job.result
     if job.task == TRAIN:
         s = r["scores"]

@@ -1,4 +1,4 @@
-"""The train page and its form."""
+"""Build the train page and its form."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _NUMBERS = (
 
 
 class TrainingForm:
-    """The form for a new job; entered values stay when the kind changes."""
+    """Form for a new job; it keeps entered values when another kind of job is chosen."""
 
     def __init__(self, page: Page, jobs: Jobs, results: StoredResults) -> None:
         self._page, self._jobs, self._results, self._words = page, jobs, results, page.words
@@ -72,7 +72,7 @@ class TrainingForm:
         self._values[EVALUATE] |= {"split": SPLITS[0], "preset": "people"}
         self._values[SWEEP] |= {"grid": PAPER}
         self._values[SEARCH] |= {"grid": PAPER}
-        # The running estimate and what it is for; the key of the last estimate that was displayed.
+        # The job that computes an estimate, the request it is for, and the key of the displayed estimate.
         self._estimate_job: StudioJob | None = None
         self._estimate_request: JobRequest | None = None
         self._estimated = ""
@@ -105,7 +105,7 @@ class TrainingForm:
             self._command = tag(ui.label().classes("ps-code"), "command")
 
     async def read(self) -> None:
-        """Read and display the facts of the chosen data set."""
+        """Read and display the counts of the chosen data set."""
         if not self._dataset:
             return
         self._facts.clear()
@@ -142,7 +142,7 @@ class TrainingForm:
     # The fields -----------------------------------------------------------------------------------------------
 
     def _build(self) -> None:
-        """Build the fields of the chosen kind."""
+        """Build the fields for the chosen kind of job."""
         self._kind_about.set_text(self._words(f"train.kind_about.{self._kind}"))
         self._fields.clear()
         with self._fields:
@@ -190,7 +190,7 @@ class TrainingForm:
         self._split_line()
 
     def _texts(self, table: str, keys: Iterable[str]) -> dict[str, str]:
-        """Return options with their texts; "" stands for the default."""
+        """Return the text of each option; the key "" stands for the default."""
         return {key: self._words(f"train.{table}.{key or 'default'}") for key in keys}
 
     def _split_line(self) -> None:
@@ -198,7 +198,7 @@ class TrainingForm:
         self._describe_split()
 
     def _describe_split(self) -> None:
-        """Display how far the scores of the chosen split can be trusted."""
+        """Display a warning if scores of the chosen split are optimistic."""
         self._split_row.clear()
         values = self._values[self._kind]
         paper = self._kind == SWEEP and values.get("grid") == PAPER
@@ -213,11 +213,11 @@ class TrainingForm:
                 ui.label(self._words("train.known_about"))
 
     def _field(self, text: str, *, key: str = "", wide: bool = False) -> None:
-        """Build the field of a setting: a choice, a number, a checkbox or text.
+        """Build the field of a setting: a selection, a number, a checkbox or a text.
 
         Args:
-            text: key of its label.
-            key: the setting, if it differs from ``text``.
+            text: key of the label.
+            key: name of the setting, if it differs from ``text``.
         """
         name = key or text
         label = self._words(f"train.{text}")
@@ -240,7 +240,7 @@ class TrainingForm:
         tag(ui.select(dict(options), label=label, value=value, on_change=self._store(key)).classes("w-96"), key)
 
     def _store(self, key: str, read: Callable[[Any], Any] | None = None) -> Callable[[Any], None]:
-        """Return an event handler that stores the value of a field."""
+        """Return an event handler that stores the value of a field, converted by ``read`` if given."""
         kind = self._kind
 
         def store(event: Any) -> None:
@@ -252,7 +252,7 @@ class TrainingForm:
         return store
 
     def _changed(self) -> None:
-        """Update the shell command, and remove an estimate that no longer applies."""
+        """Update the displayed command, and remove the estimate if it no longer applies."""
         try:
             request = self._request()
         except PlushSenseError:
@@ -296,7 +296,7 @@ class TrainingForm:
             self._build()
 
     def close(self) -> None:
-        """Stop a running estimate."""
+        """Stop the estimate that is being computed, if any."""
         if self._estimate_job is not None and self._estimate_job.state == RUNNING:
             self._jobs.stop(self._estimate_job.id)
         self._estimate_job = None
@@ -354,13 +354,13 @@ class TrainingForm:
 
 
 def _power(value: float) -> str:
-    """Return a number in scientific notation, as in ``2.3·10¹²``."""
+    """Format a number in scientific notation, as in ``2.3·10¹²``."""
     digits, power = f"{value:.1e}".split("e")
     return f"{digits}·10{str(int(power)).translate(str.maketrans('0123456789-', '⁰¹²³⁴⁵⁶⁷⁸⁹⁻'))}"
 
 
 def _integer(text: Any) -> Any:
-    """Convert digits into an integer; return other text unchanged, which the check of the settings refuses."""
+    """Convert digits into an integer; return other text unchanged, which the check of the settings rejects."""
     plain = str(text).strip()
     return int(plain) if plain.removeprefix("-").isdecimal() else plain
 
@@ -370,7 +370,7 @@ def _text(text: Any) -> str:
 
 
 _CSS = Path(__file__).with_name("train.css")
-# Shortest interval between two updates of running jobs.
+# Time between two updates of running jobs, in seconds.
 _DRAWN_S = 0.4
 
 

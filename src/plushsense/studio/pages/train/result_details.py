@@ -1,4 +1,4 @@
-"""Details of a result: confusion matrix, recordings of a cell, and scores of each person."""
+"""Display the details of a result: confusion matrix, recordings of a cell, and scores of each person."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _CLICKS = '(e) => { const b = e.target.closest("[data-cell]"); if (b) emit(b.dat
 
 
 class ResultDetailsView:
-    """The card with the details of one result."""
+    """Card with the details of one result."""
 
     def __init__(self, page: Page, results: StoredResults) -> None:
         self._page, self._results, self._words = page, results, page.words
@@ -145,18 +145,18 @@ class ResultDetailsView:
                 "train.cell_title", truth=name(truth), predicted=name(predicted), n=len(rows), windows=windows
             )
             link = await run.io_bound(self._link, d.row.dataset, [row.recording for row in rows], title)
-            # Ignore the answer after a later click or another result.
+            # Ignore this answer if another cell was clicked or another result opened in the meantime.
             if link is not None and click == self._clicks and self._details is d:
                 self._list(d, title, link, rows)
 
     def _link(self, dataset: str, recordings: list[str], title: str) -> str:
-        """Return the address of the recordings in Review, or "" if the data set is not in this studio."""
+        """Return the address of the review page for these recordings, or "" if the data set is not in this studio."""
         if not dataset:
             return ""
         return self._page.workspace.part(Reviews).address(Path(dataset), recordings, title)
 
     def _gestures(self, label: str) -> list[str]:
-        """Return the gestures that a label of the matrix stands for."""
+        """Return the gestures that a label of the displayed matrix includes: one gesture, or all with this affect."""
         d = self._details
         if d is None or self._by == "gesture":
             return [label]
@@ -196,7 +196,7 @@ class ResultDetailsView:
 
 
 def confusion_table(w: Words, confusion: Confusion, by_affect: bool, clickable: bool) -> Markup:
-    """Render a confusion matrix as a table with counts and shares of each row."""
+    """Render a confusion matrix as a table of counts and of percentages of each row."""
 
     def name(label: str) -> str:
         return f"{AFFECT_SIGNS[label]} {w.affect(label)}" if by_affect else w.gesture(label)

@@ -1,4 +1,4 @@
-"""Stored results of evaluations, sweeps, searches and trainings, as rows of one table."""
+"""Read stored results of evaluations, sweeps, searches and trainings as rows of one table."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from plushsense.workflow.reporting import PREDICTIONS, SCORES
 
 
 def figure(value: float | None) -> str:
-    """Return a score as text with three digits, or a dash if there is none."""
+    """Format a score with three decimal places, or as a dash if it is None."""
     return "–" if value is None else f"{value:z.3f}"
 
 
 def score_text(mean: float | None, sd: float | None) -> str:
-    """Return mean and standard deviation as text, as in ``0.573 ± 0.120``."""
+    """Format a mean and standard deviation, as in ``0.573 ± 0.120``."""
     return figure(mean) if mean is None or sd is None else f"{mean:z.3f} ± {sd:.3f}"
 
 
 def duration_text(words: Words, seconds: float) -> str:
-    """Return a duration in words."""
+    """Describe a duration in words, in minutes or hours."""
     if seconds < 60:
         return words("train.time.short")
     minutes = round(seconds / 60)
@@ -50,14 +50,14 @@ def duration_text(words: Words, seconds: float) -> str:
 
 
 def score_labels(words: Words, leaky: bool, simulated: bool) -> Markup:
-    """Render the labels of a score: *simulation* and *leaky*."""
+    """Render the labels *simulation* and *leaky* if they apply to a score."""
     kinds = [kind for kind, true in (("simulation", simulated), ("leaky", leaky)) if true]
     mark = Markup('<span class="ps-mark ps-mark-{}">{}</span>')
     return Markup(" ").join(mark.format(kind, words(f"train.{kind}")) for kind in kinds)
 
 
 def averaged_over(words: Words, kind: str, units: int) -> str:
-    """Describe the units that a mean is taken over."""
+    """Describe over what a mean was computed, such as 5 folds."""
     return words(f"train.over.{kind}{'_one' if units == 1 else ''}", n=units)
 
 
@@ -68,18 +68,18 @@ _HASH = 6
 
 @dataclass(frozen=True)
 class ResultRow:
-    """A result in the table.
+    """A row of the table of results.
 
     Attributes:
         kind: `EVALUATION`, `TRIAL` (of a sweep or search) or `TRAINING`.
         path: folder of the evaluation or sweep, or path of the bundle.
-        trial: number within a sweep.
+        trial: number within a sweep, or "".
         dataset: folder of the data set, "" if it is not in this studio; ``data`` is its name.
-        spread: what mean and standard deviation are taken over: ``units`` of `SUBJECTS`, `FOLDS` or `TRAININGS` (folds
-            times seeds), or for a single training the people `HELD_BACK`.
-        macs: multiply-accumulates for a decision, every 50 ms.
-        when_s: seconds since 1970.
-        apart: what else must be equal in a comparison: hash of the data set, classes, held-back people.
+        spread: over what mean and standard deviation are computed: ``units`` of `SUBJECTS`, `FOLDS` or `TRAININGS`
+            (folds times seeds), or for a single training the people `HELD_BACK`.
+        macs: number of multiply-accumulate operations per decision, every 50 ms.
+        when_s: time of the result, in seconds since 1970.
+        apart: further values that are equal in comparable results: hash of the data set, classes, held-back people.
     """
 
     id: str
@@ -108,7 +108,7 @@ class ResultRow:
 
 
 def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
-    """Read the result of an ``evaluation.json``, as a list of one row."""
+    """Read the result in the scores file ``path`` of an evaluation, as a list of one row."""
     table = read_json(path)
     model, config = table["model"], table["config"]
     training = config["training"]
@@ -146,7 +146,7 @@ def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
 
 
 def of_trials(path: Path, dataset: Any) -> list[ResultRow]:
-    """Read the finished trials of a sweep, or the finalists of a search."""
+    """Read the results of finished trials of a sweep or search from the CSV file ``path``."""
     folder = path.parent
     table = read_json(folder / SWEEP)
     grid, when = table["grid"], path.stat().st_mtime
@@ -187,7 +187,7 @@ def of_trials(path: Path, dataset: Any) -> list[ResultRow]:
 
 
 def of_bundle(path: Path, known: Any) -> list[ResultRow]:
-    """Read the result stored in a bundle; ``known`` maps names of data sets to folders."""
+    """Read the result stored in a bundle, as a list of one row; ``known`` maps names of data sets to folders."""
     bundle = Bundle.load(path)
     origin = bundle.provenance
     scores, training = origin.get("scores", {}), origin.get("training", {})
@@ -196,7 +196,7 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
     split = str(scores.get("split", origin.get("split", "?")))
     context = bundle.windowing.get("context", "?")
     if context == ANYWHERE:
-        # As in evaluations: networks trained on any context are scored on whole gestures.
+        # As in evaluations, networks trained on any context are scored in the context "stream".
         context = f"{ANYWHERE} → stream"
     held_back = sorted(set(origin.get("validation_subjects", ())) - {NOBODY, UNKNOWN_SUBJECT})
     return [
@@ -214,7 +214,7 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
             bool(scores.get("leaky")),
             bool(origin.get("simulated")),
             str(training.get("seed", "?")),
-            # If recordings or windows are held back, the network was trained on the same people.
+            # Unless whole people were held back, the network was trained on the people it was scored on.
             *((HELD_BACK, len(held_back)) if split == WHOLE_PEOPLE else (TRAININGS, 1)),
             scores.get("accuracy"),
             None,
@@ -229,7 +229,7 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
 
 
 def over_trainings(trial: Mapping[str, Any]) -> tuple[str, int]:
-    """Return what the mean of a trial is taken over, and how many units that are."""
+    """Return over what the mean of a trial is computed (`FOLDS` or `TRAININGS`), and their number."""
     folds, seeds = int(trial["folds"]), int(trial["seeds"])
     return (FOLDS, folds) if seeds == 1 else (TRAININGS, folds * seeds)
 
@@ -250,7 +250,7 @@ T = TypeVar("T")
 
 
 class Confusion(NamedTuple):
-    """Confusion counts: ``counts[i][j]`` windows of ``labels[i]`` were classified as ``labels[j]``."""
+    """Confusion matrix: ``counts[i][j]`` windows of ``labels[i]`` were classified as ``labels[j]``."""
 
     labels: tuple[str, ...]
     counts: tuple[tuple[int, ...], ...]
@@ -258,7 +258,7 @@ class Confusion(NamedTuple):
 
 @dataclass(frozen=True)
 class ResultDetails:
-    """Details of a result. ``clickable`` is true if the predictions of single windows are stored."""
+    """Details of a result. ``clickable`` is true if the prediction for each window is stored."""
 
     row: ResultRow
     by_gesture: Confusion | None = None
@@ -270,7 +270,7 @@ class ResultDetails:
 
 
 class MisreadRecording(NamedTuple):
-    """A recording in a cell: ``windows`` of its ``of`` windows fall into the cell."""
+    """A recording in a cell of a confusion matrix, which contains ``windows`` of its ``of`` windows."""
 
     recording: str
     subject: str
@@ -282,7 +282,7 @@ class MisreadRecording(NamedTuple):
 
 @dataclass(frozen=True)
 class DatasetCounts:
-    """Counts of a data set."""
+    """Counts of a data set, without excluded recordings."""
 
     name: str
     people: int
@@ -293,14 +293,14 @@ class DatasetCounts:
 
 
 class StoredResults:
-    """Results of a workspace; each file is read once until it changes. Called from worker threads."""
+    """Service that reads the results of a workspace and caches each file until it changes; call it in a thread."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
         self._read: dict[tuple[str, Path], tuple[Any, Any]] = {}
 
     def rows(self) -> list[ResultRow]:
-        """Return all readable results, the newest first."""
+        """Return all readable results, newest first."""
         return sorted(self._rows(), key=lambda row: -row.when_s)
 
     def _rows(self) -> Iterator[ResultRow]:
@@ -315,7 +315,7 @@ class StoredResults:
             yield from self._once(path, of_bundle, known) or ()
 
     def row(self, identity: str) -> ResultRow:
-        """Return the result with an id; raise BadInput if there is none."""
+        """Return the result with this id; raise BadInput if there is none."""
         for row in self._rows():
             if row.id == identity:
                 return row
@@ -348,20 +348,20 @@ class StoredResults:
         return ResultDetails(row, affects=affects, facts={**bundle.provenance, "fitted": bundle.decision.get("fitted")})
 
     def misread(self, row: ResultRow, truth: Sequence[str], predicted: Sequence[str]) -> list[MisreadRecording]:
-        """Return the recordings of a cell, those with the most windows first.
+        """Return the recordings with windows of ``truth`` classified as ``predicted``, most windows first.
 
         Raises:
-            MissingExtraError: without polars. BadInput: if the predictions are missing.
+            MissingExtraError: if polars is not installed. BadInput: if the predictions are missing.
         """
         predictions = self._once(row.path / PREDICTIONS, lambda path, _: read_predictions(path), None, refuse=True)
         assert predictions is not None
         return recordings_of_cell(predictions, truth, predicted)
 
     def facts(self, dataset: Path) -> DatasetCounts:
-        """Return counts of a data set, cached until its files change.
+        """Return the counts of a data set, cached until its files change.
 
         Raises:
-            PlushSenseError: if the folder is no data set.
+            PlushSenseError: if the folder is not a valid data set.
         """
         files = [dataset / name for name in (HEAD, "recordings.csv", MARKS)]
         key = ("facts", dataset)
@@ -370,7 +370,7 @@ class StoredResults:
             people = {r.subject for r in data.used} & set(data.subjects)
             used = {r.gesture for r in data.used}
             labels = tuple(label for label in data.gestures.labels if label in used)
-            # Opening may have rewritten the index: stamp the files afterwards.
+            # Read the time stamps now, because opening the data set may have rewritten the index.
             self._read[key] = (
                 file_stamps(*files),
                 DatasetCounts(
@@ -381,7 +381,7 @@ class StoredResults:
         return counts
 
     def _once(self, path: Path, read: Callable[[Path, Any], T], more: Any, refuse: bool = False) -> T | None:
-        """Return ``read(path, more)``, cached until the file changes; None for a file that cannot be read."""
+        """Return ``read(path, more)``, cached until the file changes; return None on errors unless ``refuse``."""
         key, stamp = (read.__name__, path), (file_stamps(path), repr(more))
         cached = self._read.get(key)
         if cached is None or cached[0] != stamp:
@@ -399,7 +399,7 @@ class StoredResults:
 def recordings_of_cell(
     predictions: Predictions, truth: Sequence[str], predicted: Sequence[str]
 ) -> list[MisreadRecording]:
-    """Return the recordings with windows of ``truth`` classified as ``predicted``, the most windows first."""
+    """Return the recordings with windows of ``truth`` classified as ``predicted``, most windows first."""
     labels = np.array(predictions.labels, dtype=np.str_)
     answers, gestures = labels[predictions.predicted], labels[predictions.truth]
     inside = np.isin(gestures, list(truth)) & np.isin(answers, list(predicted))
@@ -423,7 +423,7 @@ def recordings_of_cell(
 
 
 def sum_by_affect(confusion: Confusion, affects: Mapping[str, str | None]) -> Confusion:
-    """Sum a confusion matrix of gestures by affect."""
+    """Combine the gestures of a confusion matrix into affects."""
     of = [affects.get(label) or "none" for label in confusion.labels]
     names, counts = metrics.grouped(np.array(confusion.counts, dtype=np.int64), of)
     return Confusion(names, tuple(tuple(map(int, row)) for row in counts))

@@ -1,4 +1,4 @@
-"""The results of the train page: a sortable table, a plot of score against size, and details."""
+"""Build the results of the train page: a sortable table, a plot of score against size, and details."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ _SORTS: dict[str, Callable[[ResultRow], Any]] = {
     "when": lambda r: r.when_s,
 }
 _NUMBERS = ("over", "accuracy", "macro_f1", "parameters", "macs")
-# Columns that are sorted downwards at the first click.
+# Columns that the first click sorts in descending order.
 _DOWN = ("accuracy", "macro_f1", "when", "over")
 
 
 class ResultsSection:
-    """The section with all results."""
+    """Section with all results."""
 
     def __init__(self, page: Page, results: StoredResults, rows: list[ResultRow]) -> None:
         self._page, self._results, self._words = page, results, page.words
@@ -81,14 +81,14 @@ class ResultsSection:
         self._fill()
 
     async def reload(self) -> None:
-        """Read the results again."""
+        """Read the results again and display them if they have changed."""
         rows = await run.io_bound(self._results.rows)
         if rows is not None and rows != self._rows:
             self._rows = rows
             self._fill()
 
     async def open(self, identity: str) -> None:
-        """Open the details of a result."""
+        """Display the details of the result with this id."""
         await self.reload()
         row = next((r for r in self._rows if r.id == identity), None)
         with self._page.show_errors():
@@ -185,7 +185,7 @@ class ResultsSection:
     # Score against size ---------------------------------------------------------------------------------------
 
     def _draw_pareto(self, rows: list[ResultRow]) -> None:
-        """Plot one group of comparable results."""
+        """Plot one group of comparable results, with a field to choose the group."""
         w = self._words
         groups = comparable_groups(rows, lambda kind: w(f"train.rows.{kind}"))
         self._pareto.clear()
@@ -225,10 +225,10 @@ class ResultsSection:
 
 
 def comparable_groups(rows: Sequence[ResultRow], kind: Callable[[str], str]) -> dict[str, list[ResultRow]]:
-    """Group results that can be compared; leave out groups with one member.
+    """Group the results that can be compared; leave out groups with one member.
 
-    A group has the same data, kind, split, context, classes and held-back people. Groups of one name are numbered, such
-    as those of a data set before and after a change.
+    Members have the same data, kind, split, context, classes and held-back people. Groups with the same name, such as
+    those of a data set before and after a change, are numbered. ``kind`` returns the text for a kind of result.
     """
     comparable: dict[tuple[Any, ...], list[ResultRow]] = {}
     for row in rows:
@@ -249,34 +249,34 @@ _CLICKS = '(e) => { const b = e.target.closest("[data-do]"); if (b) emit(b.datas
 
 
 def _refocus(what: str) -> None:
-    """Focus a button again after its table was rebuilt."""
+    """Move the keyboard focus back to a button after its table was rebuilt."""
     ui.run_javascript(
         f"setTimeout(() => [...document.querySelectorAll('[data-do]')]"
         f".find((b) => b.dataset.do === {json.dumps(what)})?.focus(), 60)"
     )
 
 
-# CSS variables, so that the plot follows a change of the colour scheme.
+# CSS variables, so that the plot adapts to a change of the colour scheme.
 _INK, _DIM, _LINE, _BACKGROUND = "var(--ps-ink)", "var(--ps-dim)", "var(--ps-line)", "var(--train-page)"
 _FRONT, _POINT = "#D55E00", "#0072B2"
 _TICKS = (1, 2, 5)
 
 
 def pareto_rows(rows: Sequence[ResultRow]) -> list[ResultRow]:
-    """Return the Pareto front of macro-F1 and parameters, the smallest network first."""
+    """Return the Pareto front of macro-F1 and number of parameters, smallest network first."""
     scored = [row for row in rows if row.macro_f1 is not None]
     on_front = pareto_front([(float(row.macro_f1 or 0.0), float(row.parameters)) for row in scored])
     return sorted((row for row, best in zip(scored, on_front, strict=True) if best), key=lambda row: row.parameters)
 
 
 def pareto_options(rows: Sequence[ResultRow], *, x: str, y: str, leaky: str) -> dict[str, Any]:
-    """Return the options of an ECharts plot of scored rows, for its SVG renderer.
+    """Return the options of an ECharts plot of macro-F1 against parameters, for the SVG renderer.
 
     Args:
-        rows: results with a macro-F1.
-        x: title of the axis of parameters, which is logarithmic.
+        rows: results that have a macro-F1.
+        x: title of the logarithmic axis of parameters.
         y: title of the axis of macro-F1.
-        leaky: word added to the labels of leaky results, which are hollow diamonds.
+        leaky: word added to the labels of leaky results, which are drawn as hollow diamonds.
     """
     front = pareto_rows(rows)
     ids = {row.id for row in front}
@@ -291,7 +291,7 @@ def pareto_options(rows: Sequence[ResultRow], *, x: str, y: str, leaky: str) -> 
     return {
         "animation": False,
         "grid": {"left": 70, "right": 24, "top": 20, "bottom": 56},
-        # Rich text is drawn, not parsed as HTML.
+        # Rich text is not parsed as HTML, so that names are safe.
         "tooltip": {"renderMode": "richText", "confine": True},
         "xAxis": {
             "type": "log",
@@ -321,7 +321,7 @@ def pareto_options(rows: Sequence[ResultRow], *, x: str, y: str, leaky: str) -> 
 
 
 def pareto_table(w: Words, rows: Sequence[ResultRow]) -> Markup:
-    """Render the data of the plot as a table, the smallest network first."""
+    """Render the data of the plot as a table, smallest network first."""
     ids = {row.id for row in pareto_rows(rows)}
     head = [w(f"train.columns.{key}") for key in ("network", "schedule", "parameters", "macro_f1")]
     cells = [
@@ -350,7 +350,7 @@ def _point(row: ResultRow, front: bool, leaky: str, middle: float) -> dict[str, 
         "name": name,
         "value": [row.parameters, row.macro_f1],
         "symbol": "diamond" if row.leaky else "circle",
-        # Of overlapping labels, ECharts keeps that of the larger symbol.
+        # If labels overlap, ECharts keeps the label of the larger symbol.
         "symbolSize": 13 if front else 10,
         "itemStyle": {"opacity": 1, **(hollow if row.leaky else {"color": _POINT, "borderColor": _BACKGROUND})},
         "label": {
@@ -377,7 +377,7 @@ def _axis(name: str, gap: int) -> dict[str, Any]:
 
 
 def _log_range(values: Sequence[int]) -> tuple[float, float]:
-    """Return limits of a logarithmic axis, with a margin around the values."""
+    """Return the limits of a logarithmic axis, with a margin around the values."""
     low, high = math.log10(min(values)), math.log10(max(values))
     margin = max(0.15, 0.08 * (high - low))
     return 10 ** (low - margin), 10 ** (high + margin)
