@@ -75,6 +75,7 @@ def folder(recordings: Path, tmp_path: Path) -> Path:
             Mark(mine[1].id, "exclude", "jdoe", "Ana-Maria pulled the cable", when="2025-10-09T10:15:00+00:00"),
             Mark(mine[2].id, "trim", "plushsense trim", start=3, stop=90, when="2025-10-10T10:15:00+00:00"),
             Mark("", "accept", "JDoe", "as jdoe said", check="rate", when="2025-10-11T10:15:00+00:00"),
+            Mark("P02", "accept", "jdoe", check="missing", when="2025-10-12T10:15:00+00:00"),
         ],
     )
     (ds.path / "streams" / "P02" / "origin.json").write_text('{"file": "my daughter.xdf"}')
@@ -205,7 +206,8 @@ def test_session_files_people_and_marks_go_along(folder: Path, tmp_path: Path) -
     assert set(people) == {key[p][0] for p in ("Ana Maria", "P02", "P09")}
     assert (people[code].age_group, people[code].consent) == ("child", "on file")
     standing = read_marks(out)
-    assert set(standing) - {""} < {r.id for r in done.dataset.recordings}
+    assert set(standing) - {"", key["P02"][0]} < {r.id for r in done.dataset.recordings}
+    assert key["P02"][0] in standing, "a mark of a person"
     lines = [json.loads(line) for line in (out / "marks.jsonl").read_text().splitlines()]
     assert {m["who"] for m in lines} == {"person-1", "plushsense trim"}
     assert f"{code} pulled the cable" in {m["why"] for m in lines}

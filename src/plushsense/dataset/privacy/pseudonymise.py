@@ -279,7 +279,7 @@ class _Pseudonymisation:
         return self._words(person) if match_code(person, self.people) else None
 
     def _renamed(self, identity: str) -> str:
-        """Return the new id of a recording or stream; "" for the data set."""
+        """Return the new id of a recording, stream or person; "" for the data set."""
         if not identity:
             return ""
         for kind in (RECORDINGS, STREAMS):
@@ -287,9 +287,9 @@ class _Pseudonymisation:
             new = self.moved.get(f"{kind}/{stem}.csv")
             if new is not None:
                 return PurePosixPath(*PurePosixPath(new).with_suffix("").parts[1:]).as_posix() + mark + number
-        person, *between, name = identity.split("/")
+        person, *rest = identity.split("/")
         words = self._words(person)
-        return "/".join([words.code, *(words.text(part) for part in between), words.name(name)])
+        return "/".join([words.code, *map(words.text, rest[:-1]), *map(words.name, rest[-1:])])
 
     def _compare(self, made: Dataset) -> None:
         """Raise DatasetError unless the new index equals the old one except for names and dates."""
