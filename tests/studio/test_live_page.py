@@ -34,7 +34,8 @@ def started(browser: Look, url: str) -> Any:
     """The same, and a toy that is being read."""
     page = live(browser, url)
     marked(page, "start").click()
-    marked(page, "state").get_by_text("Reading").wait_for()
+    # Exact, because "Not reading" is no other text to a search.
+    marked(page, "state").get_by_text("Reading", exact=True).wait_for()
     return page
 
 
@@ -110,7 +111,7 @@ def test_another_bundle_while_it_runs_and_one_that_does_not_fit(studio: Fixture,
     page = live(browser, url)
     choose(page, "Network", "little")
     marked(page, "start").click()
-    marked(page, "state").get_by_text("Reading").wait_for()
+    marked(page, "state").get_by_text("Reading", exact=True).wait_for()
     for name, told in (("circus", "no gesture in common"), ("accel", "accel-3")):
         choose(page, "Network", name)
         marked(page, "message").get_by_text(told).wait_for()
@@ -129,7 +130,7 @@ def test_another_bundle_while_it_runs_and_one_that_does_not_fit(studio: Fixture,
         "Back stroke 1",
         "Tail pull",
     ]
-    marked(page, "state").get_by_text("Reading").wait_for()
+    marked(page, "state").get_by_text("Reading", exact=True).wait_for()
     choose(page, "Arithmetic", "as on the chip (int8)")
     marked(page, "message").get_by_text("calibration").wait_for()
     choose(page, "Network", "little")
@@ -137,7 +138,7 @@ def test_another_bundle_while_it_runs_and_one_that_does_not_fit(studio: Fixture,
     choose(page, "Arithmetic", "as on the chip (int8)")
     page.wait_for_function("(n) => window.plushsenseLive.scenes > n + 2", arg=scenes)
     choose(page, "Reactions of the toy", "none")
-    marked(page, "state").get_by_text("Reading").wait_for()
+    marked(page, "state").get_by_text("Reading", exact=True).wait_for()
     assert browser.complaints == []
 
 
@@ -171,7 +172,7 @@ def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, hom
     assert "away" in marked(page, "message").inner_text() or "closed" in marked(page, "message").inner_text()
     assert axe(page) == []
     toy(int(address.rsplit(":", 1)[1]))
-    marked(page, "state").get_by_text("Reading").wait_for()
+    marked(page, "state").get_by_text("Reading", exact=True).wait_for()
     marked(page, "message").wait_for(state="detached")
     assert browser.complaints == []
 
