@@ -37,7 +37,7 @@ def add_options(parser: argparse.ArgumentParser, table: str, words: Mapping[str,
     """Add the options of a table in ``verbs.toml``, in the same order; ``words`` replace placeholders in help texts."""
     texts = _Words(words or {})
     groups: dict[str, Any] = {}
-    for name, entry in {**_TABLES, **VERBS}[table].items():
+    for name, entry in (VERBS if table in VERBS else _TABLES)[table].items():
         if name in ("summary", "module", "stopped"):
             continue
         if name == "description":

@@ -14,7 +14,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache as cached
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
@@ -130,13 +130,13 @@ def build(
     blobs: Mapping[str, Path] | None = None,
     cc: str | None = None,
     flags: Sequence[str] = (),
-    cache: Path | None = None,
+    object_folder: Path | None = None,
 ) -> Program:
     """Build a program in ``out_dir`` from C or assembly sources, one of which defines ``main``.
 
     ``target.h`` is on the include path. Each file of ``blobs`` becomes bytes from the symbol NAME to NAME_end
     (``extern const uint8_t NAME[], NAME_end[]``), aligned to 16 bytes. ``flags`` apply to the sources and to linking,
-    not to the runtime. ``cache`` is a folder of object files that are used again by later builds.
+    not to the runtime. ``object_folder`` keeps object files for later builds.
 
     Raises:
         ToolError: when a compiler or emulator is missing.
@@ -153,12 +153,12 @@ def build(
         objects = []
         compiling = [compiler, *machine.flags, *source_flags]
         for n, source in enumerate(sources):
-            name = _object_name(source, compiling, include) if cache else f"{n}-{source.stem}.o"
-            objects.append((cache or out_dir) / name)
-            if cache and objects[-1].exists():
+            name = _object_name(source, compiling, include) if object_folder else f"{n}-{source.stem}.o"
+            objects.append((object_folder or out_dir) / name)
+            if object_folder and objects[-1].exists():
                 continue
-            # Programs that are built at the same time share the cache: a file appears there complete.
-            made = Path(work) / "made.o" if cache else objects[-1]
+            # Programs that are built at the same time share the folder: a file appears there complete.
+            made = Path(work) / "made.o" if object_folder else objects[-1]
             command = [*compiling, f"-I{RUNTIME}", *included, "-c", str(source.resolve()), "-o", str(made)]
             _compile(command, Path(work), source.name)
             made.replace(objects[-1])
@@ -227,6 +227,6 @@ def _error_line(output: str) -> str:
     return (matching or lines[-1:] or ["no output"])[0]
 
 
-@cached
+@cache
 def _compiler_has(compiler: str, file: str) -> bool:
     return Path(tool_output([compiler, f"-print-file-name={file}"]).strip()).is_absolute()

@@ -91,7 +91,7 @@ def timed_events(updates: Sequence[Update]) -> list[TimedEvent]:
 def event_costs(
     stream: MarkedStream, events: Sequence[TimedEvent], gestures: GestureSet, prices: EventCosts
 ) -> NDArray[np.float64]:
-    """Return the cost (n,) of answer_costs of the n gestures of a stream, in order of time.
+    """Return the cost (n,) of each of the n gestures of a stream, in order of time.
 
     The cost of an event without a gesture is added to that of the nearest gesture.
     """

@@ -180,7 +180,7 @@ def verify(
     jobs: int | None = None,
     progress: Progress | None = None,
 ) -> VerificationReport:
-    """Compile the C of the export folder for caught target, run it, and compare all_vectors answer.
+    """Compile the C of the export folder for each target, run it, and compare every result.
 
     Args:
         export: the folder.
@@ -397,7 +397,7 @@ class _Runner:
             blobs={"cases": path, **({"image": code / IMAGE} if setting.image else {})},
             cc=setting.cc,
             flags=setting.flags,
-            cache=self.objects,
+            object_folder=self.objects,
         )
         try:
             got = program.run(timeout_s=60 + 0.02 * sum(len(v.frames) for v in stream))
