@@ -41,7 +41,7 @@ def studio(tmp_path: Path) -> Iterator[Callable[..., Studio]]:
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Browser]:
     """Debian's Chromium, headless, driven by Playwright, whose loop stays in this thread while it lives: a module."""
-    found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    found = shutil.which("chromium-headless-shell") or shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if found is None:
         missing("browser", "chromium is not installed")
     if importlib.util.find_spec("playwright") is None or importlib.util.find_spec("nicegui") is None:
