@@ -104,6 +104,7 @@ def run(
         favicon=_ICON,
         show=show and visitors.open,
         reload=False,
+        tailwind=False,
         show_welcome_message=False,
         reconnect_timeout=10.0,
         uvicorn_logging_level="error",

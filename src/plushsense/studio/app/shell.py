@@ -214,7 +214,7 @@ def _choices(words: Words, dark: bool | None) -> None:
             tag(item, f"light-{light}").props(f"role=menuitemradio aria-checked={str(light == now).lower()}")
             with item, ui.row().classes("items-center no-wrap q-gutter-sm"):
                 ui.icon(icon).props("aria-hidden=true")
-                ui.label(words(f"shell.{light}")).classes("text-weight-bold" if light == now else "")
+                ui.label(words(f"shell.{light}")).classes("text-bold" if light == now else "")
 
 
 def _set_cookie(cookie: str, value: str) -> None:

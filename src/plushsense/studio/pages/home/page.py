@@ -59,7 +59,7 @@ def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
                 ui.label(words("home.no_toy")).classes("ps-dim")
                 return
             with ui.row().classes("items-center ps-small-gap"):
-                tag(ui.label(words("home.chosen", url=workspace.toy)).classes("ps-break text-weight-bold"), "chosen")
+                tag(ui.label(words("home.chosen", url=workspace.toy)).classes("ps-break text-bold"), "chosen")
                 if toys.simulated:
                     simulation_badge(page)
             button("test", words("home.test"), test)
@@ -141,7 +141,7 @@ def bundles(page: Page) -> Callable[[WorkspaceSummary], None]:
             for entry in summary.bundles:
                 with tag(ui.column().classes("ps-row w-full"), "bundle"):
                     with ui.row().classes("items-center ps-small-gap"):
-                        ui.label(entry.name).classes("text-weight-bold ps-break")
+                        ui.label(entry.name).classes("text-bold ps-break")
                         if entry.simulated:
                             simulation_badge(page)
                     if entry.refused:

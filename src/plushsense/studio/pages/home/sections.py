@@ -75,7 +75,7 @@ class DatasetSection:
         page, words = self._page, self._page.words
         with tag(ui.column().classes("ps-row w-full"), "dataset"):
             with ui.row().classes("items-center w-full ps-small-gap"):
-                ui.label(entry.name).classes("text-weight-bold")
+                ui.label(entry.name).classes("text-bold")
                 if entry.simulated:
                     simulation_badge(page)
             if entry.refused:
@@ -243,7 +243,7 @@ class JobList:
 
     def _row(self, job: StudioJob) -> None:
         words = self._page.words
-        ui.label(f"{_SIGNS[job.state]} {job.title}").classes("text-weight-bold ps-break")
+        ui.label(f"{_SIGNS[job.state]} {job.title}").classes("text-bold ps-break")
         if job.state == RUNNING:
             label = tag(ui.label(), "job-progress")
             bar = ui.linear_progress(0.0, show_value=False, size="10px").props("rounded")

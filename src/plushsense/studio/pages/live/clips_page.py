@@ -140,7 +140,7 @@ def _row(page: Page, clips: Clips, clip: Clip, edit: Callable[[], Awaitable[None
         state += f"; {words('live.clip_added', names=', '.join(clip.added))}" if clip.added else ""
     with ui.row().classes("w-full items-center ps-small-gap").style("border-bottom: 1px solid var(--ps-line)") as row:
         tag(row, f"clip-{clip.key}")
-        ui.label(clip.key).classes("font-bold")
+        ui.label(clip.key).classes("text-bold")
         when = moment(clip.head.started_ms / 1000.0)
         ui.label(f"{when}, {words.number(clip.seconds, 1)} s").classes("ps-dim")
         ui.label(state).classes("flex-grow")

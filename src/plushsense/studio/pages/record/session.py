@@ -75,7 +75,7 @@ class SignalPanel:
                 label = words("record.live_label", s=f"{_WINDOW_S * speed:g}", channels=", ".join(names))
                 series = [{"label": name, "stroke": LINES[i % len(LINES)]} for i, name in enumerate(names)]
                 flex = "2 1 420px" if len(indices) > 5 else "1 1 260px"
-                with ui.column().classes("gap-0").style(f"flex: {flex}; min-width: 0"):
+                with ui.column().classes("ps-no-gap").style(f"flex: {flex}; min-width: 0"):
                     ui.label(title).classes("text-bold")
                     plot = Plot(
                         label,

@@ -170,8 +170,8 @@ class ReviewController:
     def build(self, views: Mapping[str, Callable[[ReviewController], ReviewView]]) -> None:
         """Build the header, the filters, and the views `TABLE`, `ONE` and `OVERLAY`."""
         words, review = self.words, self.review
-        with ui.row().classes("w-full items-center gap-2"):
-            tag(ui.label(review.dataset.head.name).classes("text-lg font-bold"), "name")
+        with ui.row().classes("w-full items-center ps-small-gap"):
+            tag(ui.label(review.dataset.head.name).classes("text-lg text-bold"), "name")
             if review.dataset.head.simulated:
                 tag(ui.label(words("shell.simulation")).classes("ps-message ps-message-warning"), "simulation")
             self.counts = tag(ui.label().props("role=status"), "counts")
@@ -183,7 +183,7 @@ class ReviewController:
             tag(to_train, "to-train")
         if review.is_labelled:
             tag(ui.label(words("review.labelled")).classes("ps-message ps-message-info w-full"), "labelled")
-        with ui.row().classes("w-full items-center gap-2"):
+        with ui.row().classes("w-full items-center ps-small-gap"):
             toggle = ui.toggle({v: words(f"review.view_{v}") for v in VIEWS}, value=self.view)
             toggle.props(f'no-caps unelevated aria-label="{words("review.view")}"').classes("ps-toggle")
             self.toggle = tag(toggle, "view")

@@ -103,7 +103,7 @@ class GestureOverlayView:
         words, labels = desk.words, desk.review.gestures()
         self._gesture = desk.filter.gesture or (labels[0] if labels else "")
         with tag(ui.element("div").classes("ps-two w-full"), "overlay") as self.place:
-            with ui.column().classes("w-full gap-2 no-wrap"):
+            with ui.column().classes("w-full ps-small-gap no-wrap"):
                 self.choice = ui.select(
                     {g: words.gesture(g) for g in labels},
                     value=self._gesture if self._gesture in labels else None,
@@ -115,9 +115,9 @@ class GestureOverlayView:
                 self.plot = ReviewPlot(words("review.overlay_plot"), height=420, legend=False, on_pick=self.picked)
                 tag(self.plot, "overlay-plot")
                 ui.label(words("review.overlay_help")).classes("ps-dim")
-            with ui.column().classes("w-full gap-2"):
-                ui.label(words("review.outliers")).classes("font-bold")
-                self.names = tag(ui.column().classes("w-full gap-0"), "outliers")
+            with ui.column().classes("w-full ps-small-gap"):
+                ui.label(words("review.outliers")).classes("text-bold")
+                self.names = tag(ui.column().classes("w-full ps-no-gap"), "outliers")
 
     async def _choose(self, gesture: str) -> None:
         self._gesture = gesture
@@ -218,9 +218,9 @@ class RecordingView:
         self._drawn: Any = None
         words, trims = desk.words, not desk.review.is_labelled
         with tag(ui.element("div").classes("ps-one w-full"), "one") as self.place:
-            with ui.column().classes("w-full gap-2 no-wrap"):
-                with ui.row().classes("w-full items-center gap-2"):
-                    self.heading = tag(ui.label().classes("text-lg font-bold").props("role=status"), "recording")
+            with ui.column().classes("w-full ps-small-gap no-wrap"):
+                with ui.row().classes("w-full items-center ps-small-gap"):
+                    self.heading = tag(ui.label().classes("text-lg text-bold").props("role=status"), "recording")
                     self.heading.style("overflow-wrap: anywhere")
                     self.affect = ui.label().classes("q-px-sm rounded-borders").style("font-weight: 600; color: #fff")
                     self.state = tag(ui.label().classes("ps-chip").props("role=status"), "state")
@@ -233,10 +233,10 @@ class RecordingView:
                 if trims:
                     self._marks()
                 self._views()
-            with ui.column().classes("w-full gap-2"):
-                ui.label(words("review.findings")).classes("font-bold")
+            with ui.column().classes("w-full ps-small-gap"):
+                ui.label(words("review.findings")).classes("text-bold")
                 self.findings = tag(ui.column().classes("w-full"), "findings")
-                ui.label(words("review.keys")).classes("font-bold q-mt-md")
+                ui.label(words("review.keys")).classes("text-bold q-mt-md")
                 with tag(ui.element("dl").classes("ps-keys q-ma-none"), "keys"):
                     for key, does in KEYS:
                         if trims or does in _PLAIN:
@@ -250,7 +250,7 @@ class RecordingView:
 
     def _actions(self, trims: bool) -> None:
         desk = self.desk
-        with ui.row().classes("w-full items-center gap-2"):
+        with ui.row().classes("w-full items-center ps-small-gap"):
             self._button("accept" if trims else "next", lambda: self.accept(), "accept", "unelevated color=primary")
             self._button("back", desk.back, "back")
             self.exclude = self._button("exclude", self._exclude, "exclude")
@@ -259,7 +259,7 @@ class RecordingView:
     def _marks(self) -> None:
         """Build the buttons that set start and stop, as an alternative to the plot and the keyboard."""
         words = self.desk.words
-        with ui.row().classes("w-full items-center gap-2"):
+        with ui.row().classes("w-full items-center ps-small-gap"):
             side = ui.toggle({START: words("review.sets_start"), STOP: words("review.sets_stop")}, value=START)
             side.props(f'no-caps dense unelevated aria-label="{words("review.sets")}"').classes("ps-toggle")
             tag(side, "side").on_value_change(lambda e: setattr(self, "side", str(e.value)))
@@ -275,7 +275,7 @@ class RecordingView:
         words = self.desk.words
         kinds = list(dict.fromkeys(c.kind for c in self.desk.review.dataset.layout.channels))
         groups = [ALL, *(kinds if len(kinds) > 1 else []), ACTIVITY]
-        with ui.row().classes("w-full items-center gap-2"):
+        with ui.row().classes("w-full items-center ps-small-gap"):
             toggle = ui.toggle({g: self._kind(g) for g in groups}, value=ALL)
             toggle.props(f'no-caps dense unelevated aria-label="{words("review.group")}"').classes("ps-toggle")
             tag(toggle, "group").on_value_change(lambda e: self._grouped(str(e.value)))
@@ -409,8 +409,8 @@ class RecordingView:
                 key = "no_findings" if desk.review.prepared.checked else "not_checked"
                 ui.label(words(f"review.{key}")).classes("ps-dim")
             for f in row.findings:
-                with ui.column().classes("w-full gap-0").props(f'data-check="{f.check}"'):
-                    ui.label(finding_text(words, f)).classes("font-bold")
+                with ui.column().classes("w-full ps-no-gap").props(f'data-check="{f.check}"'):
+                    ui.label(finding_text(words, f)).classes("text-bold")
                     ui.label(f.message)
                     if f.accepted:
                         with ui.row().classes("items-center"):

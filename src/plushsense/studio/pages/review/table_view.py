@@ -83,8 +83,8 @@ def ask_reason(desk: ReviewController, finding: Finding | None = None) -> None:
         # Close without a transition, because the next key press is a command of the page again.
         dialog.props(f'aria-label="{words("review.reason")}" transition-duration=0')
         with tag(ui.card().classes("w-full"), "reason"):
-            ui.label(title).classes("text-lg font-bold").style("overflow-wrap: anywhere")
-            with ui.row().classes("gap-2"):
+            ui.label(title).classes("text-lg text-bold").style("overflow-wrap: anywhere")
+            with ui.row().classes("ps-small-gap"):
                 for number, key in enumerate(_EXCLUDING if finding is None else _ACCEPTING):
                     reason = words(f"review.because_{key}")
                     look = "outline autofocus" if number == 0 else "outline"
@@ -122,7 +122,7 @@ class RecordingTableView:
         self.desk = desk
         words = desk.words
         with tag(ui.column().classes("w-full"), "list") as self.place:
-            with ui.row().classes("w-full items-center gap-2"):
+            with ui.row().classes("w-full items-center ps-small-gap"):
                 self.range = tag(ui.label().classes("ps-number").props("role=status"), "range")
                 before, after = words("review.page_before"), words("review.page_after")
                 self.before = icon_button("chevron_left", before, lambda: self.turn(-1), "flat round")

@@ -351,7 +351,7 @@ class _Card:
             named(box.props(f'data-job="{job.id}" data-state="{job.state}"'), job.title)
             with ui.row().classes("w-full items-center"):
                 tag(_badge(w, job.state), "state")
-                ui.label(f"{w(f'train.kinds.{job.task}')}: {job.title}").classes("text-weight-bold")
+                ui.label(f"{w(f'train.kinds.{job.task}')}: {job.title}").classes("text-bold")
                 ui.space()
                 ui.label(moment(job.begun_s)).classes("ps-dim")
             if job.state == RUNNING:

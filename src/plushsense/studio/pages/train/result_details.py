@@ -63,7 +63,7 @@ class ResultDetailsView:
             card.props(f'aria-label="{w("train.details")}"')
             with ui.row().classes("w-full items-center"):
                 title = f"{row.data} · {row.network} · {row.split} · {row.context}"
-                heading(title, 3).classes("text-weight-bold", remove="text-lg")
+                heading(title, 3).classes("text-bold", remove="text-lg")
                 html(score_labels(w, row.leaky, row.simulated))
                 ui.space()
                 icon_button("close", w("train.close"), self._close, color=None)
