@@ -8,6 +8,7 @@ are those of Debian 12.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -181,12 +182,13 @@ def build(
 
 
 def _object_name(source: Path, command: Sequence[str], include: Iterable[Path]) -> str:
-    """Return a file name for an object file: a hash of compiler, flags, source and all files that these name."""
+    """Return a file name for an object file: a hash of compiler, flags, source and what it includes."""
     others = {file.name: file for folder in include for file in sorted(folder.glob("*.[ch]"))}
     key, texts = sha256(repr(command).encode()), [source.read_bytes()]
     for text in texts:
         key.update(text)
-        texts += [others.pop(name).read_bytes() for name in list(others) if name.encode() in text]
+        names = re.findall(r'#\s*include\s*[<"]([^>"]+)', text.decode("latin-1"))
+        texts += [others.pop(name).read_bytes() for name in names if name in others]
     return f"{key.hexdigest()}.o"
 
 
