@@ -23,25 +23,43 @@ from opponents.running import Died, Running
 from plushsense.models.arch import Arch
 from plushsense.models.reference import Network, random_weights
 from support.requirements import missing
+from support.sharing import built_once
 
 SMALL = ("--arch", "5_4d2", "--filters", "4,6", "--layout", "accel-3", "--window", "40")
 
 
 @pytest.fixture(autouse=True)
-def compiler() -> None:
+def compiler(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A C compiler, which compiles our own C once for all tests: it reads nothing of the folder of a case."""
     if shutil.which("gcc") is None:
         missing("compilers", "gcc is not installed")
+    compiled, kept = Workshop.compiled, built_once(tmp_path_factory, "peers", lambda draft: None)
+
+    def once(shop: Workshop, source: Path, name: str, *flags: str) -> Path:
+        if source.name == "window.c":
+            return compiled(shop, source, name, *flags)
+        if not (kept / f"{name}.o").exists():
+            compiled(shop, source, name, *flags).replace(kept / f"{name}.o")
+        return kept / f"{name}.o"
+
+    monkeypatch.setattr(Workshop, "compiled", once)
 
 
-def run(*more: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, str(REPO / "bench" / "peers.py"), *SMALL, "--rounds", "2", "--slice-ms", "1", *more]
-    return subprocess.run(command, capture_output=True, text=True)
+def words(*more: str) -> list[str]:
+    return [str(REPO / "bench" / "peers.py"), *SMALL, "--rounds", "2", "--slice-ms", "1", *more]
 
 
-def test_without_any_peer_ours_and_the_plain_window_are_measured() -> None:
-    done = run("--only", "plain", "--json", "--decisions", "3")
-    assert done.returncode == 0, done.stderr
-    report = json.loads(done.stdout)
+def main(monkeypatch: pytest.MonkeyPatch, *more: str) -> int:
+    monkeypatch.setattr(sys, "argv", words(*more))
+    return peers.main()
+
+
+def test_without_any_peer_ours_and_the_plain_window_are_measured(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, done = main(monkeypatch, "--only", "plain", "--json", "--decisions", "3"), capsys.readouterr()
+    assert code == 0, done.err
+    report = json.loads(done.out)
     rows = {row["name"]: row for row in report["rows"]}
     assert len(rows) == 8
     for name, row in rows.items():
@@ -60,24 +78,28 @@ def test_without_any_peer_ours_and_the_plain_window_are_measured() -> None:
     assert mine["instructions"] > rows["PlushSense C -O2, network only"]["instructions"]
 
 
-def test_a_peer_that_is_not_installed_is_named_with_how_to_get_it(tmp_path: Path) -> None:
+def test_a_peer_that_is_not_installed_is_named_with_how_to_get_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     venv.create(tmp_path / "bare", with_pip=False, symlinks=sys.platform != "win32")
     bare = next(p for p in (tmp_path / "bare").glob("*/python*") if p.stem == "python")
-    done = run("--only", "litert,executorch,onnx2c", "--python", str(bare), "--onnx2c", "nowhere", "--decisions", "0")
-    assert done.returncode == 0, done.stderr
-    lines = done.stdout.splitlines()
+    given = ("--only", "litert,executorch,onnx2c", "--python", str(bare), "--onnx2c", "nowhere", "--decisions", "0")
+    code, done = main(monkeypatch, *given), capsys.readouterr()
+    assert code == 0, done.err
+    lines = done.out.splitlines()
     for title, way in (
         ("LiteRT", "not here: pip install ai-edge-litert ai-edge-quantizer"),
         ("ExecuTorch", "not here: pip install executorch"),
         ("onnx2c", "not here: pip install onnxruntime onnx"),
     ):
-        assert any(line.startswith(title) and line.endswith(way) for line in lines), done.stdout
+        assert any(line.startswith(title) and line.endswith(way) for line in lines), done.out
     assert sum("not measured" in line for line in lines) == len(peers.TARGETS)
 
 
 @pytest.mark.parametrize("bad", [("--arch", "5_x"), ("--bundle", "nowhere.plush"), ("--cc", "no-such-compiler")])
 def test_bad_input_is_refused_in_a_sentence(bad: tuple[str, str]) -> None:
-    done = run(*bad, "--only", "none")
+    command = [sys.executable, *words(*bad, "--only", "none")]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 2 and done.stdout == ""
     assert "Traceback" not in done.stderr and done.stderr.startswith("bench/peers.py: ")
 

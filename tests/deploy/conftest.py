@@ -10,17 +10,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.deploy.emit import emit
+from plushsense.deploy.golden import answers_of
 from plushsense.deploy.package import package
 from plushsense.deploy.proof.scenarios import Scenario, scenarios_of
 from plushsense.deploy.quantize import integer_model
+from plushsense.deploy.targets import Program, build
 from plushsense.runtime.image import IntegerModel
 from plushsense.windows.features import Scaler
 from support.c_toy import C_FOLDER, TOY_C, compiled
 from support.exports import LAYOUTS, bundle_of, exported
 from support.requirements import missing
+from support.sharing import built_once
 
 Packages = dict[str, tuple[Path, IntegerModel]]
 
@@ -144,9 +148,30 @@ def packages(tmp_path_factory: pytest.TempPathFactory, needs: Callable[..., None
 
 
 @pytest.fixture(scope="session", autouse=True)
-def scenarios_made_once() -> Iterator[None]:
-    """Make the scenarios of a model once for all tests: they follow from the model and its scaler alone."""
+def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Compile once for all tests what is the same, flags included: object files are named by a hash of it."""
+    objects = built_once(tmp_path_factory, "objects", lambda draft: None)
+
+    def keeping(*args: Any, **options: Any) -> Program:
+        return build(*args, **{**options, "object_folder": objects})
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("profile", "proof.verify"):
+            patch.setattr(f"plushsense.deploy.{module}.build", keeping)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def made_once() -> Iterator[None]:
+    """Make the scenarios of a model, and its answers to frames, once for all tests: they follow from these alone."""
     made: dict[tuple[object, ...], list[Scenario]] = {}
+    answered: dict[tuple[object, ...], NDArray[np.int32]] = {}
+
+    def answers_once(model: IntegerModel, frames: NDArray[np.int64]) -> NDArray[np.int32]:
+        key = (model.to_bytes(), repr(model.gestures), frames.tobytes())
+        if key not in answered:
+            answered[key] = answers_of(model, frames)
+        return answered[key].copy()
 
     def once(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[Scenario]:
         key = (model.to_bytes(), repr(model.gestures), scaler.offset.tobytes(), scaler.scale.tobytes(), repeat)
@@ -156,4 +181,6 @@ def scenarios_made_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("plushsense.deploy.proof.vectors.scenarios_of", once)
+        for module in ("golden", "proof.vectors"):
+            patch.setattr(f"plushsense.deploy.{module}.answers_of", answers_once)
         yield

@@ -32,7 +32,7 @@ OK, TOO_SMALL = 0, 4
 # ---- The same answers ------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(models(), st.integers(0, 1 << 30))
 def test_any_network_any_stream(c_library: Any, plain_c_library: Any, model: IntegerModel, seed: int) -> None:
     frames = any_frames(model, seed)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import tempfile
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
@@ -29,6 +30,7 @@ def run(*words: object) -> None:
 _OBJECTS = tempfile.TemporaryDirectory(prefix="plushsense-objects-")
 
 
+@cache
 def compiled(source: Path, *words: object) -> Path:
     """Return the object file of a source. Nothing is compiled twice that is the same after the preprocessor."""
     command = [str(w) for w in words]

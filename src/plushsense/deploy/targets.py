@@ -8,6 +8,7 @@ are those of Debian 12.
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -136,7 +137,7 @@ def build(
 
     ``target.h`` is on the include path. Each file of ``blobs`` becomes bytes from the symbol NAME to NAME_end
     (``extern const uint8_t NAME[], NAME_end[]``), aligned to 16 bytes. ``flags`` apply to the sources and to linking,
-    not to the runtime. ``object_folder`` keeps object files for later builds.
+    not to the runtime. ``object_folder`` keeps object files, with the compiler's reports, for later builds.
 
     Raises:
         ToolError: when a compiler or emulator is missing.
@@ -147,45 +148,47 @@ def build(
     compiler = cc or machine.compiler
     out_dir = Path(out_dir).resolve()
     out_dir.mkdir(parents=True, exist_ok=True)
-    included = [f"-I{folder.resolve()}" for folder in include]
+    included = [f"-I{folder.resolve()}" for folder in (RUNTIME, *include)]
     source_flags = [optimise, *flags, *(f"-D{name}={value}" for name, value in (defines or {}).items())]
+    # Otherwise the compiler replaces the loop inside memset() by a call of memset().
+    runtime_flags = ["-O2", "-fno-tree-loop-distribute-patterns"] if machine.run else ["-O2"]
+    parts = [(source, source_flags) for source in sources]
+    parts += [(RUNTIME / name, runtime_flags) for name in machine.runtime]
     with tempfile.TemporaryDirectory(prefix="plushsense-", dir=out_dir) as work:
         objects = []
-        compiling = [compiler, *machine.flags, *source_flags]
-        for n, source in enumerate(sources):
+        for n, (source, options) in enumerate(parts):
+            compiling = [compiler, *machine.flags, *options]
             name = _object_name(source, compiling, include) if object_folder else f"{n}-{source.stem}.o"
             objects.append((object_folder or out_dir) / name)
             if object_folder and objects[-1].exists():
                 continue
-            # Programs that are built at the same time share the folder: a file appears there complete.
-            made = Path(work) / "made.o" if object_folder else objects[-1]
-            command = [*compiling, f"-I{RUNTIME}", *included, "-c", str(source.resolve()), "-o", str(made)]
-            _compile(command, Path(work), source.name)
-            made.replace(objects[-1])
-        runtime_files = [str(RUNTIME / name) for name in machine.runtime]
+            made = Path(work) / name
+            _compile([*compiling, *included, "-c", str(source.resolve()), "-o", str(made)], Path(work), source.name)
+            # Programs that are built at the same time share the folder: a file appears there complete, and the object
+            # file after the compiler's reports beside it.
+            for file in sorted(Path(work).glob(f"{made.stem}.*"), reverse=True):
+                file.replace(objects[-1].with_name(file.name))
+        inputs = [str(file) for file in objects]
         if blobs:
             paths = {name: str(Path(path).resolve()) for name, path in blobs.items()}
-            assembly = fill_text("plushsense.deploy", "c/runtime/blobs.S.j2", blobs=paths)
-            (Path(work) / "blobs.S").write_text(assembly)
-            runtime_files.append("blobs.S")
-        # Otherwise the compiler replaces the loop inside memset() by a call of memset().
-        runtime = ["-O2", "-fno-tree-loop-distribute-patterns"] if machine.run else ["-O2"]
-        command = [compiler, *machine.flags, f"-I{RUNTIME}", *runtime, "-c", *runtime_files]
-        _compile(command, Path(work), "the runtime")
+            inputs.append("blobs.S")
+            (Path(work) / inputs[-1]).write_text(fill_text("plushsense.deploy", "c/runtime/blobs.S.j2", blobs=paths))
         file = out_dir / f"program-{target}{'.exe' if sys.platform == 'win32' and not machine.run else ''}"
-        inputs = [*map(str, objects), *sorted(p.name for p in Path(work).glob("*.o"))]
         collect = ["-Wl,--gc-sections"] if machine.run else []
-        command = [compiler, *machine.flags, optimise, *flags, *collect, *inputs, "-o", str(file), *machine.link]
+        # -w, because macros in blobs.S may be empty.
+        command = [compiler, *machine.flags, optimise, *flags, "-w", *collect, *inputs, "-o", str(file), *machine.link]
         _compile(command, Path(work), "the program")
-    return Program(machine, file, tuple(objects))
+    return Program(machine, file, tuple(objects[: len(sources)]))
 
 
 def _object_name(source: Path, command: Sequence[str], include: Iterable[Path]) -> str:
-    """Return a file name for an object file: a hash of compiler, flags, source and headers."""
-    headers = sorted(header for folder in include for header in folder.glob("*.h"))
-    key = sha256(repr(command).encode())
-    for path in (source, *headers):
-        key.update(path.read_bytes())
+    """Return a file name for an object file: a hash of compiler, flags, source and what it includes."""
+    others = {file.name: file for folder in include for file in sorted(folder.glob("*.[ch]"))}
+    key, texts = sha256(repr(command).encode()), [source.read_bytes()]
+    for text in texts:
+        key.update(text)
+        names = re.findall(r'#\s*include\s*[<"]([^>"]+)', text.decode("latin-1"))
+        texts += [others.pop(name).read_bytes() for name in names if name in others]
     return f"{key.hexdigest()}.o"
 
 

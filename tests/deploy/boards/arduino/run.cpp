@@ -3,18 +3,14 @@
 #include <Arduino.h>
 
 #include <cstdlib>
-#include <fstream>
-#include <iterator>
-#include <map>
-#include <string>
 
 #include "PlushToy.ino"
 
 static uint64_t now = (uint64_t{1} << 32) - 3000000;
 static const uint64_t start = now;
-static std::string coming;
-static std::size_t heard;
-static std::map<int, int> pins;
+static std::FILE *coming;
+static std::size_t length, heard;
+static int pins[256]; // the value plus one; 0 before the first
 static uint64_t free_at; // when the line is silent again
 
 Port Serial;
@@ -24,9 +20,9 @@ uint32_t millis() { return static_cast<uint32_t>(now / 1000); }
 void pinMode(uint8_t, uint8_t) {}
 void analogWrite(uint8_t pin, int value)
 {
-    if (pins.count(pin) == 0 || pins[pin] != value)
+    if (pins[pin] != value + 1)
         std::fprintf(stderr, "%u %u %d\n", static_cast<unsigned>((now - start) / 1000), pin, value);
-    pins[pin] = value;
+    pins[pin] = value + 1;
 }
 void tone(uint8_t pin, unsigned int hz, unsigned long) { analogWrite(pin, static_cast<int>(hz)); }
 void noTone(uint8_t pin) { analogWrite(pin, 0); }
@@ -54,9 +50,13 @@ int Port::available()
 {
     std::size_t come = static_cast<std::size_t>((now - start) * 11520 / 1000000);
 
-    return static_cast<int>((come < coming.size() ? come : coming.size()) - heard);
+    return static_cast<int>((come < length ? come : length) - heard);
 }
-int Port::read() { return static_cast<unsigned char>(coming[heard++]); }
+int Port::read()
+{
+    heard++;
+    return std::fgetc(coming);
+}
 
 int main(int argc, char **argv)
 {
@@ -64,8 +64,10 @@ int main(int argc, char **argv)
     bool held[2] = {};
 
     if (argc > 2) {
-        std::ifstream file(argv[2], std::ios::binary);
-        coming.assign(std::istreambuf_iterator<char>(file), {});
+        coming = std::fopen(argv[2], "rb");
+        std::fseek(coming, 0, SEEK_END);
+        length = static_cast<std::size_t>(std::ftell(coming));
+        std::rewind(coming);
     }
     setup();
     while (now < end) {
