@@ -58,8 +58,8 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     marked(page, "facts").get_by_text("6 people, 119 recordings, 18 gestures").wait_for()
     assert marked(page, "facts").get_by_text("simulation", exact=True).is_visible()
     fill(page, "name", "by page")
-    fill(page, "epochs", "45")
-    page.wait_for_function("() => document.querySelector('[data-test=command]').textContent.includes('--epochs 45')")
+    fill(page, "epochs", "20")
+    page.wait_for_function("() => document.querySelector('[data-test=command]').textContent.includes('--epochs 20')")
     asked = command(page)
     marked(page, "start").click()
     kept = home / "datasets" / "virtual" / "cache" / "unfinished"
@@ -96,7 +96,7 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     assert done.get_by_text("simulation", exact=True).is_visible()
     # The curve begins with the first epoch, though three runs drew it.
     (job,) = (json.loads(path.read_text(encoding="utf-8")) for path in (home / "work").glob("*.json"))
-    assert [r["epoch"] for r in job["reports"] if r["stage"] == "training" and "epoch" in r] == list(range(1, 46))
+    assert [r["epoch"] for r in job["reports"] if r["stage"] == "training" and "epoch" in r] == list(range(1, 21))
     page.locator('[data-column="kind"]').get_by_text("training").nth(1).wait_for()
     by_page = (home / "bundles" / "by page.plush").read_bytes()
     assert not list(kept.glob("[!.]*.npz"))
