@@ -60,6 +60,17 @@ def real_data() -> Path:
 
 
 @pytest.fixture(scope="session")
+def four_people(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set of the real recordings of four people, to copy."""
+    from plushsense.dataset.importing.importers import import_recordings
+
+    folder = tmp_path_factory.mktemp("four")
+    for person in ("P01", "P02", "P03", "P04"):
+        shutil.copytree(real_data / "makeability-gestures" / person, folder / "raw" / person)
+    return import_recordings(folder / "raw", folder / "DS", layout="accel-3").dataset.path
+
+
+@pytest.fixture(scope="session")
 def pty_possible() -> None:
     """Pseudo-terminals, which stand in for a serial port."""
     try:
