@@ -60,6 +60,15 @@ def real_data() -> Path:
 
 
 @pytest.fixture(scope="session")
+def imported_study(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The import of all real recordings of gestures; never to be changed by a test."""
+    from plushsense.dataset.importing.importers import import_recordings
+
+    folder = tmp_path_factory.mktemp("study")
+    return import_recordings(real_data / "makeability-gestures", folder / "DS", layout="accel-3")
+
+
+@pytest.fixture(scope="session")
 def four_people(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data set of the real recordings of four people, to copy."""
     from plushsense.dataset.importing.importers import import_recordings
