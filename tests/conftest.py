@@ -42,6 +42,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.slow)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def one_processor() -> Iterator[None]:
+    """Make trainings run in this process where a test does not say how many workers: each would import PyTorch."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "cpu_count", lambda: 1)
+        yield
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of real recordings beside the checkout; it is never committed."""
@@ -49,6 +57,26 @@ def real_data() -> Path:
     if not (folder / "makeability-gestures").is_dir():
         missing("data", f"no real recordings at {folder}")
     return folder
+
+
+@pytest.fixture(scope="session")
+def imported_study(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The import of all real recordings of gestures; never to be changed by a test."""
+    from plushsense.dataset.importing.importers import import_recordings
+
+    folder = tmp_path_factory.mktemp("study")
+    return import_recordings(real_data / "makeability-gestures", folder / "DS", layout="accel-3")
+
+
+@pytest.fixture(scope="session")
+def four_people(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set of the real recordings of four people, to copy."""
+    from plushsense.dataset.importing.importers import import_recordings
+
+    folder = tmp_path_factory.mktemp("four")
+    for person in ("P01", "P02", "P03", "P04"):
+        shutil.copytree(real_data / "makeability-gestures" / person, folder / "raw" / person)
+    return import_recordings(folder / "raw", folder / "DS", layout="accel-3").dataset.path
 
 
 @pytest.fixture(scope="session")

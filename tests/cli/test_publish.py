@@ -6,18 +6,26 @@ import json
 import stat
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from plushsense.dataset.store import Dataset
+from plushsense.evaluation.reidentification import reidentify
 
 Cli = Callable[..., Any]
 CONTACT = ("--contact", "Ada <ada@example.org>")
 SAID = (*CONTACT, "--licence", "CC-BY-4.0", "--consent", "all agreed")
 
 pytestmark = pytest.mark.usefixtures("publish_tools")
+
+
+@pytest.fixture(autouse=True)
+def few_trees(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a smaller forest look for the people: how well it finds them is not tested here."""
+    monkeypatch.setattr("plushsense.workflow.datasets.reidentify", partial(reidentify, trees=20))
 
 
 def test_from_refusal_to_a_valid_package(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.recorder_csv import Frames
-from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.onset import suggest
 from plushsense.dataset.trimming import suggest_trims
 from plushsense.devices.virtual.session import VirtualSession
@@ -141,11 +141,11 @@ def test_a_hand_that_lies_still_is_no_rest() -> None:
     assert min(ends) > -1.0
 
 
-def test_suggestions_lie_near_the_marks_made_by_eye(real_data: Path, tmp_path: Path) -> None:
+def test_suggestions_lie_near_the_marks_made_by_eye(imported_study: Any) -> None:
     """The figures are in docs/trim.md (bench/onsets.py prints them); these floors are well below them."""
     with MARKS.open(encoding="utf-8", newline="") as file:
         marked = {row["recording"]: row for row in csv.DictReader(file)}
-    dataset = import_recordings(real_data / "makeability-gestures", tmp_path / "DS", layout="accel-3").dataset
+    dataset = imported_study.dataset
     found = suggest_trims(dataset, [r for r in dataset.recordings if r.id in marked])
     assert len(found) == len(marked) >= 60
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from plushsense.cli.main import main
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.index import open_dataset
 from plushsense.dataset.store import Dataset
 
 ACCEL = load_layout("accel-3")
@@ -87,16 +89,22 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def imported(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data set of ``recordings``, to copy."""
+    return import_recordings(recordings, tmp_path_factory.mktemp("imported") / "DS", layout="accel-3").dataset.path
+
+
 @pytest.fixture
-def dataset(recordings: Path, tmp_path: Path) -> Dataset:
+def dataset(imported: Path, tmp_path: Path) -> Dataset:
     """A data set of one's own: evaluations keep their folds in it."""
-    return import_recordings(recordings, tmp_path / "DS", layout="accel-3").dataset
+    return open_dataset(shutil.copytree(imported, tmp_path / "DS"))
 
 
 @pytest.fixture(scope="session")
-def bundle(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bundle(imported: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     import plushsense as ps
 
     folder = tmp_path_factory.mktemp("bundle")
-    made = ps.import_recordings(recordings, folder / "DS", layout="accel-3").dataset
+    made = shutil.copytree(imported, folder / "DS")
     return ps.train(made, epochs=10, filters=(4, 4, 4)).save(folder / "model.plush")

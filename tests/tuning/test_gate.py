@@ -149,8 +149,8 @@ def test_neither_humidity_nor_the_hand_matters_much(fitted: GateFit, world: Worl
 
 
 def test_a_lower_rate_allows_fewer_false_alarms(virtual: Dataset) -> None:
-    few = fit_gate(virtual, virtual.gestures, virtual.subjects[:5], false_alarms_per_hour=0.1).report
-    many = fit_gate(virtual, virtual.gestures, virtual.subjects[:5], false_alarms_per_hour=60.0).report
+    few = fit_gate(virtual, virtual.gestures, virtual.subjects[:3], false_alarms_per_hour=0.1).report
+    many = fit_gate(virtual, virtual.gestures, virtual.subjects[:3], false_alarms_per_hour=60.0).report
     assert few["false_alarms_per_hour"] <= many["false_alarms_per_hour"]
     assert few["recall"] <= many["recall"]
 
@@ -158,14 +158,14 @@ def test_a_lower_rate_allows_fewer_false_alarms(virtual: Dataset) -> None:
 def test_one_energetic_gesture_is_named(virtual: Dataset) -> None:
     calm = [dataclasses.replace(g, energetic=g.label == "Tail hit 2") for g in virtual.gestures.gestures]
     chosen = GestureSet("one", tuple(g for g in calm if g.label not in ("Tail hit 1", "Tail pull")))
-    fit = fit_gate(virtual, chosen, virtual.subjects[:5])
+    fit = fit_gate(virtual, chosen, virtual.subjects[:3])
     assert fit.plan.rules and {r.gesture for r in fit.plan.rules} == {chosen.index("Tail hit 2")}
     assert set(fit.report["recall_by_gesture"]) == {"Tail hit 2"}
 
 
 def test_gestures_without_affect_give_rules_without_one(virtual: Dataset) -> None:
     plain = [dataclasses.replace(g, affect="none") for g in virtual.gestures.gestures]
-    fit = fit_gate(virtual, GestureSet("plain", tuple(plain)), virtual.subjects[:5])
+    fit = fit_gate(virtual, GestureSet("plain", tuple(plain)), virtual.subjects[:3])
     assert {rule.affect for rule in fit.plan.rules} == {AFFECT_CODES["none"]}
 
 

@@ -14,7 +14,7 @@ from plushsense.workflow import demo
 from plushsense.workflow.demo import DemoSize
 
 REPO = Path(__file__).resolve().parents[2]
-TINY = DemoSize(people=4, repetitions=1, epochs=2, folds=2, live_s=25.0)
+TINY = DemoSize(people=4, repetitions=1, epochs=1, folds=2, live_s=15.0)
 
 
 def test_demo_twice(cli: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,7 +52,7 @@ def test_the_quickstart_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    module.main(tmp_path, people=4, epochs=2, seconds=6.0)
+    module.main(tmp_path, people=4, epochs=1, seconds=4.0)
     said = capsys.readouterr().out
     assert "33520 multiply-accumulates" in said
     assert (tmp_path / "model.plush").is_file()

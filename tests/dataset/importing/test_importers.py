@@ -1,5 +1,6 @@
 import hashlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -194,8 +195,8 @@ def test_labelled_rows_become_recordings_of_a_stream(tmp_path: Path) -> None:
     assert np.array_equal(done.dataset.read(walk).values, frames.values[50:120])
 
 
-def test_makeability_imports_whole(real_data: Path, tmp_path: Path) -> None:
-    done = import_recordings(real_data / "makeability-gestures", tmp_path / "DS", layout="accel-3")
+def test_makeability_imports_whole(imported_study: Any) -> None:
+    done = imported_study
     assert (done.recordings, done.subjects, done.streams) == (1485, 27, 24)
     assert [r["file"] for r in done.rejected] == ["LICENSE"]
     text = "\n".join(done.warnings)

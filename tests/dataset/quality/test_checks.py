@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -498,9 +499,8 @@ def test_simulated_sessions_raise_no_alarm(tmp_path: Path) -> None:
     assert {f.check for f in result.findings if f.severity == "info"} <= {"duration", "garbage"}
 
 
-def test_the_real_recordings_known_faults_are_found(real_data: Path, tmp_path: Path) -> None:
-    dataset = import_recordings(real_data / "makeability-gestures", tmp_path / "DS", layout="accel-3").dataset
-    result = check(dataset)
+def test_the_real_recordings_known_faults_are_found(real_data: Path, imported_study: Any) -> None:
+    result = check(imported_study.dataset)
     assert [f.recording for f in result.findings_of("never-stopped")] == ["P22/Forehand Tennis_1589429213972_18907"]
     assert {f.recording for f in result.findings_of("clock-reset") if f.recording} == {
         "P27/Jumping Jack_1589674214418_191"

@@ -187,15 +187,15 @@ def test_one_that_diverges_is_left_out(dataset: Dataset, tmp_path: Path, monkeyp
     assert {row["why"] for row in sweep_json["failed"]} == {"the loss is no number"}
 
 
-def test_killed_in_every_rung_and_gone_on_with(real_data: Path, tmp_path: Path) -> None:
+def test_killed_in_every_rung_and_gone_on_with(four_people: Path, tmp_path: Path) -> None:
     """Real recordings, ``kill -9`` once in each rung: each training once, the outcome that of an undisturbed search."""
-    import_recordings(real_data / "makeability-gestures", tmp_path / "DS", layout="accel-3")
-    shutil.copytree(tmp_path / "DS", tmp_path / "whole")
+    for name in ("DS", "whole"):
+        shutil.copytree(four_people, tmp_path / name)
     options = {
         "architectures": "20d2_16d4_20d8,19d1_24d3_19d9,14d1_19d2_19d4,126d2",
         "filters": "2,2,2,2",
         "split": "by-subject:2",
-        "batches": "256",
+        "batches": "32",
         "rungs": "1,2,4",
         "share": "0.8",
     }

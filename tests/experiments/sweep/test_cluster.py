@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,6 @@ import polars
 import pytest
 from polars.testing import assert_frame_equal
 
-from plushsense.dataset.importing.importers import import_recordings
 from plushsense.experiments.sweep.run import sweep
 from plushsense.jobs.progress import JobProgress
 from plushsense.trials.plan import JOURNAL
@@ -38,9 +38,9 @@ class Killer:
             self.thread.start()
 
 
-def test_a_node_lost_in_a_sweep_changes_nothing(two_nodes: Any, real_data: Path, tmp_path: Path) -> None:
+def test_a_node_lost_in_a_sweep_changes_nothing(two_nodes: Any, four_people: Path, tmp_path: Path) -> None:
     for name in ("DS", "whole"):
-        import_recordings(real_data / "makeability-gestures", tmp_path / name, layout="accel-3")
+        shutil.copytree(four_people, tmp_path / name)
     killer = Killer(two_nodes)
     found = sweep(tmp_path / "DS", out=tmp_path / "out", cluster=two_nodes.address, progress=killer, **GRID)
     assert killer.thread is not None, "a node was to be killed in the middle"
@@ -54,9 +54,9 @@ def test_a_node_lost_in_a_sweep_changes_nothing(two_nodes: Any, real_data: Path,
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere.invalid:6379"])
-def test_a_cluster_that_is_not_there(address: str, cluster_possible: None, real_data: Path, tmp_path: Path) -> None:
+def test_a_cluster_that_is_not_there(address: str, cluster_possible: None, four_people: Path, tmp_path: Path) -> None:
     from plushsense.core.errors import PlushSenseError
 
-    import_recordings(real_data / "makeability-gestures", tmp_path / "DS", layout="accel-3")
+    shutil.copytree(four_people, tmp_path / "DS")
     with pytest.raises(PlushSenseError, match=address.split(":")[0]):
         sweep(tmp_path / "DS", out=tmp_path / "out", cluster=address, **GRID)

@@ -346,18 +346,17 @@ def test_a_bad_grid_is_refused_with_all_its_problems(cli: Any, dataset: Dataset,
     assert taken.status == 2 and "is a file" in taken.err
 
 
-def test_killed_three_times_and_gone_on_with(real_data: Path, tmp_path: Path) -> None:
+def test_killed_three_times_and_gone_on_with(cli: Any, four_people: Path, tmp_path: Path) -> None:
     """Real recordings, ``kill -9`` at three random moments: each training once, tables as of an undisturbed run."""
-    source = real_data / "makeability-gestures"
-    import_recordings(source, tmp_path / "DS", layout="accel-3")
-    shutil.copytree(tmp_path / "DS", tmp_path / "whole")
+    for name in ("DS", "whole"):
+        shutil.copytree(four_people, tmp_path / name)
     words = [
         "--architectures",
         "20d2_16d4_20d8,19d1_24d3_19d9,1d1_27d3_20d9,14d1_19d2_19d4,126d2",
         "--filters",
         "2,2,2,2",
     ]
-    words += ["--epochs", "1,2", "--batches", "256,full", "--out", str(tmp_path / "out"), "--json"]
+    words += ["--epochs", "1,2", "--batches", "64,full", "--out", str(tmp_path / "out"), "--json"]
     journal = tmp_path / "DS" / "cache" / "sweeps"
 
     def finished() -> dict[str, bytes]:
@@ -385,11 +384,9 @@ def test_killed_three_times_and_gone_on_with(real_data: Path, tmp_path: Path) ->
         assert len(before) < len(now) < 10, "some were done, some not"
         assert all(now[name] == content for name, content in before.items()), "not trained again"
         before = now
-    done = subprocess.run(
-        [*COMMAND, str(tmp_path / "DS"), *words, "--workers", "1"], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+    done = cli("sweep", tmp_path / "DS", *words, "--workers", "1")
+    assert done.status == 0, done.err
+    found = done.json
     assert (found["trials"], found["done"], found["trainings_resumed"]) == (20, 20, len(before))
     after = finished()
     assert len(after) == 10 and all(after[name] == content for name, content in before.items())
