@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from support.browsing import CHROMIUM, Look, Studio
+from support.browsing import CHROMIUM, Look, Studio, find_chromium
 
 PLOT = "document.querySelector('[data-test=plot]')"
 
@@ -34,7 +34,7 @@ def main() -> None:
         home = Path(place) / "home"
         shutil.copytree(args.dataset, home / "datasets" / "copy", ignore=shutil.ignore_patterns("cache", "marks*"))
         studio = Studio(home).start()
-        found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+        found = find_chromium()
         browser = driver.chromium.launch(executable_path=found, headless=True, args=CHROMIUM)
         try:
             page = Look(browser.new_context(viewport={"width": 1280, "height": 800})).open(

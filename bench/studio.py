@@ -21,7 +21,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -32,8 +31,9 @@ from typing import Any
 
 import numpy as np
 
-CHROMIUM = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
-CHROMIUM += ["--disable-component-update", "--disable-sync", "--enable-precise-memory-info"]
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from support.browsing import CHROMIUM, find_chromium
+
 _LOOK = "() => { const s = window.plushsenseLive; return {...s, delays: [...s.delays], painted: [...s.painted]}; }"
 
 
@@ -160,7 +160,6 @@ def measure(model: Path, speed: float, seconds: float, watched: str, tabs: int =
     """Measure one toy, one studio and one browser: ``watched`` is "real" or "memory"."""
     from playwright.sync_api import sync_playwright
 
-    found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     with tempfile.TemporaryDirectory() as folder:
         here = Path(folder)
         toy = Program("toy", "--tcp", "0", "--speed", f"{speed:g}", "--person", "31", cwd=here)
@@ -168,7 +167,9 @@ def measure(model: Path, speed: float, seconds: float, watched: str, tabs: int =
         studio = Program("studio", "--home", str(here / "home"), *options, cwd=here)
         try:
             with sync_playwright() as driver:
-                browser = driver.chromium.launch(executable_path=found, headless=True, args=CHROMIUM)
+                browser = driver.chromium.launch(
+                    executable_path=find_chromium(), headless=True, args=[*CHROMIUM, "--enable-precise-memory-info"]
+                )
                 page = browser.new_page(viewport={"width": 1280, "height": 900})
                 page.goto(f"{studio.url}/live")
                 begin(page)

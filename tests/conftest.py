@@ -24,9 +24,10 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 
 REPO = Path(__file__).resolve().parents[1]
 # CI draws the same examples every time, so that a change is judged by itself; at a desk they are new ones each time.
-settings.register_profile("ci", derandomize=True, print_blob=True)
-if os.environ.get("PLUSHSENSE_REQUIRE"):
-    settings.load_profile("ci")
+# No example has a deadline, which a busy machine would miss.
+settings.register_profile("desk", deadline=None)
+settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True)
+settings.load_profile("ci" if os.environ.get("PLUSHSENSE_REQUIRE") else "desk")
 
 
 # Folders and fixtures of tests that take seconds; `make test-quick` leaves them out.
@@ -34,8 +35,14 @@ SLOW_FOLDERS = {"bench", "cli", "deploy", "experiments", "studio", "workflow"}
 SLOW_FIXTURES = {"real_data", "c_compiler", "target_here", "two_nodes", "lsl_possible", "publish_tools", "pty_possible"}
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """Run three tests on two processors, as the tests of the studio wait a third of their time."""
+    return max(2, 3 * (os.cpu_count() or 1) // 2)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that `make test-quick` leaves out."""
+    """Mark the tests that `make test-quick` leaves out, and begin with those of the studio, beside others that compute."""
+    items.sort(key=lambda item: item.path.parent.name != "studio")
     for item in items:
         folder = item.path.relative_to(REPO / "tests").parts[0]
         if folder in SLOW_FOLDERS or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):

@@ -125,7 +125,7 @@ def test_unreadable_files_are_refused_in_one_sentence(tmp_path: Path, content: b
         read_recording(path, ACCEL)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.binary(max_size=400) | st.text(alphabet="0123456789,; \r\n.-enaif", max_size=400).map(str.encode))
 def test_any_bytes_are_read_or_refused(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
     path = tmp_path_factory.mktemp("fuzz") / "x_1_2.csv"

@@ -32,7 +32,7 @@ OK, TOO_SMALL = 0, 4
 # ---- The same answers ------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(models(), st.integers(0, 1 << 30))
 def test_any_network_any_stream(c_library: Any, plain_c_library: Any, model: IntegerModel, seed: int) -> None:
     frames = any_frames(model, seed)
@@ -93,7 +93,7 @@ def test_every_edge(c_library: Any, plain_c_library: Any) -> None:
         assert 1 not in best
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(models(longest=200))
 def test_memory_is_what_python_says(c_library: Any, model: IntegerModel) -> None:
     image = model.to_bytes()
@@ -227,14 +227,14 @@ def test_the_clocks_wrap_is_a_restart(c_library: Any) -> None:
 int32s = st.integers(*INT32) | st.sampled_from((*INT32, 0, -1, 1))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(int32s, st.integers(0, 30))
 def test_shift_down(c_library: Any, v: int, n: int) -> None:
     assert c_library.try_shift_down(v, n) == v >> n
     assert c_library.try_as_signed(ctypes.c_uint32(v)) == v
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     st.integers(0, 2**64 - 1)
     | st.integers(0, 2**32 - 1).map(lambda r: r * r)
@@ -244,13 +244,13 @@ def test_square_root(c_library: Any, v: int) -> None:
     assert c_library.try_root(v) == math.isqrt(v)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(int32s)
 def test_square(c_library: Any, v: int) -> None:
     assert c_library.try_square(v) == v * v
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 @given(st.data())
 def test_interpolation_in_32_bits(c_library: Any, data: st.DataObject) -> None:
     """Of any distance and any gap that a model may have; ``add`` is at most half of ``by``."""

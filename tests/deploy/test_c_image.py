@@ -295,7 +295,7 @@ def test_sanitizers_find_nothing_in_good_models(sanitized: list[Path], tmp_path:
     """Extremes on purpose: full ranges, garbage, gaps, saturated scales."""
     found = []
 
-    @settings(max_examples=25, deadline=None, database=None)
+    @settings(max_examples=25, database=None)
     @given(models(longest=200), st.integers(0, 1 << 30))
     def collect(model: IntegerModel, seed: int) -> None:
         frames = any_frames(model, seed, 450)

@@ -154,7 +154,7 @@ def test_loss_follows_the_real_period() -> None:
 
 
 @given(st.lists(st.binary(max_size=400), max_size=8))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_noise_never_breaks_the_next_frame(pieces: list[bytes]) -> None:
     parser = LineParser(PLUSH)
     for piece in pieces:
@@ -165,7 +165,7 @@ def test_noise_never_breaks_the_next_frame(pieces: list[bytes]) -> None:
 
 
 @given(st.binary(max_size=3000), st.lists(st.integers(1, 50), min_size=1, max_size=20))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_how_bytes_are_cut_into_pieces_does_not_matter(noise: bytes, cuts: list[int]) -> None:
     data = GOOD + noise + b"\n" + GOOD
     whole = LineParser(PLUSH)
@@ -204,7 +204,7 @@ FIELDS = st.one_of(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.sampled_from(["accel-3", "plush-14"]), st.data())
 def test_a_plain_line_is_read_at_one_look_as_field_by_field(layout: str, data: st.DataObject) -> None:
     chosen = load_layout(layout)

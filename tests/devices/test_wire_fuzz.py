@@ -98,7 +98,7 @@ def is_frame(layout: Layout, line: bytes) -> bool:
 
 
 @given(streams(), st.lists(st.integers(1, 70), min_size=1, max_size=12), st.booleans())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_the_cuts_do_not_matter(stream: tuple[Layout, bytes], sizes: list[int], joining: bool) -> None:
     layout, data = stream
     expected, whole = parse(layout, [data], joining=joining)
@@ -109,7 +109,7 @@ def test_the_cuts_do_not_matter(stream: tuple[Layout, bytes], sizes: list[int], 
 
 
 @given(streams())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @example((LAYOUTS["plush-14"], b"1 2 3 4 5 6 7 8 9 10 11 12 13 9007199254740992\n" * 3))
 @example((LAYOUTS["accel-3"], b"1 2\r3 4\n5 6 7 8\r"))
 def test_every_whole_frame_is_found_and_all_lines_are_accounted_for(stream: tuple[Layout, bytes]) -> None:
@@ -131,7 +131,7 @@ def test_every_whole_frame_is_found_and_all_lines_are_accounted_for(stream: tupl
 
 
 @given(st.sampled_from(sorted(LAYOUTS)), st.lists(st.binary(max_size=300), max_size=10), st.booleans())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_any_bytes_at_all(name: str, pieces: list[bytes], joining: bool) -> None:
     layout = LAYOUTS[name]
     parser = LineParser(layout, joining=joining)

@@ -92,7 +92,7 @@ def test_stream_equals_windows_around_the_warm_up(symbol: str, norm: str) -> Non
     np.testing.assert_allclose(list(decided.values()), expected, atol=1e-9)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.sampled_from(PADDINGS), st.lists(st.integers(0, 700), max_size=6), st.sampled_from((1, 4, 5)))
 def test_blocks_of_any_size_decide_alike(padding: str, sizes: list[int], step: int) -> None:
     arch = Arch.parse("4d1_3d2_2d5", (5, 4, 6), padding=padding, step=step, **SMALL)

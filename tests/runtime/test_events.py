@@ -424,7 +424,7 @@ PLANS = st.builds(
 )
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(PLANS, SHARES, st.integers(5, 30), st.integers(0, 32767))
 def test_a_single_step_never_flips_a_hug_to_a_hit(
     plan: EventSettings, odd: dict[int, float], at: int, smoothing: int
@@ -436,7 +436,7 @@ def test_a_single_step_never_flips_a_hug_to_a_hit(
         assert all(u.affect == POSITIVE and u.gesture in (STROKE, NO_GESTURE) for u in updates), now
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     PLANS,
     st.lists(st.tuples(SHARES, st.integers(0, 19)), min_size=1, max_size=80),

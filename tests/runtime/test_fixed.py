@@ -47,7 +47,7 @@ shifts = edged(0, 30)
 multipliers = edged(0, ONE - 1)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(int32s, int32s, edged(0, 16), multipliers, edged(-(1 << 30), (1 << 30) - 1), shifts)
 def test_inputs(x: int, offset: int, before: int, multiplier: int, bias: int, after: int) -> None:
     scale = InputScale(*([v] for v in (offset, before, multiplier, bias, after)))  # type: ignore[arg-type]
@@ -59,7 +59,7 @@ def test_inputs(x: int, offset: int, before: int, multiplier: int, bias: int, af
     assert scale.apply([x]).tolist() == [max(0, min(255, wanted))]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(int32s, shifts, multipliers, shifts)
 def test_requantize(total: int, before: int, multiplier: int, after: int) -> None:
     scale = Requantize(*([v] for v in (before, multiplier, after)))  # type: ignore[arg-type]
@@ -71,7 +71,7 @@ def test_requantize(total: int, before: int, multiplier: int, after: int) -> Non
     assert scale.apply(np.array([total])).tolist() == [wanted]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(int32s, shifts, multipliers, shifts)
 def test_logits(total: int, before: int, multiplier: int, after: int) -> None:
     scale = LogitScale(*([v] for v in (before, multiplier, after)))  # type: ignore[arg-type]
@@ -90,7 +90,7 @@ def test_exponentials() -> None:
 logit_rows = st.lists(edged(-16384, 16384), min_size=2, max_size=255)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(logit_rows)
 def test_softmax(logits: list[int]) -> None:
     coarse, fine = (table.tolist() for table in exponentials())
@@ -111,7 +111,7 @@ def test_softmax_of_all_the_same_and_of_one_winner() -> None:
     assert softmax(np.array([-16384, 16384, -16384])).tolist() == [0, ONE, 0]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(edged(0, ONE << 12), edged(0, ONE), edged(1, ONE))
 def test_smoothing(mean: int, probability: int, weight: int) -> None:
     d = s32((probability << 12) - mean)
@@ -155,7 +155,7 @@ def test_smoothing_weight() -> None:
     assert smoothing_weight(1e-6, 0.05) == ONE
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.floats(1e-12, 1e4), st.floats(1, 1e6), st.sampled_from((22, 30)))
 def test_a_ratio_is_kept_to_15_bits(ratio: float, full: float, most_after: int) -> None:
     highest = full / ratio
@@ -173,7 +173,7 @@ def test_a_ratio_is_kept_to_15_bits(ratio: float, full: float, most_after: int) 
         assert abs(multiplier - ratio * 2.0 ** (before + after)) <= 0.5
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.floats(1e-7, 1.0), st.integers(0, (1 << 31) - 1))
 def test_a_requantized_sum_is_the_product_rounded(ratio: float, total: int) -> None:
     row = split_ratio(ratio, 255 / ratio)

@@ -42,7 +42,7 @@ class Reader:
         return found
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(models(longest=300))
 def test_read_back(model: IntegerModel) -> None:
     """By the table of the module's docstring, and by nothing else."""

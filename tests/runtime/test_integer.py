@@ -26,7 +26,7 @@ def samples_of(model: IntegerModel, n: int, seed: int) -> np.ndarray:
     return np.clip(x, *INT32)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(models(longest=300), st.integers(0, 1 << 30))
 def test_a_window_and_a_stream_agree(model: IntegerModel, seed: int) -> None:
     """Whatever the sizes of the pieces in which the stream comes."""
@@ -48,7 +48,7 @@ def test_a_window_and_a_stream_agree(model: IntegerModel, seed: int) -> None:
     assert np.array_equal(again, got)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(models(longest=130), st.integers(0, 1 << 30))
 def test_against_loops_of_plain_integers(model: IntegerModel, seed: int) -> None:
     """Every sum on its way fits 32 bits, or wraps once where the C lets it wrap: weights + 128."""

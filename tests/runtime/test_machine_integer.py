@@ -152,7 +152,7 @@ def test_a_real_session(library: Any, real_data: Path) -> None:
     assert (found[:, 2] == 1).sum() > 1000
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(STREAMS, SPECS)
 def test_events_are_the_c_librarys_to_the_step(library: Any, frames: Frames, spec: DecideSpec) -> None:
     rows = zip(frames.device_ms.tolist(), frames.values.tolist(), strict=True)

@@ -28,7 +28,7 @@ SPEC = DecideSpec(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.too_slow])
 @given(STREAMS, SPECS)
 def test_replay_is_live(engine: str, frames: Frames, spec: DecideSpec) -> None:
     same(BUNDLE, spec, engine, frames)

@@ -30,7 +30,7 @@ def check_partition(folds: list[Fold], n: int, whole: bool = True) -> None:
         assert sorted(tested) == list(range(n))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(people=st.integers(3, 12), nobody=st.integers(0, 20), k=st.integers(2, 12), seed=st.integers(0, 99))
 def test_subject_wise_folds_keep_whole_people_apart(people: int, nobody: int, k: int, seed: int) -> None:
     subject, label = study(people, repetitions=1, nobody=nobody)
@@ -146,7 +146,7 @@ def test_too_few_people_and_unknown_people_are_refused() -> None:
     assert make_folds(parse_split("by-recording:3"), subject, label)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 10_000))
 def test_purge_keeps_exactly_what_touches_no_tested_row(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from support.browsing import CHROMIUM, DESK, Look, Studio, is_own
+from support.browsing import CHROMIUM, DESK, Look, Studio, find_chromium, is_own
 from support.requirements import missing
 from support.sharing import built_once
 
@@ -41,9 +41,9 @@ def studio(tmp_path: Path) -> Iterator[Callable[..., Studio]]:
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Browser]:
     """Debian's Chromium, headless, driven by Playwright, whose loop stays in this thread while it lives: a module."""
-    found = shutil.which("chromium-headless-shell") or shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    found = find_chromium()
     if found is None:
-        missing("browser", "chromium is not installed")
+        missing("browser", "neither chromium-headless-shell nor chromium is installed")
     if importlib.util.find_spec("playwright") is None or importlib.util.find_spec("nicegui") is None:
         missing("browser", "playwright or nicegui is not installed")
     from playwright.sync_api import sync_playwright

@@ -1,4 +1,4 @@
-"""Ten minutes of a virtual toy at up to twenty times the speed: every gesture is seen with its affect, and nothing grows.
+"""Ten minutes of a virtual toy at twenty times the speed: every gesture is seen with its affect, and nothing grows.
 
 What is asked of the bundle is honest only for the virtual toy: it was trained on ten of its people and reads one
 whom it never met. Where this was written it found all 69 gestures of the ten minutes; one in fifty may be missed, since
@@ -44,7 +44,7 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("reader")
     simulate(folder / "made", people=10, dataset=folder / "set")
-    trained = ps.train(folder / "set", preset="people", epochs=30, context="anywhere")
+    trained = ps.train(folder / "set", preset="people", epochs=24, context="anywhere")
     return trained.save(folder / "reader.plush")
 
 

@@ -6,6 +6,7 @@ import asyncio
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import socket
 import sys
@@ -36,6 +37,7 @@ CHROMIUM = [
     "--disable-component-update",
     "--disable-sync",
 ]
+_PROGRAMS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 _START_S = 60.0
 _WAIT_MS = 60_000
 _SETTLE_MS = 200
@@ -172,6 +174,11 @@ class Look:
         page.goto(url)
         connected(page)
         return page
+
+
+def find_chromium() -> str | None:
+    """Return the path of the browser; the headless shell loads a page in half of the processor time."""
+    return next(filter(None, map(shutil.which, _PROGRAMS)), None)
 
 
 def connected(page: Page) -> None:

@@ -71,7 +71,7 @@ steps = st.lists(st.one_of(st.integers(0, 40), st.integers(90, 130), st.integers
 value = st.one_of(st.integers(-40_000, 40_000), st.sampled_from([-32768, 32767, 32768, -32769]))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.data(), steps)
 def test_stream_equals_batch_in_every_bit(data: st.DataObject, moves: list[int]) -> None:
     clock = np.cumsum([0, *moves]).tolist()

@@ -34,7 +34,7 @@ def some(examples: int) -> Any:
     """So many examples, or PLUSHSENSE_FUZZ times as many for a long look."""
     examples *= int(os.environ.get("PLUSHSENSE_FUZZ", "1"))
     quiet = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture, HealthCheck.data_too_large]
-    return settings(max_examples=examples, deadline=None, suppress_health_check=quiet, print_blob=True)
+    return settings(max_examples=examples, suppress_health_check=quiet, print_blob=True)
 
 
 class Place:

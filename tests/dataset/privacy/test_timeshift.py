@@ -131,7 +131,7 @@ def malformed(draw: st.DrawFn) -> str:
     return line if len(re.findall(r"[^;,\s]+", line)) != 5 else line + ",1"
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(lines=st.lists(malformed(), max_size=6), end=st.sampled_from(["\n", "\r\n"]))
 def test_whatever_a_line_holds_no_date_is_left_and_no_line_lost(lines: list[str], end: str) -> None:
     first = f"{NOW}, 5000, 1, 2, 3"

@@ -100,7 +100,7 @@ def test_within_one_standard_error_of_the_best_is_said() -> None:
     assert set(found.equals) == {n for n, gap in apart.items() if gap <= last.error}
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     costs=st.lists(st.floats(0.05, 20.0), min_size=2, max_size=30),
     seed=st.integers(0, 10_000),
