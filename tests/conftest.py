@@ -41,7 +41,7 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that `make test-quick` leaves out, and begin with those of the studio, beside others that compute."""
+    """Mark the tests that `make test-quick` leaves out; begin with those of the studio, which wait a lot."""
     items.sort(key=lambda item: item.path.parent.name != "studio")
     for item in items:
         folder = item.path.relative_to(REPO / "tests").parts[0]
