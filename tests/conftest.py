@@ -35,6 +35,7 @@ SLOW_FOLDERS = {"bench", "cli", "deploy", "experiments", "studio", "workflow"}
 SLOW_FIXTURES = {"real_data", "c_compiler", "target_here", "two_nodes", "lsl_possible", "publish_tools", "pty_possible"}
 
 
+@pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
     """Run three tests on two processors, as the tests of the studio wait a third of their time."""
     return max(2, 3 * (os.cpu_count() or 1) // 2)
