@@ -32,6 +32,7 @@ settings.load_profile("ci" if os.environ.get("PLUSHSENSE_REQUIRE") else "desk")
 
 # Folders and fixtures of tests that take seconds; `make test-quick` leaves them out.
 SLOW_FOLDERS = {"bench", "cli", "deploy", "experiments", "studio", "workflow"}
+LONGEST = {"test_train.py", "test_live_long.py"}
 SLOW_FIXTURES = {"real_data", "c_compiler", "target_here", "two_nodes", "lsl_possible", "publish_tools", "pty_possible"}
 
 
@@ -41,9 +42,15 @@ def pytest_xdist_auto_num_workers() -> int:
     return max(2, 3 * (os.cpu_count() or 1) // 2)
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Do not import tests of a folder that `make test-quick` leaves out."""
+    parts = collection_path.relative_to(REPO / "tests").parts if collection_path != REPO else ()
+    return True if config.option.markexpr == "not slow" and parts[:1] and parts[0] in SLOW_FOLDERS else None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that `make test-quick` leaves out; begin with those of the studio, which wait a lot."""
-    items.sort(key=lambda item: item.path.parent.name != "studio")
+    """Mark the tests that `make test-quick` leaves out; begin with the longest and with others that wait a lot."""
+    items.sort(key=lambda item: (item.path.parent.name != "studio", item.path.name not in LONGEST))
     for item in items:
         folder = item.path.relative_to(REPO / "tests").parts[0]
         if folder in SLOW_FOLDERS or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
