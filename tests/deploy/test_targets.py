@@ -197,3 +197,23 @@ def test_missing_tools_are_named_by_package(monkeypatch: pytest.MonkeyPatch, tmp
         build("host", [], tmp_path)
     with pytest.raises(ConfigError, match=r"accepted are host, xtensa.*Did you mean 'xtensa'\?"):
         target_named("xtens")
+
+
+def test_a_changed_header_is_compiled_again_wherever_it_lies(tmp_path: Path, c_compiler: str) -> None:
+    sources, first, second = (tmp_path / name for name in ("sources", "first", "second"))
+    for folder in (sources, first, second):
+        folder.mkdir()
+    (first / "value.h").write_text("#define VALUE 1\n")
+    (second / "value.h").write_text("#define VALUE 1\n")
+    main = sources / "main.c"
+    main.write_text('#include "value.h"\nint main(void) { return VALUE; }\n')
+
+    def objects() -> tuple[Path, ...]:
+        return build("host", [main], tmp_path / "out", include=[first, second], object_folder=tmp_path).objects
+
+    one = objects()
+    assert objects() == one
+    (first / "value.h").write_text("#define VALUE 2\n")
+    two = objects()
+    (sources / "value.h").write_text("#define VALUE 3\n")
+    assert len({one, two, objects()}) == 3

@@ -43,7 +43,7 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from plushsense.workflow.api import simulate
 
     folder = tmp_path_factory.mktemp("reader")
-    simulate(folder / "made", people=10, dataset=folder / "set")
+    simulate(folder / "made", people=10, repetitions=1, dataset=folder / "set")
     trained = ps.train(folder / "set", preset="people", epochs=24, context="anywhere")
     return trained.save(folder / "reader.plush")
 

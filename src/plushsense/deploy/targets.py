@@ -182,13 +182,15 @@ def build(
 
 
 def _object_name(source: Path, command: Sequence[str], include: Iterable[Path]) -> str:
-    """Return a file name for an object file: a hash of compiler, flags, source and what it includes."""
-    others = {file.name: file for folder in include for file in sorted(folder.glob("*.[ch]"))}
-    key, texts = sha256(repr(command).encode()), [source.read_bytes()]
+    """Return a file name for an object file: a hash of compiler, flags, source and every file it may include."""
+    files = [file for folder in (source.parent, *include) for file in sorted(folder.glob("*.[ch]"))]
+    key, texts, seen = sha256(repr(command).encode()), [source.read_bytes()], set[str]()
     for text in texts:
         key.update(text)
-        names = re.findall(r'#\s*include\s*[<"]([^>"]+)', text.decode("latin-1"))
-        texts += [others.pop(name).read_bytes() for name in names if name in others]
+        included = re.findall(r'#\s*include\s*[<"]([^>"]+)', text.decode("latin-1"))
+        names = {Path(name).name for name in included} - seen
+        seen |= names
+        texts += [file.read_bytes() for file in files if file.name in names]
     return f"{key.hexdigest()}.o"
 
 
