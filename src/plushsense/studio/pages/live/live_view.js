@@ -355,7 +355,7 @@ export default {
         c.lineTo(right, top + lane);
         c.stroke();
         c.strokeStyle = k.dark ? "#8cc4f0" : this.lines[0];
-        c.lineWidth = 1.5;
+        c.lineWidth = 1;
         c.beginPath();
         for (let j = from; j < ys.length; j++) {
           // A gap in the clock of the toy is a gap in the line.
