@@ -158,8 +158,8 @@ class IntegerModel:
         for i, name in enumerate(layout.inputs):
             parts = derived.get(name) or (layout.index(name),)
             row = (int(getattr(scale, n)[i]) for n in ("offset", "bias", "multiplier", "before", "after"))
-            plan = bytes([name in derived, len(parts), *parts])
-            sections.append((f"input '{name}': where from; offset, bias, multiplier, shifts", plan))
+            source = bytes([name in derived, len(parts), *parts])
+            sections.append((f"input '{name}': where from; offset, bias, multiplier, shifts", source))
             sections.append(("", struct.pack("<iiHBB", *row)))
         for n, (layer, read, part) in enumerate(zip(arch.layers, arch.inputs, self.network.layers, strict=True), 1):
             shape = struct.pack("<HHHH", layer.kernel, layer.dilation, read, layer.filters)
@@ -192,8 +192,8 @@ class IntegerModel:
 def _rules(rules: Rules) -> list[tuple[str, bytes]]:
     events, health, gate = rules.events, rules.health, rules.gate
     settings = asdict(events)
-    plan = b"".join(struct.pack("<h" if name == "known" else "<H", value) for name, value in settings.items())
-    sections = [(f"events: {', '.join(settings)}", plan)]
+    packed = b"".join(struct.pack("<h" if name == "known" else "<H", value) for name, value in settings.items())
+    sections = [(f"events: {', '.join(settings)}", packed)]
     times = struct.pack("<HHHBB", health.fault_ms, health.still_ms, health.recover_ms, bool(health.low), 0)
     sections.append(("health: fault, still, recover (ms), whether limits follow", times))
     if health.low:

@@ -41,9 +41,9 @@ IntsLimits = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class HealthFit:
-    """Fitted ``plan`` and the amount of data; ``widened`` names channels whose limits had to be moved outwards."""
+    """Fitted ``settings`` and the amount of data; ``widened`` names channels whose limits had to be moved outwards."""
 
-    plan: HealthSettings
+    settings: HealthSettings
     frames: int
     seconds: float
     widened: tuple[str, ...]
@@ -62,7 +62,7 @@ def frames_of(dataset: Dataset, subjects: Iterable[str]) -> Iterator[Frames]:
             yield dataset.read(recording)
 
 
-def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings | None = None) -> HealthFit:
+def fit_health(dataset: Dataset, subjects: Iterable[str], settings: HealthSettings | None = None) -> HealthFit:
     """Fit limits with which the sensors of ``subjects`` are never at fault.
 
     A channel's limits are the lowest and the highest valid value in the data, moved outwards by a tenth of the range
@@ -72,13 +72,13 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings |
     is twice the longest time in which all channels repeated, at least 500 ms; above 10 s the rule is disabled.
 
     Args:
-        plan: settings from which ``fault_ms`` and ``recover_ms`` are taken.
+        settings: those from which ``fault_ms`` and ``recover_ms`` are taken.
     """
-    plan = plan or HealthSettings()
+    settings = settings or HealthSettings()
     layout = dataset.layout
     parts = [f for f in frames_of(dataset, subjects) if len(f)]
     if not parts:
-        return HealthFit(plan, 0, 0.0, (), 0)
+        return HealthFit(settings, 0, 0.0, (), 0)
     values = np.concatenate([f.values for f in parts])
     valid = np.stack([np.maximum(layout.valid_min_int, _INT32[0]), np.minimum(layout.valid_max_int, _INT32[1])])
     valid = valid.astype(np.int64)
@@ -94,7 +94,7 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings |
             high[c] = last + margin if last + margin < valid[1, c] else last - inside
     usual = low.copy(), high.copy()
     for frames in parts:
-        for rows, wrong in _long_wrong(frames, usual, valid, plan.fault_ms / _SAFETY, layout.gap_ms):
+        for rows, wrong in _long_wrong(frames, usual, valid, settings.fault_ms / _SAFETY, layout.gap_ms):
             low = np.minimum(low, np.where(wrong, rows, low).min(axis=0))
             high = np.maximum(high, np.where(wrong, rows, high).max(axis=0))
     moved = (low != usual[0]) | (high != usual[1])
@@ -102,7 +102,7 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings |
     still = max(_longest(f.device_ms, _repeats(f.values, f.device_ms, layout.gap_ms)) for f in parts)
     still_ms = max(_STILL_MS, _SAFETY * still)
     fitted = replace(
-        plan,
+        settings,
         low=tuple(low.tolist()),
         high=tuple(high.tolist()),
         still_ms=still_ms if still_ms <= min(_STILL_MOST_MS, MOST_MS) else 0,
@@ -223,11 +223,11 @@ def fit_decisions(
     everybody = sorted({*people, *training})
     health = fit_health(dataset, everybody, spec.health)
     if "health" not in keep:
-        spec = replace(spec, health=health.plan)
+        spec = replace(spec, health=health.settings)
     gate: dict[str, Any] | None = None
     if "gate" not in keep:
         fitted = fit_gate(dataset, bundle.gestures, everybody, false_alarms_per_hour=false_alarms_per_hour)
-        spec, gate = replace(spec, gate=fitted.plan), fitted.report
+        spec, gate = replace(spec, gate=fitted.settings), fitted.report
     streams = marked_streams(bundle, dataset, people, spec)
     idle = [k for k, gesture in enumerate(bundle.gestures.gestures) if gesture.idle]
     report: dict[str, Any] = {

@@ -136,9 +136,9 @@ class GateSpec:
 
 @dataclass(frozen=True)
 class GateFit:
-    """A fitted gate (``plan``), and a ``report`` with the data and results of the fit."""
+    """A fitted gate (``settings``), and a ``report`` with the data and results of the fit."""
 
-    plan: GateSettings
+    settings: GateSettings
     report: dict[str, Any] = field(default_factory=dict)
 
 
@@ -151,7 +151,7 @@ def fit_gate(
 ) -> GateFit:
     """Fit a gate on the streams of ``subjects``, and on their recordings that are in no stream.
 
-    If there is nothing energetic to detect or no rule is good enough, the plan has no rules; the report says why.
+    If there is nothing energetic to detect or no rule is good enough, the settings have no rules; the report says why.
 
     Args:
         gestures: the classes of the model; they define which gestures are energetic, and their affect.
@@ -186,12 +186,11 @@ def fit_gate(
                     tuple(terms), AFFECT_CODES[affect], gesture, candidates.within, dataset.layout.samples(spec.deaf_s)
                 )
             )
-    plan = GateSettings(tuple(signals), tuple(rules))
+    settings = GateSettings(tuple(signals), tuple(rules))
     if not rules:
-        return GateFit(plan, {**figures, "reason": "no rule detects enough of them at so few false alarms"})
-    return GateFit(
-        plan, {**figures, "between_recordings_believed": believed, **measure_gate(plan, material, dataset.layout)}
-    )
+        return GateFit(settings, {**figures, "reason": "no rule detects enough of them at so few false alarms"})
+    measured = measure_gate(settings, material, dataset.layout)
+    return GateFit(settings, {**figures, "between_recordings_believed": believed, **measured})
 
 
 def _rules_of(candidates: _Candidates, labels: list[str], spec: GateSpec) -> tuple[list[FoundRule], bool]:
@@ -366,7 +365,7 @@ def signals_of(layout: Layout, spec: GateSpec) -> list[Signal]:
     return [Signal(kind, group, lag, 0, slow, slower) for kind, group, lag in watched]
 
 
-def measure_gate(plan: GateSettings, material: Material, layout: Layout) -> dict[str, Any]:
+def measure_gate(settings: GateSettings, material: Material, layout: Layout) -> dict[str, Any]:
     """Run the `Gate` on the material of some people; return a report as plain values.
 
     It has recall by gesture, false alarms per hour in calm recordings and between recordings, and the median time from
@@ -377,7 +376,7 @@ def measure_gate(plan: GateSettings, material: Material, layout: Layout) -> dict
     calm_hit: set[int] = set()
     wrong_by: dict[str, int] = {}
     for stretch in material.stretches:
-        gate = Gate(plan)
+        gate = Gate(settings)
         begun = {int(t): int(np.argmax(stretch.what == t)) for t in np.unique(stretch.what) if t >= 0}
         for at, row in enumerate(stretch.x.tolist()):
             if gate.push(row) < 0:

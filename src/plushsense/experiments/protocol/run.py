@@ -46,8 +46,8 @@ def virtual_rules(seed: int, layout: Layout, gestures: GestureSet, people: int =
         raw, folder = Path(work) / "raw", Path(work) / "ds"
         simulate(raw, people, (seed + _ELSEWHERE) % 2**31, 2, at_rest=0, layout=layout)
         dataset = import_recordings(raw, folder, layout=layout, gestures=gestures, name="others").dataset
-        plan, _ = fit_rule_baseline(dataset, gestures, dataset.subjects)
-    heuristic = partial(baseline_events, layout=layout, plan=plan)
+        settings, _ = fit_rule_baseline(dataset, gestures, dataset.subjects)
+    heuristic = partial(baseline_events, layout=layout, settings=settings)
     return heuristic, f"Tuned on {people} other virtual people, of another population."
 
 
@@ -57,10 +57,10 @@ def recorded_rules(dataset: Dataset, gestures: GestureSet, scored: Collection[st
     if not others:
         return None, "Everybody is scored here, so nobody is left to tune the old rules on: they are left out."
     try:
-        plan, _ = fit_rule_baseline(dataset, gestures, others)
+        settings, _ = fit_rule_baseline(dataset, gestures, others)
     except ConfigError as cause:
         return None, f"The old rules cannot be tuned: {cause}"
-    heuristic = partial(baseline_events, layout=dataset.layout, plan=plan)
+    heuristic = partial(baseline_events, layout=dataset.layout, settings=settings)
     return heuristic, f"Tuned on people who are not scored here: {len(others)}."
 
 
