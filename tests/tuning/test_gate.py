@@ -93,11 +93,11 @@ def test_what_is_energetic_calm_and_unknown(virtual: Dataset) -> None:
     assert len(material.trials) == 2 * 2 * 3 and {g for _, g in material.trials} == set(BLOWS)
     assert len(material.calm) == 2 * 2 * 14
     for stretch in material.stretches:
-        edges = np.flatnonzero(np.diff((stretch.what >= 0).astype(int)))
+        edges = np.flatnonzero(np.diff((stretch.trial >= 0).astype(int)))
         for edge in edges.tolist():
-            around = stretch.what[max(0, edge - 60) : edge + 60]
+            around = stretch.trial[max(0, edge - 60) : edge + 60]
             assert BETWEEN not in around and (around >= 0).any() and (around == LEFT_OUT).any()
-        assert ((stretch.what == CALM) == (stretch.calm >= 0)).all()
+        assert ((stretch.trial == CALM) == (stretch.calm >= 0)).all()
     assert sum(material.hours(w) for w in (CALM, BETWEEN)) > 0.1
 
 

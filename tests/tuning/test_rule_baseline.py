@@ -40,7 +40,7 @@ def frames_of(touch: np.ndarray, z: np.ndarray | None = None, electrode: str = "
 
 def begun(events: list[GestureEvent]) -> list[tuple[str, float]]:
     """(affect, seconds) of every beginning, rounded to a sample."""
-    return [(e.affect, round(e.t_s, 2)) for e in events if e.what == "begun"]
+    return [(e.affect, round(e.t_s, 2)) for e in events if e.kind == "begun"]
 
 
 def test_a_blow_is_answered_within_50_ms_and_is_over_after_a_second() -> None:
@@ -48,7 +48,7 @@ def test_a_blow_is_answered_within_50_ms_and_is_over_after_a_second() -> None:
     z[300:303] = (32_000, 3_000, 30_000)
     events = baseline_events(frames_of(np.zeros(600), z), PLUSH, SETTINGS)
     assert begun(events) == [("negative", 3.0)]
-    assert [e.what for e in events] == ["begun", "ended"]
+    assert [e.kind for e in events] == ["begun", "ended"]
     assert 4.0 <= events[1].t_s <= 4.2
     assert events[0].gesture is None and events[0].source == "gate"
 
@@ -87,8 +87,8 @@ def test_what_goes_on_when_nothing_is_heard_ends() -> None:
     events: list[GestureEvent] = []
     for ms, values in zip(frames.device_ms.tolist(), frames.values.tolist(), strict=True):
         events += reader.push(Frame(0, ms, tuple(values)))
-    assert [e.what for e in events] == ["begun"]
-    assert [e.what for e in reader.silence()] == ["ended"]
+    assert [e.kind for e in events] == ["begun"]
+    assert [e.kind for e in reader.silence()] == ["ended"]
     assert reader.silence() == []
 
 

@@ -92,7 +92,7 @@ def verification_lines(done: VerificationReport) -> list[str]:
     ]
     head = ("target", "compiler", "flags", "vectors", "mismatches", "largest difference", "seconds")
     lines = [done.title, *streams, "", table(head, rows)]
-    lines += [f"not run: {what} ({why})" for what, why in done.not_run]
+    lines += [f"not run: {part} ({reason})" for part, reason in done.not_run]
     if done.mutants:
         targets = list(dict.fromkeys(m.target for m in done.mutants))
         by_mutant: dict[tuple[str, str], dict[str, str]] = {}

@@ -436,7 +436,7 @@ def read_people(path: Path) -> dict[str, PersonInfo]:
     return people
 
 
-def read_csv_rows(path: Path, what: str) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+def read_csv_rows(path: Path, kind: str) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
     """Read a CSV file that a user wrote, separated by ``,`` or ``;``.
 
     Returns:
@@ -458,7 +458,7 @@ def read_csv_rows(path: Path, what: str) -> tuple[list[str], list[tuple[int, dic
     except FileNotFoundError:
         raise
     except (OSError, UnicodeDecodeError, csv.Error) as cause:
-        raise DatasetError(f"The {what} '{path}' cannot be read ({cause}): give a CSV file in UTF-8.") from None
+        raise DatasetError(f"The {kind} '{path}' cannot be read ({cause}): give a CSV file in UTF-8.") from None
     return columns, rows
 
 

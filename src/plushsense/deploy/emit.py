@@ -91,8 +91,8 @@ def read_facts(folder: str | Path) -> dict[str, Any]:
         facts = json.loads(path.read_text(encoding="utf-8"))
         needed = {"title", "channels", "classes", "memory_bytes", "model_bytes"} - set(facts)
     except (FileNotFoundError, NotADirectoryError):
-        what = f"'{folder}' is no export" if Path(folder).exists() else f"There is no export '{folder}'"
-        raise BadInput(f"{what}: make one with plushsense export BUNDLE OUT.") from None
+        problem = f"'{folder}' is no export" if Path(folder).exists() else f"There is no export '{folder}'"
+        raise BadInput(f"{problem}: make one with plushsense export BUNDLE OUT.") from None
     except (OSError, ValueError, TypeError) as cause:
         raise BadInput(f"'{path}' cannot be read ({cause}): export the model again.") from None
     if needed:

@@ -353,9 +353,9 @@ class _RowTable:
         if answer is None or moment.logits is None or moment.smoothed is None:
             self._add(ANSWER, ms, count, WARMING)
             return
-        what = answer.best, self.affects[answer.best], answer.share, answer.kind, answer.known
+        values = answer.best, self.affects[answer.best], answer.share, answer.kind, answer.known
         numbers = [*moment.logits.tolist(), *moment.smoothed.tolist()]
-        self._add(ANSWER, ms, count, TRACKING, *what, numbers=numbers)
+        self._add(ANSWER, ms, count, TRACKING, *values, numbers=numbers)
 
     def add_health(self, ms: int) -> None:
         """Add the current state of the health check."""
@@ -366,9 +366,9 @@ class _RowTable:
     def _ms(self, time_us: int) -> int:
         return (time_us + self.toy.frames.zero_us) // 1000
 
-    def _add(self, kind: int, ms: int, *what: int, numbers: Sequence[int] = ()) -> None:
+    def _add(self, kind: int, ms: int, *values: int, numbers: Sequence[int] = ()) -> None:
         counts = self.toy.frames.clock.restarts, self.toy.frames.clock.invalid
-        row = [kind, self.frame, ms, *what, *[0] * (HEAD - 5 - len(what)), *counts, *numbers]
+        row = [kind, self.frame, ms, *values, *[0] * (HEAD - 5 - len(values)), *counts, *numbers]
         self.rows.append(row + [0] * (HEAD + 2 * len(self.affects) - len(row)))
 
 

@@ -362,10 +362,10 @@ def _same_layout(bundle: Bundle, dataset: Dataset) -> None:
 
 
 def _warn_of_training(bundle: Bundle, person: str, warn: Warn) -> None:
-    for key, what in (("subjects", "trained"), ("validation_subjects", "validated")):
+    for key, used in (("subjects", "trained"), ("validation_subjects", "validated")):
         people = bundle.provenance.get(key, ())
         if isinstance(people, list | tuple) and person in people:
-            warn(f"the bundle was {what} on a person {person}: if it is the same one, the scores before are too high")
+            warn(f"the bundle was {used} on a person {person}: if it is the same one, the scores before are too high")
 
 
 def _recordings_of(dataset: Dataset, person: str, bundle: Bundle, warn: Warn) -> tuple[Dataset, dict[str, str]]:

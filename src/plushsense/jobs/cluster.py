@@ -209,10 +209,10 @@ def _outcome(ray: Any, ref: Any, job: Job) -> JobEvent:
         return JobEvent(job, "failed", lost)
     except errors.RayError as cause:
         raise _unfit(str(cause)) from cause
-    what = pickle.loads(packed)
+    payload = pickle.loads(packed)
     if kind == "lost":
-        raise what
-    return JobEvent(job, kind, what)
+        raise payload
+    return JobEvent(job, kind, payload)
 
 
 def _unfit(reason: str) -> PlushSenseError:

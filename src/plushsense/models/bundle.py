@@ -64,14 +64,14 @@ class Bundle:
 
     def __post_init__(self) -> None:
         check_weights(self.arch, self.weights)
-        for what, found, needed in (
+        for name, found, needed in (
             ("inputs in the layout", self.layout.n_inputs, self.arch.channels),
             ("offsets in the scaling", np.size(self.scaler.offset), self.arch.channels),
             ("scales in the scaling", np.size(self.scaler.scale), self.arch.channels),
             ("gestures in the set", len(self.gestures), self.arch.classes),
         ):
             if found != needed:
-                raise BundleError(f"The bundle does not fit together: {found} {what}, the network needs {needed}.")
+                raise BundleError(f"The bundle does not fit together: {found} {name}, the network needs {needed}.")
         if not (np.isfinite(self.scaler.offset).all() and np.isfinite(self.scaler.scale).all()):
             raise BundleError("The bundle's scaling holds a value that is not finite: train again.")
 

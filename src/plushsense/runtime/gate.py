@@ -108,9 +108,9 @@ def _all_within(part: Signal | Rule | Term, **ranges: tuple[int, int]) -> None:
         _within(name, getattr(part, name), low, high)
 
 
-def _within(what: str, value: int, low: int, high: int) -> None:
+def _within(name: str, value: int, low: int, high: int) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise BundleError(f"The gate's settings have {what} {value!r}; accepted are {low} to {high}.")
+        raise BundleError(f"The gate's settings have {name} {value!r}; accepted are {low} to {high}.")
 
 
 class Gate:

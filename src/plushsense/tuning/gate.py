@@ -269,8 +269,8 @@ class _Candidates:
         levels = [k for k, s in enumerate(signals) if s.kind == LEVEL]
         pieces, trials = [], []
         for stretch in self.material.stretches:
-            for trial in np.unique(stretch.what[stretch.what >= 0]).tolist():
-                at = np.flatnonzero(stretch.what == trial)
+            for trial in np.unique(stretch.trial[stretch.trial >= 0]).tolist():
+                at = np.flatnonzero(stretch.trial == trial)
                 pieces.append(stretch.x[max(0, int(at[0]) - 300) : int(at[-1]) + 1])
                 trials.append(len(at))
         some = slice(None, None, max(1, len(pieces) // 100))
@@ -288,7 +288,7 @@ class _Candidates:
         for first in range(0, len(self._xs), _TOGETHER):
             some = self.material.stretches[first : first + _TOGETHER]
             for stretch, sizes in zip(some, self._signed([s.x for s in some], candidates), strict=True):
-                kind = np.where(stretch.what >= 0, stretch.what, np.where(stretch.what == LEFT_OUT, -2, -1))
+                kind = np.where(stretch.trial >= 0, stretch.trial, np.where(stretch.trial == LEFT_OUT, -2, -1))
                 edges = np.flatnonzero(np.append(True, (np.diff(kind) != 0) | (np.arange(1, len(kind)) % 50 == 0)))
                 tops, kinds = np.maximum.reduceat(sizes, edges, axis=0), kind[edges]
                 calm.append(tops[kinds == -1])
@@ -313,15 +313,15 @@ class _Candidates:
         calm, chunks, rough, trials, delays = [], [], [], [], []
         first_chunk = 0
         for stretch, sizes in zip(self.material.stretches, self._sizes, strict=True):
-            quiet = (stretch.what == CALM) | ((stretch.what == BETWEEN) & between)
+            quiet = (stretch.trial == CALM) | ((stretch.trial == BETWEEN) & between)
             calm.append(sizes[quiet])
             chunks.append(first_chunk + np.flatnonzero(quiet) // self.chunk)
             first_chunk += len(quiet) // self.chunk + 1
-            at = np.flatnonzero(stretch.what >= 0)
-            at = at[chosen[stretch.what[at]]]
+            at = np.flatnonzero(stretch.trial >= 0)
+            at = at[chosen[stretch.trial[at]]]
             rough.append(sizes[at])
-            trials.append(stretch.what[at])
-            delays.append(np.arange(len(at)) - np.searchsorted(stretch.what[at], stretch.what[at]))
+            trials.append(stretch.trial[at])
+            delays.append(np.arange(len(at)) - np.searchsorted(stretch.trial[at], stretch.trial[at]))
         together = np.concatenate(trials)
         order = np.argsort(together, kind="stable")
         heights = Heights.of(
@@ -377,23 +377,23 @@ def measure_gate(settings: GateSettings, material: Material, layout: Layout) -> 
     wrong_by: dict[str, int] = {}
     for stretch in material.stretches:
         gate = Gate(settings)
-        begun = {int(t): int(np.argmax(stretch.what == t)) for t in np.unique(stretch.what) if t >= 0}
+        begun = {int(t): int(np.argmax(stretch.trial == t)) for t in np.unique(stretch.trial) if t >= 0}
         for at, row in enumerate(stretch.x.tolist()):
             if gate.push(row) < 0:
                 continue
-            what = int(stretch.what[at])
-            if what >= 0:
-                first.setdefault(what, at - begun[what])
-            elif what != LEFT_OUT:
-                wrong[what] += 1
-                if what == CALM:
+            trial = int(stretch.trial[at])
+            if trial >= 0:
+                first.setdefault(trial, at - begun[trial])
+            elif trial != LEFT_OUT:
+                wrong[trial] += 1
+                if trial == CALM:
                     calm_hit.add(int(stretch.calm[at]))
                     label = material.calm[int(stretch.calm[at])][1]
                     wrong_by[label] = wrong_by.get(label, 0) + 1
     by_gesture: dict[str, list[int]] = {}
     for trial, (_, label) in enumerate(material.trials):
         by_gesture.setdefault(label, []).append(trial)
-    hours = {what: material.hours(what) for what in (CALM, BETWEEN)}
+    hours = {kind: material.hours(kind) for kind in (CALM, BETWEEN)}
     total = sum(hours.values())
     delays = [at / layout.rate_hz for at in first.values()]
     return {

@@ -25,13 +25,13 @@ GUARD_S = 0.7
 class Stretch:
     """Evenly spaced samples of one person without a break.
 
-    ``x`` (T, I): raw inputs. ``what`` (T,): index of the energetic recording in `Material.trials`, or `BETWEEN`, `CALM`
-    or `LEFT_OUT`. ``calm`` (T,): index of the recording of a calm sample in `Material.calm`, else -1.
+    ``x`` (T, I): raw inputs. ``trial`` (T,): index of the energetic recording in `Material.trials`, or `BETWEEN`,
+    `CALM` or `LEFT_OUT`. ``calm`` (T,): index of the recording of a calm sample in `Material.calm`, else -1.
     """
 
     subject: str
     x: NDArray[np.int64]
-    what: NDArray[np.int64]
+    trial: NDArray[np.int64]
     calm: NDArray[np.int64]
 
 
@@ -44,9 +44,9 @@ class Material:
     calm: tuple[tuple[str, str], ...]
     rate_hz: float
 
-    def hours(self, what: int) -> float:
+    def hours(self, kind: int) -> float:
         """Return the total duration of samples of one kind, in hours."""
-        return sum(int((s.what == what).sum()) for s in self.stretches) / self.rate_hz / 3600
+        return sum(int((s.trial == kind).sum()) for s in self.stretches) / self.rate_hz / 3600
 
 
 def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str]) -> Material:
@@ -81,16 +81,16 @@ def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str
             numbers.append(calm_index if k == CALM else -1)
             calm_index += k == CALM
         for segment in segments:
-            what = np.full(len(segment), rest)
+            trial = np.full(len(segment), rest)
             which = np.full(len(segment), -1)
             spans = [np.searchsorted(segment.row_of, edge, side="left").tolist() for edge in [k[:2] for k in kinds]]
             for (first, last), (_, _, k) in zip(spans, kinds, strict=True):
                 if k >= 0 and last > first:
-                    around = what[max(0, first - guard) : last + guard]
+                    around = trial[max(0, first - guard) : last + guard]
                     around[around == BETWEEN] = LEFT_OUT
             for (first, last), (_, _, k), number in zip(spans, kinds, numbers, strict=True):
-                what[first:last], which[first:last] = k, number
-            stretches.append(Stretch(subject, network_inputs(segment.data, layout), what, which))
+                trial[first:last], which[first:last] = k, number
+            stretches.append(Stretch(subject, network_inputs(segment.data, layout), trial, which))
 
     for stream in dataset.streams:
         if stream.subject in people:

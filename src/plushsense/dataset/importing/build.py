@@ -59,9 +59,9 @@ def refuse_merged(files: Sequence[SourceFile], there: Iterable[str] = ()) -> Non
     not_met = set(codes)
     folders = [("people", f.subject, folder_name(f.subject), "") for f in files]
     folders += [("sessions", f.session, session_folder(f.session), folder_name(f.subject)) for f in files if f.session]
-    for what, code, folder, within in folders:
+    for kind, code, folder, within in folders:
         if len(folder.encode("utf-8")) > _LONGEST:
-            raise DatasetError(f"The code '{code[:40]}…' is too long: codes of {what} have {_LONGEST} bytes at most.")
+            raise DatasetError(f"The code '{code[:40]}…' is too long: codes of {kind} have {_LONGEST} bytes at most.")
         key = (folder.casefold(), within)
         first = codes.setdefault(key, code)
         if key in not_met and first == folder:
@@ -70,7 +70,7 @@ def refuse_merged(files: Sequence[SourceFile], there: Iterable[str] = ()) -> Non
             codes[key] = code
         elif first != code:
             raise DatasetError(
-                f"The {what} '{first}' and '{code}' would share the folder '{folder}': rename one of them."
+                f"The {kind} '{first}' and '{code}' would share the folder '{folder}': rename one of them."
             )
 
 

@@ -310,8 +310,8 @@ def _row(row: NDArray[Any]) -> str:
 def _column(field: int, kind: int, labels: Sequence[str]) -> str:
     if field < HEAD:
         return f"'{COLUMNS.get(kind, COLUMNS[0])[field]}'"
-    what, at = divmod(field - HEAD, len(labels))
-    return f"{('the logit', 'the smoothed probability')[what]} of '{labels[at]}'"
+    kind, at = divmod(field - HEAD, len(labels))
+    return f"{('the logit', 'the smoothed probability')[kind]} of '{labels[at]}'"
 
 
 def in_parts(frames: Ints) -> list[Ints]:

@@ -159,9 +159,9 @@ def _recorded(
     heuristic, tuned = recorded_rules(dataset, bundle.gestures, people) if rules else (None, NOTES["no_rules"])
     made = scoring.run(sittings, asked, heuristic, progress, len(sittings))
     virtual = dataset.head.simulated
-    what = "recorded sessions of a simulation" if virtual else "recorded sessions"
+    source = "recorded sessions of a simulation" if virtual else "recorded sessions"
     return made | {
-        "heading": f"The paper's real-time protocol on {what}: {dataset.head.name}",
+        "heading": f"The paper's real-time protocol on {source}: {dataset.head.name}",
         "simulated": virtual,
         "codes": people,
         "left": left,

@@ -134,9 +134,9 @@ class _EventSpan:
 def _event_spans(events: Sequence[GestureEvent]) -> list[_EventSpan]:
     spans: dict[int, _EventSpan] = {}
     for event in events:
-        if event.what == "begun":
+        if event.kind == "begun":
             spans[event.number] = _EventSpan(event.affect, event.source, event.t_s, event.gesture, event.t_s)
-        elif event.what == "named":
+        elif event.kind == "named":
             spans[event.number].gesture, spans[event.number].named_s = event.gesture, event.t_s
             spans[event.number].affect = event.affect
         else:
