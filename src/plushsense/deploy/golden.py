@@ -16,7 +16,7 @@ from plushsense.core.errors import BadInput
 from plushsense.core.layouts import MAGNITUDE_FRACTION_BITS, Layout
 from plushsense.core.templates import fill_text
 from plushsense.runtime.events import AFFECT_CODES
-from plushsense.runtime.fixed import InputScale
+from plushsense.runtime.fixed import InputScale, Ints
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel
 from plushsense.runtime.machine import Moment, ToyMachine
@@ -138,7 +138,7 @@ class FrameGenerator:
             self.put(np.array(self.rows[-1][1:], dtype=np.int64))
             self.now += self.pace()
 
-    def frames_of(self, ms: int) -> int:
+    def frames_in(self, ms: int) -> int:
         """Return the number of frames in ``ms`` milliseconds, rounded up."""
         return -(-ms * 1000 // self.layout.period_us)
 
@@ -148,25 +148,25 @@ class FrameGenerator:
         A channel is out of range, or stuck outside the range of touches, first only briefly; then all channels are
         frozen. There are also too few good frames for a recovery, and a gap during a failure.
         """
-        few, enough = self.frames_of(health.fault_ms) // 2, self.frames_of(health.fault_ms + health.recover_ms) + 20
-        back = self.frames_of(health.recover_ms) + after
+        few, enough = self.frames_in(health.fault_ms) // 2, self.frames_in(health.fault_ms + health.recover_ms) + 20
+        back = self.frames_in(health.recover_ms) + after
         if health.fault_ms:
             ends = self._beyond(health)
             self.touches(few + 3, stuck=ends)
             self.touches(30)
             self.touches(enough, stuck=ends)
-            self.touches(self.frames_of(health.recover_ms) // 2)
+            self.touches(self.frames_in(health.recover_ms) // 2)
             self.touches(20, garbage=0.5)
             self.touches(back, blows=0.02)
             self.touches(enough, garbage_channel=len(self.mean) - 1)
             self.wait(self.layout.gap_ms + 40)
             self.touches(back)
         if health.still_ms:
-            self.frozen(self.frames_of(health.still_ms) * 3 // 4)
+            self.frozen(self.frames_in(health.still_ms) * 3 // 4)
             self.wait(self.layout.gap_ms + 10)
             self.frozen(4)
-            self.touches(self.frames_of(health.still_ms) // 2)
-            self.frozen(self.frames_of(health.still_ms) + 20)
+            self.touches(self.frames_in(health.still_ms) // 2)
+            self.frozen(self.frames_in(health.still_ms) + 20)
             self.now = 40
             self.touches(back, blows=0.02)
 
@@ -265,7 +265,6 @@ _KINDS = {
     EVENT: "a change of an event",
     HEALTH: "a change of the sensor health",
 }
-Ints = NDArray[np.int64]
 
 
 def column(rows: NDArray[Any], name: str, kind: int = ANSWER) -> NDArray[Any]:

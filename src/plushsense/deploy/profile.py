@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ProgramError, ToolError
 from plushsense.core.toml import load_table, read_toml
@@ -30,6 +29,7 @@ from plushsense.deploy.targets import (
     tool_output,
 )
 from plushsense.models.arch import Arch
+from plushsense.runtime.fixed import Ints
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,6 @@ _HEAP = ("malloc", "calloc", "realloc", "free", "reallocarray", "aligned_alloc",
 _FLOAT = re.compile(r"^__(\w*[sdt]f\d?$|float|fix|aeabi_[fd](?!iv)|aeabi_u?[il]2[fd])")
 _SECTIONS = {"text": (".text", ".literal"), "rodata": (".rodata", ".srodata"), "data": (".data", ".sdata")}
 _SECTIONS["bss"] = (".bss", ".sbss")
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,6 @@ _STILL_MOST_MS = 10_000
 _INT32 = -(1 << 31), (1 << 31) - 1
 
 Bools = NDArray[np.bool_]
-IntsLimits = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -48,18 +47,6 @@ class HealthFit:
     seconds: float
     widened: tuple[str, ...]
     still_ms: int
-
-
-def frames_of(dataset: Dataset, subjects: Iterable[str]) -> Iterator[Frames]:
-    """Yield the frames of the streams of some people, or of the recordings of those without a stream."""
-    people = set(subjects)
-    streams = [s for s in dataset.streams if s.subject in people]
-    with_stream = {s.subject for s in streams}
-    for stream in streams:
-        yield dataset.read_stream(stream.id)
-    for recording in dataset.used:
-        if recording.subject in people - with_stream:
-            yield dataset.read(recording)
 
 
 def fit_health(dataset: Dataset, subjects: Iterable[str], settings: HealthSettings | None = None) -> HealthFit:
@@ -76,7 +63,7 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], settings: HealthSettin
     """
     settings = settings or HealthSettings()
     layout = dataset.layout
-    parts = [f for f in frames_of(dataset, subjects) if len(f)]
+    parts = [f for f in dataset.read_people(sorted(set(subjects))) if len(f)]
     if not parts:
         return HealthFit(settings, 0, 0.0, (), 0)
     values = np.concatenate([f.values for f in parts])
@@ -132,8 +119,8 @@ def _longest(ms: NDArray[np.int64], repeats: Bools) -> int:
 
 
 def _long_wrong(
-    frames: Frames, usual: tuple[IntsLimits, IntsLimits], valid: IntsLimits, longest_ms: float, gap_ms: int
-) -> Iterator[tuple[IntsLimits, NDArray[np.bool_]]]:
+    frames: Frames, usual: tuple[Ints, Ints], valid: Ints, longest_ms: float, gap_ms: int
+) -> Iterator[tuple[Ints, NDArray[np.bool_]]]:
     """Yield stretches of at least ``longest_ms`` in which some channel is wrong throughout.
 
     Yields:
@@ -436,10 +423,10 @@ def left_out_coverage(labelled: LabelledSteps, coverage: float) -> list[float]:
     for person in people:
         own_steps = labelled.take(labelled.person == person)
         threshold = sure_threshold(labelled.take(labelled.person != person), coverage)
-        out.append(covered(own_steps, threshold))
+        out.append(coverage_of(own_steps, threshold))
     return out
 
 
-def covered(labelled: LabelledSteps, threshold: float) -> float:
+def coverage_of(labelled: LabelledSteps, threshold: float) -> float:
     """Return the share of steps whose set contains the true class; people and recordings have equal weights."""
     return float((weights_of(labelled) * (labelled.of_truth >= threshold * ONE)).sum())

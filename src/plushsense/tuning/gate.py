@@ -98,8 +98,6 @@ def _follow_block(block: NDArray[np.int32], signals: Sequence[Signal], deviation
     return block
 
 
-Ints32 = NDArray[np.int32]
-
 _TOGETHER = 6  # number of stretches processed at once with all candidates, which limits memory
 _MOST, _FLOORS = 24, 2  # number of candidates to keep, and of those among them that may differ only in the floor
 
@@ -235,7 +233,7 @@ class _Candidates:
         self.candidates = [candidates[k] for k in promising]
         self._sizes = [self._lasting(sizes) for sizes in self._signed(self._xs, self.candidates)]
 
-    def _signed(self, xs: list[NDArray[np.int64]], candidates: list[tuple[Signal, int]]) -> list[Ints32]:
+    def _signed(self, xs: list[NDArray[np.int64]], candidates: list[tuple[Signal, int]]) -> list[NDArray[np.int32]]:
         sizes = signal_sizes(xs, [signal for signal, _ in candidates])
         for column, (_, sign) in enumerate(candidates):
             for of in sizes:
@@ -243,7 +241,7 @@ class _Candidates:
                 np.copyto(one, np.abs(one) if sign == 0 else np.maximum(one * sign, 0))
         return sizes
 
-    def _lasting(self, sizes: Ints32) -> Ints32:
+    def _lasting(self, sizes: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the largest threshold at which a term holds: minimum over ``times``, then maximum over ``within``."""
         lasting = sizes.copy()
         for back in range(1, self.times):

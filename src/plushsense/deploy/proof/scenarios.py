@@ -24,14 +24,13 @@ from plushsense.deploy.golden import (
     HEALTH,
     TRACKING,
     FrameGenerator,
-    Ints,
     answers_of,
     column,
     measured,
 )
 from plushsense.runtime.decisions import Rules
 from plushsense.runtime.events import ANSWERS, BEGUN, ENDED, GATE, KINDS, NO_GESTURE, ONE, SOURCES, EventSettings
-from plushsense.runtime.fixed import LOGIT_LIMIT, PROBABILITY_BITS, LogitScale, split_ratio
+from plushsense.runtime.fixed import LOGIT_LIMIT, PROBABILITY_BITS, Ints, LogitScale, split_ratio
 from plushsense.runtime.gate import JERK, LEVEL, Gate, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel
@@ -111,8 +110,8 @@ def all_outcomes() -> set[str]:
     return events | ends | health | set(ANSWERS) | {"gate while warming", "unnamed", "without affect", "resting"}
 
 
-def covered(scenario: Scenario) -> set[str]:
-    """Return the subset of `all_outcomes` that a scenario covers."""
+def outcomes_of(scenario: Scenario) -> set[str]:
+    """Return the subset of `all_outcomes` that a scenario reaches."""
     rows, outcomes = scenario.rows.astype(np.int64), set()
     answered = column(rows, "answer")[column(rows, "state") == TRACKING]
     outcomes |= {ANSWERS[k] for k in set(answered.tolist())}
