@@ -18,7 +18,7 @@ import pytest
 from plushsense.recording.session_files import SessionHead, read_events
 
 Cli = Callable[..., Any]
-COMMAND = [sys.executable, "-m", "plushsense.cli.main", "record"]
+COMMAND = [sys.executable, "-m", "plushsense", "record"]
 URL = "virtual://?speed=0&lost=0&garbled=0&glitch=0"
 KEYS = {
     "folder", "subject", "session", "recordings", "skipped", "redone", "rows", "lost", "malformed", "garbage",

@@ -507,7 +507,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 def test_a_full_disk(small_disk: Path) -> None:
     words = [
-        sys.executable, "-m", "plushsense.cli.main", "record", str(small_disk), "--device", URL,
+        sys.executable, "-m", "plushsense", "record", str(small_disk), "--device", URL,
         "--subject", "S01", "--auto", "2", "--json",
     ]  # fmt: skip
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60, stdin=subprocess.DEVNULL)

@@ -32,7 +32,7 @@ def recording(out: Path, toy: Toy, speed: float, *words: str) -> subprocess.Pope
     """``plushsense record`` as a program of its own, pressing its own space bar."""
     process = subprocess.Popen(
         [
-            sys.executable, "-m", "plushsense.cli.main", "record", str(out), "--device", toy.url,
+            sys.executable, "-m", "plushsense", "record", str(out), "--device", toy.url,
             "--subject", "S01", "--speed", str(speed), "--auto", "4", "--json", *words,
         ],
         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
