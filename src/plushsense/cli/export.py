@@ -212,7 +212,7 @@ def _bytes(costs: list[Cost]) -> list[str]:
         for c in costs
         if c.stack_functions
     )
-    proof += f" Largest frames, as the compiler says: {frames}." if frames else ""
+    proof += f" Largest frames, as reported by the compiler: {frames}." if frames else ""
     proof += " Stack comes on top of RAM; an ESP32, S2 or S3 has windows of registers and needs more than xtensa here."
     return ["Bytes", table(["", *(c.target for c in costs)], rows), *textwrap.wrap(proof, 118)]
 

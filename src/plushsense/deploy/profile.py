@@ -51,7 +51,7 @@ class Core:
         if self.flash_mb_s is None:
             return self.why
         return (
-            f"{self.why}; high also fetches code and model from the serial flash anew for every sample, at "
+            f"{self.why}; high also fetches code and model from the serial flash again for every sample, at "
             f"{self.flash_mb_s:g} MB/s, as if its cache had kept nothing (in RAM they never are)"
         )
 
@@ -299,7 +299,7 @@ def _whole(program: Program, step: int) -> tuple[list[int], Ints, Ints]:
     if (len(even), len(jittered)) != (STEPS, STEPS + 1):
         raise ProgramError(
             f"The C in the export gave {len(even)} answers on {program.target.name} where {STEPS} steps of {step} "
-            "samples should: plushsense verify says where it goes wrong."
+            "samples should: plushsense verify shows where it goes wrong."
         )
     return numbers[:6].tolist(), even, jittered
 

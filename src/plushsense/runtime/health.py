@@ -7,8 +7,8 @@ This module is the specification that ``deploy/c/plushsense.c`` implements. It c
 - The toy is *still* while all channels repeat the frame before. Working sensors are noisy; ones that hang are not.
 - A frame is *suspect* if a channel is wrong, or the toy was still for ``still_ms`` / 2. No event begins at it.
 - A *fault* begins when for ``fault_ms`` every frame had a wrong channel (not always the same one), or the toy was still
-  for ``still_ms``. Frames are then ignored until none was suspect for ``recover_ms``; after that the stream begins
-  anew.
+  for ``still_ms``. Frames are then ignored until none was suspect for ``recover_ms``; after that a new stream
+  begins.
 - After a gap or a reset of the clock, all these times are counted from 0 (`Health.clear`), also during a fault.
 """
 

@@ -115,9 +115,9 @@ class IntegerModel:
                 f"{len(self.layout.channels)}: train again."
             )
         if any(i >= arch.channels for s in gate.signals for i in s.inputs):
-            raise BundleError(f"The gate reads an input that there is not: the model has {arch.channels}; train again.")
+            raise BundleError(f"The gate reads an unknown input: the model has {arch.channels}; train again.")
         if any(arch.classes <= r.gesture != NO_GESTURE for r in gate.rules):
-            raise BundleError(f"The gate says a gesture that there is not: there are {arch.classes}; train again.")
+            raise BundleError(f"The gate reports an unknown gesture: the model has {arch.classes}; train again.")
         for gesture in self.gestures.gestures:
             if "\0" in gesture.label or gesture.label.encode(errors="replace").decode() != gesture.label:
                 raise BundleError(f"The gesture {gesture.label!r} has a character that the toy cannot keep: rename it.")

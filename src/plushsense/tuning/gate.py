@@ -149,7 +149,8 @@ def fit_gate(
 ) -> GateFit:
     """Fit a gate on the streams of ``subjects``, and on their recordings that are in no stream.
 
-    If there is nothing energetic to detect or no rule is good enough, the settings have no rules; the report says why.
+    If there is nothing energetic to detect or no rule is good enough, the settings have no rules; the report has the
+    reason.
 
     Args:
         gestures: the classes of the model; they define which gestures are energetic, and their affect.

@@ -297,7 +297,7 @@ def merge_people(
         for key in keys:
             new, old = getattr(info, key), getattr(known, key)
             if new and old and new != old:
-                notes.append(f"the {key.replace('_', ' ')} of '{code}' is kept as '{old}'; a session says '{new}'")
+                notes.append(f"the {key.replace('_', ' ')} of '{code}' is kept as '{old}'; a session states '{new}'")
         values = {key: getattr(known, key) or getattr(info, key) for key in keys}
         people[code] = replace(known, **values, more=info.more | known.more)
     strangers = [code for code in file if folder_name(code) not in subjects]

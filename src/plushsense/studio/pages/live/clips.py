@@ -397,7 +397,7 @@ def _count_losses(take: RecordingTake, layout: Layout) -> None:
         if last is not None:
             step_ms = frame.device_ms - last.device_ms
             if step_ms < 0 or step_ms > layout.gap_ms:
-                reason = "the toy's clock began anew" if step_ms < 0 else "nothing came"
+                reason = "the toy's clock restarted" if step_ms < 0 else "nothing came"
                 take.gaps.append(gap_entry(at, last, frame, max(step_ms, frame.host_ms - last.host_ms, 0), reason))
         last = frame
 
