@@ -44,7 +44,7 @@ _NEGATIVE, _POSITIVE = AFFECT_CODES["negative"], AFFECT_CODES["positive"]
 
 
 @dataclass(frozen=True)
-class BaselineSettings:
+class RuleBaselineSettings:
     """Settings of the rule baseline, in raw counts and seconds; a count of 0 switches its rule off.
 
     Attributes:
@@ -99,7 +99,7 @@ class _Swings:
 class _Rules:
     """Applies the rules to evenly sampled inputs."""
 
-    def __init__(self, layout: Layout, settings: BaselineSettings) -> None:
+    def __init__(self, layout: Layout, settings: RuleBaselineSettings) -> None:
         touch, shock = sensors_of(layout)
         self.settings = settings
         self._touch, self._shock = touch, shock
@@ -174,10 +174,10 @@ def sensors_of(layout: Layout) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return tuple(touch), tuple(i for i, n in enumerate(layout.inputs) if kinds[n] == "acceleration")
 
 
-class BaselineReader:
+class RuleBaselineReader:
     """Applies the rule baseline to the frames of one toy; its events have an affect, no gesture and source ``gate``."""
 
-    def __init__(self, layout: Layout, settings: BaselineSettings) -> None:
+    def __init__(self, layout: Layout, settings: RuleBaselineSettings) -> None:
         self.layout, self.settings = layout, settings
         self.reset()
 
@@ -208,9 +208,9 @@ def _to_event(update: Update) -> GestureEvent:
     return GestureEvent(KINDS[update.kind], update.number, affect, None, source, update.since / 1e6, update.now / 1e6)
 
 
-def baseline_events(frames: Frames, layout: Layout, settings: BaselineSettings) -> list[GestureEvent]:
+def rule_baseline_events(frames: Frames, layout: Layout, settings: RuleBaselineSettings) -> list[GestureEvent]:
     """Return the events of a whole stream; an event that is open at the end of the stream ends there."""
-    reader = BaselineReader(layout, settings)
+    reader = RuleBaselineReader(layout, settings)
     host = frames.host_ms if frames.host_ms is not None else frames.device_ms
     events: list[GestureEvent] = []
     for at, ms, values in zip(host.tolist(), frames.device_ms.tolist(), frames.values.tolist(), strict=True):
@@ -222,7 +222,7 @@ def fit_rule_baseline(
     dataset: Dataset,
     gestures: GestureSet,
     subjects: Collection[str],
-) -> tuple[BaselineSettings, dict[str, Any]]:
+) -> tuple[RuleBaselineSettings, dict[str, Any]]:
     """Tune the thresholds on the recordings of ``subjects``.
 
     ``shock`` and ``touch_shock`` are the lowest counts at which at most 2 % of the positive and neutral recordings
@@ -237,7 +237,7 @@ def fit_rule_baseline(
     """
     if not gestures.has_affect:
         raise ConfigError(
-            f"The gesture set '{gestures.name}' has no affects, which the old rules need: "
+            f"The gesture set '{gestures.name}' has no affects, which the rule baseline needs: "
             "give each gesture an affect in its TOML file, or use another set."
         )
     layout, people = dataset.layout, set(subjects)
@@ -260,10 +260,10 @@ def fit_rule_baseline(
     if not peaks:
         raise ConfigError("None of these people recorded a gesture that is not negative: include other people.")
     thresholds = np.ceil(np.quantile(np.array(peaks), 1.0 - _MAX_WRONG / 2, axis=0)).astype(int) + 1
-    settings = BaselineSettings(int(thresholds[0]) if shock else 0, int(thresholds[1]) if touch else 0)
+    settings = RuleBaselineSettings(int(thresholds[0]) if shock else 0, int(thresholds[1]) if touch else 0)
     shares: dict[str, float] = {}
     for swing in _SWINGS if touch else ():
-        candidate = BaselineSettings(settings.shock, settings.touch_shock, swing)
+        candidate = RuleBaselineSettings(settings.shock, settings.touch_shock, swing)
         shares = {
             a: float(np.mean([_is_answered_positive(x, layout, candidate) for x in xs]))
             for a, xs in unanswered.items()
@@ -285,6 +285,6 @@ def fit_rule_baseline(
 _SWINGS = tuple(round(100 * 1.25**n) for n in range(18))
 
 
-def _is_answered_positive(x: NDArray[np.int64], layout: Layout, settings: BaselineSettings) -> bool:
+def _is_answered_positive(x: NDArray[np.int64], layout: Layout, settings: RuleBaselineSettings) -> bool:
     rules = _Rules(layout, settings)
     return any(u.affect == _POSITIVE for at, row in enumerate(x.tolist()) for u in rules.push(row, at))
