@@ -79,7 +79,7 @@ class Program:
 
     def __init__(self, *options: str, cwd: Path) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "plushsense.cli.main", *options, "--json"],
+            [sys.executable, "-m", "plushsense", *options, "--json"],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,

@@ -112,7 +112,7 @@ def test_a_person_of_the_training_is_warned_of(cli: Cli, bundle: Path, recording
     ("words", "said"),
     [
         (("--subject", "P77"), "no recording of 'P77'"),
-        ((), "say whose with --subject"),
+        ((), "choose a person with --subject"),
         (("--subject", "P1", "--use", "1"), "--use 1 is too few"),
         (("--subject", "P1", "--use", "2"), "left to test on"),
     ],

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-COMMAND = [sys.executable, "-m", "plushsense.cli.main"]
+COMMAND = [sys.executable, "-m", "plushsense"]
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from typing import Any
 
 from plushsense.dataset.store import Dataset
 
-COMMAND = [sys.executable, "-m", "plushsense.cli.main"]
+COMMAND = [sys.executable, "-m", "plushsense"]
 
 
 def test_kill_9_in_the_middle(dataset: Dataset, cli: Callable[..., Any]) -> None:

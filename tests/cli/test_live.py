@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-COMMAND = [sys.executable, "-m", "plushsense.cli.main"]
+COMMAND = [sys.executable, "-m", "plushsense"]
 KEYS = ["t_s", "gesture", "affect", "confidence", "source", "state", "answer", "events"]
 
 

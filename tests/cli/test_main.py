@@ -463,7 +463,7 @@ def test_windows_calls_a_broken_pipe_an_invalid_argument(monkeypatch: pytest.Mon
 def test_output_is_utf8_whatever_the_console(cli: Cli, recordings: Path, tmp_path: Path) -> None:
     ran = cli("import", recordings, tmp_path / "DS", "--layout", "accel-3", "--name", "Plüsch")
     assert ran.status == 0
-    words = [sys.executable, "-m", "plushsense.cli.main", "info", str(tmp_path / "DS"), "--json"]
+    words = [sys.executable, "-m", "plushsense", "info", str(tmp_path / "DS"), "--json"]
     done = subprocess.run(words, capture_output=True, check=False, env={**os.environ, "PYTHONIOENCODING": "cp1252"})
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.decode("utf-8"))["name"] == "Plüsch"

@@ -90,7 +90,7 @@ def test_recorded_sessions_give_the_same_table_under_their_own_heading(capsys, s
     result = json.loads(text)
     assert result["heading"].startswith("The paper's real-time protocol on recorded sessions of a simulation: raw")
     assert (result["trials"], result["people"], result["aims"]) == (4, ["P01", "P02"], [])
-    assert any("nobody is left to tune the old rules on" in sentence for sentence in result["said"])
+    assert any("nobody is left to tune the rule baseline on" in sentence for sentence in result["said"])
     (sessions / "SIMULATION.txt").rename(tmp_path / "SIMULATION.txt")
     try:
         (sessions / "P02" / "fulldatastream.csv").rename(tmp_path / "away.csv")
@@ -129,7 +129,7 @@ def test_the_old_rules_are_tuned_on_people_who_are_not_scored(capsys, sessions, 
     status, text, err = said(capsys, "--model", stranger, "--session", sessions, "--subjects", "P02", "--json")
     assert status == 0, err
     result = json.loads(text)
-    assert ["Old rules", "Tuned on people who are not scored here: 1."] in result["about"]
+    assert ["Rule baseline", "Tuned on people who are not scored here: 1."] in result["about"]
     rows = {(row["group"], row["system"]): row for row in result["rows"]}
     assert rows["energetic", "rules"]["activated"] == 1, "an abrupt blow is what they are for"
     assert rows["energetic", "rules"]["named"] == 0
@@ -143,7 +143,7 @@ def test_virtual_rules_are_tuned_on_another_population():
     ask, tuned = virtual_rules(1, layout, gestures, people=1)
     assert tuned == "Tuned on 1 other virtual people, of another population."
     sitting = next(iter(virtual_sittings([1001], 1, 2, layout, gestures=("Tail hit 2",))))
-    begun = [e for e in ask(sitting.frames) if e.what == "begun" and e.affect == "negative"]
+    begun = [e for e in ask(sitting.frames) if e.kind == "begun" and e.affect == "negative"]
     for trial in sitting.trials:
         assert any(-0.02 <= e.t_s - trial.onset_s < 0.2 for e in begun)
 

@@ -18,7 +18,7 @@ import pytest
 from plushsense.recording.session_files import SessionHead, read_events
 
 Cli = Callable[..., Any]
-COMMAND = [sys.executable, "-m", "plushsense.cli.main", "record"]
+COMMAND = [sys.executable, "-m", "plushsense", "record"]
 URL = "virtual://?speed=0&lost=0&garbled=0&glitch=0"
 KEYS = {
     "folder", "subject", "session", "recordings", "skipped", "redone", "rows", "lost", "malformed", "garbage",
@@ -56,8 +56,8 @@ def test_keys_from_a_script(tmp_path: Path) -> None:
     # One of two seconds, set aside and made again, the next skipped, then one more.
     assert (said["recordings"], said["redone"], said["skipped"], said["finished"]) == (2, 1, 1, False)
     events = list(read_events(tmp_path / "S01" / "1"))
-    assert [e.details["text"] for e in events if e.what == "note"] == ["too soft"]
-    rows = [e.details["rows"] for e in events if e.what == "take"]
+    assert [e.details["text"] for e in events if e.kind == "note"] == ["too soft"]
+    rows = [e.details["rows"] for e in events if e.kind == "take"]
     assert rows[0] >= 200
     done = scripted(tmp_path, " . ")
     said = json.loads(done.stdout)
@@ -68,9 +68,9 @@ def test_a_pause_from_a_script_breaks_the_recording_off(tmp_path: Path) -> None:
     done = scripted(tmp_path, " .pp . ", "--protocol", "quick")
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["recordings"] == 1
-    events = [e for e in read_events(tmp_path / "S01" / "1") if e.what in ("abandon", "pause", "resume", "take")]
-    assert [e.what for e in events] == ["abandon", "pause", "resume", "take"]
-    assert {e.details["gesture"] for e in events if e.what in ("abandon", "take")} == {"Back stroke 1"}
+    events = [e for e in read_events(tmp_path / "S01" / "1") if e.kind in ("abandon", "pause", "resume", "take")]
+    assert [e.kind for e in events] == ["abandon", "pause", "resume", "take"]
+    assert {e.details["gesture"] for e in events if e.kind in ("abandon", "take")} == {"Back stroke 1"}
 
 
 def test_an_input_that_never_ends_does_not_hold_it_up(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_a_log_that_nobody_reads_holds_up_no_recording(tmp_path: Path) -> None:
     os.close(err)
     until = time.monotonic() + 60
     folder = tmp_path / "S01" / "1"
-    while not any(e.what == "finished" for e in read_events(folder)):
+    while not any(e.kind == "finished" for e in read_events(folder)):
         assert time.monotonic() < until, f"only {len(list(folder.glob('*_*.csv')))} recordings"
         time.sleep(0.05)
     with os.fdopen(out, "rb") as log:
@@ -159,7 +159,7 @@ def test_a_person_at_a_terminal(tmp_path: Path, pty_possible: None) -> None:
     assert termios.tcgetattr(slave) == before, "the terminal is as it was"
     os.close(master)
     os.close(slave)
-    assert [e.details["text"] for e in read_events(tmp_path / "S01" / "1") if e.what == "note"] == ["möchte nicht"]
+    assert [e.details["text"] for e in read_events(tmp_path / "S01" / "1") if e.kind == "note"] == ["möchte nicht"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")
@@ -201,7 +201,7 @@ def test_asked_to_end_while_recording(tmp_path: Path, pty_possible: None, name: 
     os.close(master)
     process.wait(10)
     events = list(read_events(tmp_path / "S01" / "1"))
-    assert [e.what for e in events][-2:] == ["abandon", "close"]
+    assert [e.kind for e in events][-2:] == ["abandon", "close"]
     stream = (tmp_path / "S01" / "1" / "fulldatastream.csv").read_bytes()
     assert stream.count(b"\n") == events[-1].details["rows"]
     assert not (tmp_path / "S01" / "1" / "session.lock").exists()

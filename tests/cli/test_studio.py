@@ -93,7 +93,7 @@ class Running:
     """The verb in a process of its own."""
 
     def __init__(self, home: Path, *options: str) -> None:
-        command = [sys.executable, "-m", "plushsense.cli.main", "studio", "--home", str(home), "--no-show"]
+        command = [sys.executable, "-m", "plushsense", "studio", "--home", str(home), "--no-show"]
         env = {k: v for k, v in os.environ.items() if not k.startswith(("NICEGUI_", "PYTEST_"))}
         self.process = subprocess.Popen(
             [*command, "--port", "0", *options],

@@ -126,3 +126,28 @@ def test_a_range_that_nobody_gave_is_that_of_the_integers(tmp_path: Path) -> Non
     layout = load_layout(path)
     assert (layout.valid_min_int == -(2**31)).all() and (layout.valid_max_int == 2**31 - 1).all()
     assert Layout.from_dict(layout.to_dict()) == layout
+
+
+def test_columns_by_label_by_header_and_by_position() -> None:
+    plush, accel = load_layout("plush-15"), load_layout("accel-3")
+    names, first = plush.names, tuple(range(13))
+    assert plush.match_columns([*reversed(names)], 13) == (tuple(reversed(first)), None)
+    assert plush.match_columns([" Device_MS", "other", *(n.upper() for n in names)], 15) == (tuple(range(2, 15)), 0)
+    assert accel.match_columns(["Arduino Timestamp (ms)", "Z", "Y", "X"], 4) == ((3, 2, 1), 0)
+    assert plush.match_columns([], 13) == plush.match_columns([f"Ch{i}" for i in first], 13) == (first, None)
+    assert plush.match_columns(["?"] * 15, 15) == (first, 13)
+    assert load_layout("plush-14").match_columns([], 14) == (first, None)
+    assert accel.match_columns([], 4) == ((1, 2, 3), 0), "device_ms comes first on this layout's wire"
+
+
+@pytest.mark.parametrize(
+    ("labels", "width", "reason"),
+    [
+        ([], 8, "it has 8 channels, and layout 'accel-3' needs 3, or the 4 of its wire format"),
+        (["Fp1", "Fp2"], 2, "it has 2 channels (Fp1, Fp2), and layout 'accel-3' needs 3"),
+        (["x", "y", "q"], 3, "its labels do not name z exactly once"),
+        (["x", "y", "z", "x"], 4, "its labels do not name x exactly once"),
+    ],
+)
+def test_a_stream_that_does_not_fit(labels: list[str], width: int, reason: str) -> None:
+    assert str(load_layout("accel-3").match_columns(labels, width)).startswith(reason)

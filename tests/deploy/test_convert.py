@@ -75,7 +75,7 @@ def test_onnx_answers_as_the_network(net: Any, tmp_path: Path, onnx_here: None) 
     assert done.bytes == done.path.stat().st_size and done.path.name == "model.onnx"
     assert done.largest_difference is not None and done.largest_difference < 1e-3
     raw = others(bundle)
-    assert_floats(as_onnx.answers(done.path.read_bytes(), raw), bundle, raw)
+    assert_floats(as_onnx.run_model(done.path.read_bytes(), raw), bundle, raw)
     assert [p.name for p in done.path.parent.iterdir()] == ["model.onnx"], "something was left behind"
 
 
@@ -85,7 +85,7 @@ def test_litert_answers_as_the_network(net: Any, tmp_path: Path, litert_here: No
     done = convert(bundle, tmp_path / "model.tflite", "tflite")
     assert done.largest_difference is not None and done.largest_difference < 1e-3
     raw = others(bundle)
-    assert_floats(as_tflite.answers(done.path.read_bytes(), raw), bundle, raw)
+    assert_floats(as_tflite.run_model(done.path.read_bytes(), raw), bundle, raw)
 
 
 @pytest.mark.parametrize("net", DEPLOYABLE, ids=str)
@@ -97,7 +97,7 @@ def test_int8_comes_close_to_the_integers(name: str, net: Any, tmp_path: Path, r
     done = convert(bundle, tmp_path / "m", name)
     raw = others(bundle, 60)
     room = as_onnx if name == "onnx-int8" else as_tflite
-    found, expected = room.answers(done.path.read_bytes(), raw), integer.forward(raw) / 256
+    found, expected = room.run_model(done.path.read_bytes(), raw), integer.forward(raw) / 256
     assert found is not None
     # A code that rounds the other way moves a logit by little; a wrong scale or shift by much.
     assert np.abs(found - expected).max() < 0.01 * max(1.0, np.abs(expected).max())
@@ -114,8 +114,8 @@ def test_real_windows(real_data: Path, onnx_here: None, litert_here: None) -> No
     raw = np.stack([values[at : at + bundle.arch.span].T for at in range(0, len(values) - bundle.arch.span, 400)])
     assert len(raw) > 10
     fitted = Bundle(bundle.arch, bundle.weights, bundle.layout, Scaler.fit(raw), bundle.gestures)
-    assert_floats(as_onnx.answers(as_onnx.float_model(fitted), raw), fitted, raw)
-    assert_floats(as_tflite.answers(as_tflite.float_model(fitted), raw), fitted, raw)
+    assert_floats(as_onnx.run_model(as_onnx.float_model(fitted), raw), fitted, raw)
+    assert_floats(as_tflite.run_model(as_tflite.float_model(fitted), raw), fitted, raw)
 
 
 def test_onnx_says_what_it_is(tmp_path: Path, onnx_here: None) -> None:
@@ -159,7 +159,7 @@ def test_a_file_that_answers_otherwise_is_refused(tmp_path: Path, onnx_here: Non
     job = ConversionJob.of(bundle, None)
     with pytest.raises(BundleError, match="gives other answers"):
         data = as_onnx.float_model(other)
-        compared(job, data, as_onnx.answers(data, job.windows), "ONNX")
+        compared(job, data, as_onnx.run_model(data, job.windows), "ONNX")
 
 
 def test_given_windows_are_tried_too(tmp_path: Path, onnx_here: None) -> None:

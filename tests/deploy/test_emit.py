@@ -13,7 +13,7 @@ import pytest
 from plushsense.core.errors import BadInput
 from plushsense.core.gestures import GestureSet
 from plushsense.core.templates import c_comment
-from plushsense.deploy.emit import TOY_BYTES, c_names, emit, read_facts, without_people
+from plushsense.deploy.emit import TOY_BYTES, c_names, emit, read_facts
 from plushsense.deploy.golden import answers_of, column, golden_frames, read_golden
 from plushsense.deploy.quantize import integer_model
 from plushsense.models.bundle import Bundle
@@ -71,16 +71,18 @@ def test_a_folder_that_cannot_be_finished_leaves_nothing(tmp_path: Path) -> None
 
 
 def test_nobody_is_named(tmp_path: Path) -> None:
-    emit(*made(), tmp_path / "out")
+    model, bundle = made()
+    emit(model, bundle, tmp_path / "out")
     for path in (tmp_path / "out").rglob("*"):
         if path.is_file():
             assert not any(name in path.read_bytes() for name in (b"Anna", b"P02", b"Bo,"))
-    assert without_people(PEOPLE) == {
+    export = bundle.without_people()
+    assert export.provenance == {
         "subjects": 2,
         "validation_subjects": 1,
         "scores": {"said": "people: …, …", "f1": 0.5},
     }
-    assert without_people(without_people(PEOPLE)) == without_people(PEOPLE), "export does it before emit does"
+    assert export.without_people().provenance == export.provenance, "export does it before emit does"
 
 
 @pytest.mark.parametrize("label", ["*\\", "*/*", "/*/", "\u202eRTL", "a\rb\n", "\u2066x"])

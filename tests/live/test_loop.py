@@ -47,9 +47,9 @@ def test_a_replay_gives_what_pushing_its_frames_gives(bundle, recording):
     assert summary.seconds == pytest.approx(wanted[-1].t_s, abs=0.06)
     assert summary.decisions_per_s == pytest.approx(len(wanted) / summary.seconds)
     assert 0 < summary.latency_ms["p50"] <= summary.latency_ms["p95"] <= summary.latency_ms["p99"]
-    assert summary.events == sum(e.what == "begun" for d in wanted for e in d.events) > 0
+    assert summary.events == sum(e.kind == "begun" for d in wanted for e in d.events) > 0
     assert (summary.no_signal, summary.faults) == (3, 0)
-    assert [e.what for e in wanted[-1].events] == ["ended"]
+    assert [e.kind for e in wanted[-1].events] == ["ended"]
     assert summary.to_dict()["counters"] == summary.counters
 
 

@@ -74,7 +74,7 @@ def take(r: Recorder, seconds: float = 1.0) -> RecorderStatus:
 
 
 def whats(folder: Path) -> list[str]:
-    return [e.what for e in read_events(folder)]
+    return [e.kind for e in read_events(folder)]
 
 
 def test_one_recording(tmp_path: Path) -> None:
@@ -100,8 +100,8 @@ def test_one_recording(tmp_path: Path) -> None:
     lines = path.read_text().splitlines()[1:]
     stream = (tmp_path / STREAM_NAME).read_text().splitlines()
     assert lines == stream[beside["stream_row"] : beside["stream_row"] + len(lines)]
-    start = next(e for e in read_events(tmp_path) if e.what == "start")
-    countdown = next(e for e in read_events(tmp_path) if e.what == "countdown")
+    start = next(e for e in read_events(tmp_path) if e.kind == "start")
+    countdown = next(e for e in read_events(tmp_path) if e.kind == "countdown")
     assert start.details["device_ms"] - countdown.details["device_ms"] == pytest.approx(3000, abs=12)
     assert beside["device_ms"][0] == start.details["device_ms"]
 
@@ -154,7 +154,7 @@ def test_a_running_one_is_broken_off(tmp_path: Path) -> None:
         r.space()
         r.wait("recording", timeout_s=20)
     assert whats(tmp_path) == ["open", *2 * ["countdown", "start", "abandon"], "close"]
-    assert [e.details["why"] for e in read_events(tmp_path) if e.what == "abandon"] == ["redo", "quit"]
+    assert [e.details["why"] for e in read_events(tmp_path) if e.kind == "abandon"] == ["redo", "quit"]
     assert not list(tmp_path.glob("Back*"))
 
 
@@ -173,15 +173,15 @@ def test_a_pause_breaks_a_recording_off_and_asks_for_it_again(tmp_path: Path) ->
         assert (r.status().state, r.status().step.gesture, r.status().done) == ("idle", "Head stroke 1", 1)
         assert take(r).done == 2
     events = list(read_events(tmp_path))
-    (abandoned,) = [e.details for e in events if e.what == "abandon"]
+    (abandoned,) = [e.details for e in events if e.kind == "abandon"]
     assert (abandoned["why"], abandoned["gesture"], abandoned["repetition"]) == ("pause", "Head stroke 1", 1)
     # Nothing is lost: the rows of the abandoned recording are in the stream, where the log says.
-    started = [e.details["row"] for e in events if e.what == "start"][1]
+    started = [e.details["row"] for e in events if e.kind == "start"][1]
     rows = read_stream(tmp_path / STREAM_NAME, LAYOUT).frames
     assert started >= before
     assert abandoned["rows"] >= 95
     assert len(rows) >= started + abandoned["rows"]
-    assert [e.details["gesture"] for e in events if e.what == "take"] == ["Back stroke 1", "Head stroke 1"]
+    assert [e.details["gesture"] for e in events if e.kind == "take"] == ["Back stroke 1", "Head stroke 1"]
     assert len(list(tmp_path.glob("Head stroke 1_*.csv"))) == 1
     with recorder(tmp_path) as r:
         assert (r.status().done, r.status().step.gesture) == (2, "Hold strong")
@@ -216,7 +216,7 @@ def test_pause_note_and_the_end(tmp_path: Path) -> None:
             r.skip()
         assert take(r).state == "finished"
         assert r.wait("finished", timeout_s=0)
-    assert next(e.details["text"] for e in read_events(tmp_path) if e.what == "note") == "the child laughs"
+    assert next(e.details["text"] for e in read_events(tmp_path) if e.kind == "note") == "the child laughs"
     assert whats(tmp_path)[-2:] == ["finished", "close"]
     with recorder(tmp_path) as r:
         assert (r.status().state, r.status().done, r.status().skipped) == ("finished", 1, 3)
@@ -307,7 +307,7 @@ def test_unplugged_for_five_seconds_during_a_gesture(tmp_path: Path) -> None:
     # What the toy said just before and just after the plug was pulled may be lost with it.
     assert 5000 <= gap["missing_ms"] < 11_000
     assert (beside["reconnects"], gap["reason"]) == (1, "'x' went away: was it unplugged?")
-    (event,) = [e for e in read_events(tmp_path) if e.what == "gap"]
+    (event,) = [e for e in read_events(tmp_path) if e.kind == "gap"]
     assert (event.details["gesture"], event.details["missing_ms"]) == ("Back stroke 1", gap["missing_ms"])
     frames = read_recording(next(tmp_path.glob("Back*.csv")), LAYOUT).frames
     hole = int(np.argmax(np.diff(frames.device_ms)))
@@ -416,7 +416,7 @@ def test_commands_from_many_threads_lose_nothing(tmp_path: Path) -> None:
     stream = (tmp_path / STREAM_NAME).read_text().splitlines()
     clock = read_stream(tmp_path / STREAM_NAME, LAYOUT).frames.device_ms
     assert np.diff(clock).max() <= 12
-    takes = [e.details for e in read_events(tmp_path) if e.what == "take"]
+    takes = [e.details for e in read_events(tmp_path) if e.kind == "take"]
     assert takes
     assert {t["file"] for t in takes} == {p.name for p in tmp_path.glob("* *_*.csv")}
     for path in tmp_path.glob("* *_*.csv"):
@@ -435,7 +435,7 @@ def test_a_remark_after_the_end_is_not_said_to_be_kept(tmp_path: Path) -> None:
         assert r.status().message == "Note saved."
     r.note("too late")
     assert "not saved" in r.status().message
-    assert [e.details["text"] for e in read_events(tmp_path) if e.what == "note"] == ["in time"]
+    assert [e.details["text"] for e in read_events(tmp_path) if e.kind == "note"] == ["in time"]
 
 
 FULL = """
@@ -507,7 +507,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 def test_a_full_disk(small_disk: Path) -> None:
     words = [
-        sys.executable, "-m", "plushsense.cli.main", "record", str(small_disk), "--device", URL,
+        sys.executable, "-m", "plushsense", "record", str(small_disk), "--device", URL,
         "--subject", "S01", "--auto", "2", "--json",
     ]  # fmt: skip
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60, stdin=subprocess.DEVNULL)

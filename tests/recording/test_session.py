@@ -97,7 +97,7 @@ def test_a_torn_stream_is_cut_to_whole_lines_and_the_log_keeps_the_rest(folder: 
     progress = OpenSession(folder)
     progress.close()
     assert path.read_bytes() == whole
-    (event,) = [e for e in read_events(folder) if e.what == "mended"]
+    (event,) = [e for e in read_events(folder) if e.kind == "mended"]
     assert (event.details["bytes"], event.details["text"]) == (8, "1020, 20")
     assert len(progress.progress.repairs) == 1
     path.write_bytes(b"10")
@@ -112,7 +112,7 @@ def test_a_torn_line_of_the_log_is_passed_over(folder: Path) -> None:
     session.log.write([SessionEvent("note", 1, {"text": "after"})])
     session.close()
     assert session.progress.takes == {("Back stroke 1", 1): path.name}
-    assert [e.what for e in read_events(folder)] == ["take", "note"]
+    assert [e.kind for e in read_events(folder)] == ["take", "note"]
 
 
 def test_a_recording_that_the_log_does_not_know_is_taken_in(folder: Path) -> None:
@@ -129,7 +129,7 @@ def test_what_was_begun_is_to_be_made_again(folder: Path) -> None:
     progress = opened(folder, start).progress
     assert progress.takes == {}
     assert "record it again" in progress.repairs[0]
-    assert [e.what for e in read_events(folder)] == ["start", "unfinished"]
+    assert [e.kind for e in read_events(folder)] == ["start", "unfinished"]
     assert opened(folder).progress.repairs == []
 
 

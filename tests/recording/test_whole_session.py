@@ -32,7 +32,7 @@ def recording(out: Path, toy: Toy, speed: float, *words: str) -> subprocess.Pope
     """``plushsense record`` as a program of its own, pressing its own space bar."""
     process = subprocess.Popen(
         [
-            sys.executable, "-m", "plushsense.cli.main", "record", str(out), "--device", toy.url,
+            sys.executable, "-m", "plushsense", "record", str(out), "--device", toy.url,
             "--subject", "S01", "--speed", str(speed), "--auto", "4", "--json", *words,
         ],
         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -81,7 +81,7 @@ def _hand_follows_prompt(folder: Path, toy: Toy) -> None:
 
     At this speed a second of the toy is 17 ms, so on a busy machine a prompt may be missed or read too late.
     """
-    prompted = iter([str(e.details["gesture"]) for e in read_events(folder) if e.what == "countdown"])
+    prompted = iter([str(e.details["gesture"]) for e in read_events(folder) if e.kind == "countdown"])
     assert all(p.label in prompted for p in toy.performed)
     beside = [json.loads(path.with_suffix(".json").read_text()) for path in recordings(folder)]
     spans = [(b["gesture"], *b["device_ms"]) for b in beside]
@@ -110,12 +110,12 @@ def kill_and_check(out: Path, toy: Toy, after_s: float, speed: float, *words: st
     sent_ms = toy.last_ms
     kill(process)
     stream = read_stream(folder / STREAM_NAME, LAYOUT)
-    before = [e for e in read_events(folder) if e.what in ("start", "take", "abandon", "unfinished")]
+    before = [e for e in read_events(folder) if e.kind in ("start", "take", "abandon", "unfinished")]
     return {
         "recordings": done,
         "missing_ms": sent_ms - int(stream.frames.device_ms[-1]),
         "torn": float(stream.malformed),
-        "in_a_recording": float(bool(before) and before[-1].what == "start"),
+        "in_a_recording": float(bool(before) and before[-1].kind == "start"),
     }
 
 
@@ -138,7 +138,7 @@ def test_killed_three_times(tmp_path: Path) -> None:
     assert not [p.name for p in folder.iterdir() if p.suffix in (".part", ".new", ".torn", ".lock")]
     # What is missing lies between two runs, nowhere else.
     stream = read_stream(folder / STREAM_NAME, LAYOUT).frames
-    opened = {e.details["row"] for e in read_events(folder) if e.what == "open"}
+    opened = {e.details["row"] for e in read_events(folder) if e.kind == "open"}
     gaps = set((np.flatnonzero(np.abs(np.diff(stream.device_ms)) > 15) + 1).tolist())
     assert gaps <= opened
 

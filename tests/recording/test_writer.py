@@ -120,4 +120,4 @@ def test_events_are_appended(tmp_path: Path) -> None:
         log.write([SessionEvent("note", n, {"text": "ä"}), SessionEvent("pause", n)])
         log.write([])
         log.close()
-    assert [(e.what, e.at_ms) for e in read_events(tmp_path)] == [("note", 0), ("pause", 0), ("note", 1), ("pause", 1)]
+    assert [(e.kind, e.at_ms) for e in read_events(tmp_path)] == [("note", 0), ("pause", 0), ("note", 1), ("pause", 1)]

@@ -51,7 +51,7 @@ SET = GestureSet(
 )
 POSITIVE, NEUTRAL, NEGATIVE = (AFFECT_CODES[a] for a in ("positive", "neutral", "negative"))
 UNSMOOTHED = ONE
-PLAN = EventSettings(
+SETTINGS = EventSettings(
     enter=round(0.6 * ONE), leave=round(0.3 * ONE), enter_affect=round(0.8 * ONE), leave_affect=round(0.4 * ONE),
     least=3, switch=5, end=4,
 )  # fmt: skip
@@ -76,7 +76,7 @@ NOTHING: dict[int, float] = {}
 
 def played(
     steps: list[dict[int, float]],
-    plan: EventSettings = PLAN,
+    settings: EventSettings = SETTINGS,
     *,
     gate: dict[int, tuple[int, int]] | None = None,
     suspect: range = range(0),
@@ -84,7 +84,7 @@ def played(
     machine: EventMachine | None = None,
 ) -> list[tuple[int, str, int, int, int, int]]:
     """(step, what, affect, gesture, number, since) of every update; the gate fires before the step."""
-    machine = machine or EventMachine(plan, UNSMOOTHED, gestures)
+    machine = machine or EventMachine(settings, UNSMOOTHED, gestures)
     found: list[Update] = []
     for now, shares in enumerate(steps):
         if gate and now in gate:
@@ -95,8 +95,8 @@ def played(
     return [(u.now, names[u.kind], u.affect, u.gesture, u.number, u.since) for u in found]
 
 
-def answered(shares: dict[int, float], plan: EventSettings = PLAN, most: float = 10.0) -> str:
-    answer, _ = EventMachine(plan, UNSMOOTHED, SET).step(logits(shares, most), 0)
+def answered(shares: dict[int, float], settings: EventSettings = SETTINGS, most: float = 10.0) -> str:
+    answer, _ = EventMachine(settings, UNSMOOTHED, SET).step(logits(shares, most), 0)
     return ANSWERS[answer.kind]
 
 
@@ -104,7 +104,7 @@ def answered(shares: dict[int, float], plan: EventSettings = PLAN, most: float =
 
 
 def test_probabilities_and_the_highest_logit_are_smoothed_alike() -> None:
-    machine = EventMachine(PLAN, 6000, SET)
+    machine = EventMachine(SETTINGS, 6000, SET)
     mean = None
     for at, (shares, most) in enumerate([(STROKES, 9.0), (HITS, 3.0), (HITS, -2.0), (NOTHING, 20.0)]):
         row = logits(shares, most)
@@ -118,7 +118,7 @@ def test_probabilities_and_the_highest_logit_are_smoothed_alike() -> None:
 
 
 def test_of_two_that_look_equal_the_best_is_the_one_with_more_bits_and_of_equal_ones_the_first() -> None:
-    machine = EventMachine(PLAN, 1, SET)
+    machine = EventMachine(SETTINGS, 1, SET)
     both = logits({SCRATCH: 0.4, HIT: 0.4})
     assert machine.step(both, 0)[0].best == SCRATCH
     assert machine.mean is not None
@@ -132,20 +132,20 @@ def test_of_two_that_look_equal_the_best_is_the_one_with_more_bits_and_of_equal_
 
 
 def test_the_kinds_of_an_answer() -> None:
-    plan = replace(PLAN, sure=round(0.3 * ONE), known=5 * 256)
-    assert answered(STROKES, plan, most=4.9) == "unknown"
-    assert answered(STROKES, plan, most=5.1) == "sure"
-    assert answered(RESTS, plan) == "idle"
-    assert answered({REST: 0.4, HIT: 0.3}, plan) == "idle", "the best class is idle, sure or not"
-    assert answered(RESTS, plan, most=4.0) == "unknown", "unknown goes before idle"
-    assert answered(BOTH_POSITIVE, plan) == "affect"
-    assert answered({STROKE: 0.45, HIT: 0.45}, plan) == "unsure", "two affects"
-    assert answered(NOTHING, plan) == "unsure", "no class is in the set"
-    assert answered({THING: 0.6, STROKE: 0.32}, plan) == "unsure", "a class without a told affect"
-    assert answered({HOLD: 0.5, REST: 0.4}, plan) == "unsure", "an idle class in the set, though of the same affect"
-    assert answered({THING: 0.6, STROKE: 0.2}, plan) == "sure", "one class needs no affect"
+    settings = replace(SETTINGS, sure=round(0.3 * ONE), known=5 * 256)
+    assert answered(STROKES, settings, most=4.9) == "unknown"
+    assert answered(STROKES, settings, most=5.1) == "sure"
+    assert answered(RESTS, settings) == "idle"
+    assert answered({REST: 0.4, HIT: 0.3}, settings) == "idle", "the best class is idle, sure or not"
+    assert answered(RESTS, settings, most=4.0) == "unknown", "unknown goes before idle"
+    assert answered(BOTH_POSITIVE, settings) == "affect"
+    assert answered({STROKE: 0.45, HIT: 0.45}, settings) == "unsure", "two affects"
+    assert answered(NOTHING, settings) == "unsure", "no class is in the set"
+    assert answered({THING: 0.6, STROKE: 0.32}, settings) == "unsure", "a class without a told affect"
+    assert answered({HOLD: 0.5, REST: 0.4}, settings) == "unsure", "an idle class in the set, though of the same affect"
+    assert answered({THING: 0.6, STROKE: 0.2}, settings) == "sure", "one class needs no affect"
     untold = GestureSet("untold", tuple(Gesture(g) for g in "abc"))
-    answer, _ = EventMachine(plan, UNSMOOTHED, untold).step(logits({0: 0.47, 1: 0.47}, classes=3), 0)
+    answer, _ = EventMachine(settings, UNSMOOTHED, untold).step(logits({0: 0.47, 1: 0.47}, classes=3), 0)
     assert answer.kind == UNSURE, "none is no affect that could be told"
     assert tuple(range(5)) == (IDLE, UNKNOWN, UNSURE, AFFECT, SURE) and len(ANSWERS) == 5
 
@@ -153,9 +153,9 @@ def test_the_kinds_of_an_answer() -> None:
 def test_a_class_of_exactly_sure_is_in_the_set_and_known_exactly_is_known() -> None:
     row = logits({STROKE: 0.5, HIT: 0.4})
     shares = softmax(row)
-    machine = EventMachine(replace(PLAN, sure=int(shares[HIT]), known=int(row.max())), UNSMOOTHED, SET)
+    machine = EventMachine(replace(SETTINGS, sure=int(shares[HIT]), known=int(row.max())), UNSMOOTHED, SET)
     assert machine.step(row, 0)[0].kind == UNSURE
-    machine = EventMachine(replace(PLAN, sure=int(shares[HIT]) + 1), UNSMOOTHED, SET)
+    machine = EventMachine(replace(SETTINGS, sure=int(shares[HIT]) + 1), UNSMOOTHED, SET)
     assert machine.step(row, 0)[0].kind == SURE
 
 
@@ -172,28 +172,28 @@ def test_a_gesture_is_wanted_from_enter_on_an_affect_by_its_classes_together_and
     assert played([RESTS] * 9) == []
     assert played([{HOLD: 0.41, REST: 0.57}] * 9) == [], "idle"
     assert played([{HOLD: 0.5, REST: 0.48}] * 9) == [], "an idle class counts for no affect"
-    assert played([STROKES] * 9, replace(PLAN, known=11 * 256)) == [], "unknown"
-    assert played([STROKES] * 9, replace(PLAN, known=9 * 256)) != []
+    assert played([STROKES] * 9, replace(SETTINGS, known=11 * 256)) == [], "unknown"
+    assert played([STROKES] * 9, replace(SETTINGS, known=9 * 256)) != []
 
 
 def test_exactly_enter_is_enough_and_exactly_leave_stays() -> None:
     shares = softmax(logits(STROKES))
     for more, n in ((0, 1), (1, 0)):
-        by_gesture = replace(PLAN, enter=int(shares[STROKE]) + more, enter_affect=ONE + 1)
+        by_gesture = replace(SETTINGS, enter=int(shares[STROKE]) + more, enter_affect=ONE + 1)
         assert len(played([STROKES] * 9, by_gesture)) == n
-        alone = replace(PLAN, enter=ONE + 1, enter_affect=int(shares[STROKE] + shares[SCRATCH]) + more)
+        alone = replace(SETTINGS, enter=ONE + 1, enter_affect=int(shares[STROKE] + shares[SCRATCH]) + more)
         assert len(played([STROKES] * 9, alone)) == n
     low = {STROKE: 0.28}
     at = int(softmax(logits(low))[STROKE])
-    assert len(played([STROKES] * 3 + [low] * 9, replace(PLAN, leave=at))) == 1
-    assert len(played([STROKES] * 3 + [low] * 9, replace(PLAN, leave=at + 1))) == 2
+    assert len(played([STROKES] * 3 + [low] * 9, replace(SETTINGS, leave=at))) == 1
+    assert len(played([STROKES] * 3 + [low] * 9, replace(SETTINGS, leave=at + 1))) == 2
 
 
 def test_of_two_affects_of_equal_weight_the_first_code_is_wanted() -> None:
-    plan = replace(PLAN, enter=ONE + 1, enter_affect=round(0.4 * ONE), least=1)
+    settings = replace(SETTINGS, enter=ONE + 1, enter_affect=round(0.4 * ONE), least=1)
     row = np.zeros(7, dtype=np.int64) - 5000
     row[[SCRATCH, PULL]] = 0
-    _, updates = EventMachine(plan, UNSMOOTHED, SET).step(row, 0)
+    _, updates = EventMachine(settings, UNSMOOTHED, SET).step(row, 0)
     assert updates[0].affect == POSITIVE
 
 
@@ -219,8 +219,8 @@ def test_affect_first_then_the_gesture_once() -> None:
 
 
 def test_being_named_breaks_the_row_of_misses() -> None:
-    plan = replace(PLAN, leave_affect=ONE + 1)
-    found = played([BOTH_NEGATIVE] * 3 + [HITS] * 3 + [{HIT: 0.1}] * 9, plan)
+    settings = replace(SETTINGS, leave_affect=ONE + 1)
+    found = played([BOTH_NEGATIVE] * 3 + [HITS] * 3 + [{HIT: 0.1}] * 9, settings)
     assert [f[:2] for f in found] == [(2, "begun"), (5, "named"), (9, "ended")]
 
 
@@ -228,8 +228,8 @@ def test_no_event_begins_within_rest_steps_of_the_last() -> None:
     stream = [STROKES] * 3 + [NOTHING] * 4 + [HITS] * 10
     assert [f[0] for f in played(stream)] == [2, 6, 9]
     for rest in (4, 6):
-        plan = replace(PLAN, rest=rest)
-        begun = played(stream, plan)[-1]
+        settings = replace(SETTINGS, rest=rest)
+        begun = played(stream, settings)[-1]
         assert begun[:2] == (6 + rest + 1, "begun") and begun[5] == 7, "it was wanted all the while"
 
 
@@ -239,21 +239,21 @@ def test_no_event_begins_within_rest_steps_of_the_last() -> None:
 def test_another_takes_its_place_after_switch_steps_in_a_row_and_hold() -> None:
     start = [STROKES] * 3
     for other, what in ((HITS, (NEGATIVE, HIT)), (SCRATCHES, (POSITIVE, SCRATCH)), (BOTH_NEGATIVE, (NEGATIVE, 255))):
-        plan = replace(PLAN, end=9)
-        assert played(start + [other] * 4 + [STROKES] + [other] * 4, plan)[1:] == [], "not in a row"
-        assert played(start + [other] * 5, plan)[1:] == [
+        settings = replace(SETTINGS, end=9)
+        assert played(start + [other] * 4 + [STROKES] + [other] * 4, settings)[1:] == [], "not in a row"
+        assert played(start + [other] * 5, settings)[1:] == [
             (7, "ended", POSITIVE, STROKE, 1, 7),
             (7, "begun", *what, 2, 7),
         ]
-        held = played(start + [other] * 12, replace(PLAN, end=50, hold=8))
+        held = played(start + [other] * 12, replace(SETTINGS, end=50, hold=8))
         assert [f[:2] for f in held] == [(2, "begun"), (10, "ended"), (10, "begun")]
     # An affect wanted without a gesture is no other than the event's own.
     assert played(start + [BOTH_POSITIVE] * 20) == played(start)
 
 
 def test_a_gesture_of_its_own_affect_names_it_and_replaces_nothing() -> None:
-    plan = replace(PLAN, switch=1, least=4)
-    assert played([BOTH_POSITIVE] * 4 + [SCRATCHES] * 5, plan) == [
+    settings = replace(SETTINGS, switch=1, least=4)
+    assert played([BOTH_POSITIVE] * 4 + [SCRATCHES] * 5, settings) == [
         (3, "begun", POSITIVE, NO_GESTURE, 1, 0),
         (7, "named", POSITIVE, SCRATCH, 1, 0),
     ]
@@ -263,23 +263,23 @@ def test_it_ends_after_end_steps_below_leave_in_a_row() -> None:
     start, low, kept = [STROKES] * 3, {STROKE: 0.28}, {STROKE: 0.32}
     assert played(start + [low] * 3 + [kept] + [low] * 3) == played(start)
     assert played(start + [low] * 4)[-1] == (6, "ended", POSITIVE, STROKE, 1, 3)
-    assert played(start + [low] * 4, replace(PLAN, hold=6))[1:] == []
-    assert played(start + [low] * 6, replace(PLAN, hold=6))[-1] == (8, "ended", POSITIVE, STROKE, 1, 3)
+    assert played(start + [low] * 4, replace(SETTINGS, hold=6))[1:] == []
+    assert played(start + [low] * 6, replace(SETTINGS, hold=6))[-1] == (8, "ended", POSITIVE, STROKE, 1, 3)
     # One without a gesture goes by its affect's classes together.
     first = [BOTH_NEGATIVE] * 3
     assert played(first + [{HIT: 0.21, PULL: 0.21, STROKE: 0.5}] * 9) == played(first)
     assert played(first + [{HIT: 0.19, PULL: 0.19, STROKE: 0.5}] * 4)[-1][:2] == (6, "ended")
     # Unknown is no reason to end.
-    machine = EventMachine(replace(PLAN, known=5 * 256), UNSMOOTHED, SET)
+    machine = EventMachine(replace(SETTINGS, known=5 * 256), UNSMOOTHED, SET)
     found = [u for now in range(20) for u in machine.step(logits(STROKES, 10.0 if now < 3 else 1.0), now)[1]]
     assert len(found) == 1
 
 
 def test_it_ends_when_the_best_class_is_idle_and_reached_enter() -> None:
-    plan = replace(PLAN, leave=0)
+    settings = replace(SETTINGS, leave=0)
     start = [STROKES] * 3
-    assert played(start + [{REST: 0.62, STROKE: 0.38}] * 4, plan)[-1][:2] == (6, "ended")
-    assert played(start + [{REST: 0.58, STROKE: 0.42}] * 9, plan) == played(start, plan)
+    assert played(start + [{REST: 0.62, STROKE: 0.38}] * 4, settings)[-1][:2] == (6, "ended")
+    assert played(start + [{REST: 0.58, STROKE: 0.42}] * 9, settings) == played(start, settings)
     # Taken at its word (enter 0), an idle class that is not the best ends nothing.
     assert played([STROKES] * 3 + [{STROKE: 0.6, REST: 0.4}] * 9, EventSettings()) == [
         (0, "begun", POSITIVE, STROKE, 1, 0)
@@ -303,51 +303,51 @@ def test_the_defaults_are_plain_argmax() -> None:
 
 
 def test_the_gates_event_begins_at_once_also_in_the_rest() -> None:
-    plan = replace(PLAN, rest=50)
-    found = played([STROKES] * 3 + [NOTHING] * 5, plan, gate={7: (NEGATIVE, NO_GESTURE)})
+    settings = replace(SETTINGS, rest=50)
+    found = played([STROKES] * 3 + [NOTHING] * 5, settings, gate={7: (NEGATIVE, NO_GESTURE)})
     assert found[-1] == (7, "begun", NEGATIVE, NO_GESTURE, 2, 7)
 
 
 def test_the_gate_and_the_network_make_one_event_not_two() -> None:
-    plan = replace(PLAN, wait=10)
-    found = played([NOTHING] * 2 + [HITS] * 6, plan, gate={1: (NEGATIVE, NO_GESTURE)})
+    settings = replace(SETTINGS, wait=10)
+    found = played([NOTHING] * 2 + [HITS] * 6, settings, gate={1: (NEGATIVE, NO_GESTURE)})
     assert found == [(1, "begun", NEGATIVE, NO_GESTURE, 1, 1), (4, "named", NEGATIVE, HIT, 1, 1)]
     # The other way round: the network has begun, then the gate fires of the same affect.
-    found = played([HITS] * 4 + [NOTHING] * 20, plan, gate={3: (NEGATIVE, NO_GESTURE)})
+    found = played([HITS] * 4 + [NOTHING] * 20, settings, gate={3: (NEGATIVE, NO_GESTURE)})
     assert [f[:2] for f in found] == [(2, "begun"), (16, "ended")], "and prolongs it: 10 to wait, then 4 to end"
     # It had been missed for 3 steps: that is forgotten.
-    found = played([HITS] * 3 + [NOTHING] * 20, replace(PLAN, wait=0), gate={6: (NEGATIVE, NO_GESTURE)})
+    found = played([HITS] * 3 + [NOTHING] * 20, replace(SETTINGS, wait=0), gate={6: (NEGATIVE, NO_GESTURE)})
     assert found[1:] == [(9, "ended", NEGATIVE, HIT, 1, 6)]
     # One of another affect gives way at once.
-    found = played([STROKES] * 4, plan, gate={3: (NEGATIVE, NO_GESTURE)})
+    found = played([STROKES] * 4, settings, gate={3: (NEGATIVE, NO_GESTURE)})
     assert [f[:4] for f in found[1:]] == [(3, "ended", POSITIVE, STROKE), (3, "begun", NEGATIVE, NO_GESTURE)]
 
 
 def test_what_the_gate_began_is_neither_ended_nor_replaced_for_wait_steps() -> None:
-    plan = replace(PLAN, wait=10, switch=1, end=1)
-    found = played([STROKES] * 12, plan, gate={0: (NEGATIVE, NO_GESTURE)})
+    settings = replace(SETTINGS, wait=10, switch=1, end=1)
+    found = played([STROKES] * 12, settings, gate={0: (NEGATIVE, NO_GESTURE)})
     assert [f[:4] for f in found[1:]] == [(10, "ended", NEGATIVE, NO_GESTURE), (10, "begun", POSITIVE, STROKE)]
-    found = played([NOTHING] * 14, plan, gate={0: (NEGATIVE, NO_GESTURE)})
+    found = played([NOTHING] * 14, settings, gate={0: (NEGATIVE, NO_GESTURE)})
     assert found[1:] == [(10, "ended", NEGATIVE, NO_GESTURE, 1, 10)]
 
 
 def test_a_gate_that_fires_again_prolongs_its_event_whatever_its_affect() -> None:
-    plan = replace(PLAN, wait=5)
+    settings = replace(SETTINGS, wait=5)
     for affect in (NEGATIVE, POSITIVE):
-        found = played([NOTHING] * 20, plan, gate={0: (NEGATIVE, NO_GESTURE), 4: (affect, NO_GESTURE)})
+        found = played([NOTHING] * 20, settings, gate={0: (NEGATIVE, NO_GESTURE), 4: (affect, NO_GESTURE)})
         assert [f[:3] for f in found] == [(0, "begun", NEGATIVE), (12, "ended", NEGATIVE)]
 
 
 def test_a_gate_that_tells_no_affect_takes_that_of_the_gesture_that_names_it() -> None:
-    plan = replace(PLAN, wait=10)
-    found = played([HITS] * 5, plan, gate={0: (0, NO_GESTURE)})
+    settings = replace(SETTINGS, wait=10)
+    found = played([HITS] * 5, settings, gate={0: (0, NO_GESTURE)})
     assert found == [(0, "begun", 0, NO_GESTURE, 1, 0), (2, "named", NEGATIVE, HIT, 1, 0)]
     for nothing_known in (NOTHING, {THING: 0.5, HIT: 0.3}):
-        assert played([nothing_known] * 20, plan, gate={0: (0, NO_GESTURE)})[-1][:2] == (13, "ended")
+        assert played([nothing_known] * 20, settings, gate={0: (0, NO_GESTURE)})[-1][:2] == (13, "ended")
 
 
 def test_source_tells_who_began() -> None:
-    machine = EventMachine(replace(PLAN, wait=9), UNSMOOTHED, SET)
+    machine = EventMachine(replace(SETTINGS, wait=9), UNSMOOTHED, SET)
     assert [u.source for u in machine.gate(NEGATIVE, NO_GESTURE, 0)] == [GATE]
     updates = [u for now in range(4) for u in machine.step(logits(HITS), now)[1]]
     assert [(u.kind, u.source) for u in updates] == [(NAMED, GATE)], "though the network named it"
@@ -357,12 +357,12 @@ def test_source_tells_who_began() -> None:
 
 
 def test_while_warming_an_event_of_the_gate_ends_in_its_time() -> None:
-    machine = EventMachine(replace(PLAN, wait=6, end=4, hold=0), UNSMOOTHED, SET)
+    machine = EventMachine(replace(SETTINGS, wait=6, end=4, hold=0), UNSMOOTHED, SET)
     assert machine.blind_step(0) == []
     machine.gate(NEGATIVE, NO_GESTURE, 0)
     found = [u for now in range(1, 20) for u in machine.blind_step(now)]
     assert [(u.kind, u.since, u.now) for u in found] == [(ENDED, 7, 10)]
-    machine = EventMachine(replace(PLAN, wait=6, end=4, hold=15), UNSMOOTHED, SET)
+    machine = EventMachine(replace(SETTINGS, wait=6, end=4, hold=15), UNSMOOTHED, SET)
     machine.gate(NEGATIVE, NO_GESTURE, 0)
     found = [u for now in range(1, 20) for u in machine.blind_step(now)]
     assert [(u.kind, u.since, u.now) for u in found] == [(ENDED, 7, 15)]
@@ -388,14 +388,14 @@ def test_a_suspect_step_neither_counts_nor_breaks_a_row() -> None:
 
 
 def test_when_the_signal_is_lost_its_event_ends_and_all_but_the_count_is_forgotten() -> None:
-    plan = replace(PLAN, rest=50)
-    machine = EventMachine(plan, 3000, SET)
+    settings = replace(SETTINGS, rest=50)
+    machine = EventMachine(settings, 3000, SET)
     for now in range(60):
         machine.step(logits(STROKES), now)
     lost = machine.lost(70)
     assert [(u.kind, u.number, u.gesture, u.since, u.now) for u in lost] == [(ENDED, 1, STROKE, 70, 70)]
     assert machine.lost(71) == [] and machine.mean is None
-    fresh = EventMachine(plan, 3000, SET)
+    fresh = EventMachine(settings, 3000, SET)
     fresh.number = 1
     for now in range(80, 130):
         row = logits(HITS if now % 20 < 12 else NOTHING)
@@ -427,10 +427,10 @@ PLANS = st.builds(
 @settings(max_examples=80)
 @given(PLANS, SHARES, st.integers(5, 30), st.integers(0, 32767))
 def test_a_single_step_never_flips_a_hug_to_a_hit(
-    plan: EventSettings, odd: dict[int, float], at: int, smoothing: int
+    settings: EventSettings, odd: dict[int, float], at: int, smoothing: int
 ) -> None:
-    plan = replace(plan, switch=max(2, plan.switch), least=max(2, plan.least))
-    machine = EventMachine(plan, UNSMOOTHED, SET)
+    settings = replace(settings, switch=max(2, settings.switch), least=max(2, settings.least))
+    machine = EventMachine(settings, UNSMOOTHED, SET)
     for now in range(60):
         _, updates = machine.step(logits(odd if now == at else STROKES), now)
         assert all(u.affect == POSITIVE and u.gesture in (STROKE, NO_GESTURE) for u in updates), now
@@ -442,9 +442,9 @@ def test_a_single_step_never_flips_a_hug_to_a_hit(
     st.lists(st.tuples(SHARES, st.integers(0, 19)), min_size=1, max_size=80),
     st.sampled_from([UNSMOOTHED, 9000]),
 )
-def test_events_follow_one_another_whatever_comes(plan: EventSettings, stream: list[Any], smoothing: int) -> None:
+def test_events_follow_one_another_whatever_comes(settings: EventSettings, stream: list[Any], smoothing: int) -> None:
     """Begun, perhaps named once, ended; numbers go up by one; ``hold`` and ``rest`` are kept; what is said fits."""
-    machine = EventMachine(plan, smoothing, SET)
+    machine = EventMachine(settings, smoothing, SET)
     going: Update | None = None
     named, number, began, ended, steps = False, 0, 0, -99, 0
     for now, (shares, what) in enumerate(stream):
@@ -464,7 +464,7 @@ def test_events_follow_one_another_whatever_comes(plan: EventSettings, stream: l
                 if u.kind == BEGUN:
                     assert going is None and u.number == number + 1
                     if cause == "step" and not switched:
-                        assert steps - ended > plan.rest
+                        assert steps - ended > settings.rest
                     going, number, named, began = u, u.number, u.gesture != NO_GESTURE, steps
                 elif u.kind == NAMED:
                     assert going is not None and not named and u.number == number and u.gesture != NO_GESTURE
@@ -473,7 +473,7 @@ def test_events_follow_one_another_whatever_comes(plan: EventSettings, stream: l
                 else:
                     assert going is not None and u.number == number
                     if cause == "step":
-                        assert steps + 1 - began >= plan.hold and what != 4
+                        assert steps + 1 - began >= settings.hold and what != 4
                     going, ended = None, -99 if cause == "lost" else steps
             if cause == "step" and (what != 3 or open_before):
                 steps += 1

@@ -42,7 +42,7 @@ def stream(values: np.ndarray, step_ms: int = 10) -> Frames:
 
 def begun(decisions: list[Decision]) -> list[tuple[Any, ...]]:
     """(seconds, affect, source) of every event."""
-    return [(e.t_s, e.affect, e.source) for d in decisions for e in d.events if e.what == "begun"]
+    return [(e.t_s, e.affect, e.source) for d in decisions for e in d.events if e.kind == "begun"]
 
 
 def spoil(values: np.ndarray, kind: str, first: int, last: int) -> None:
@@ -94,7 +94,7 @@ def test_a_sensor_that_fails(bundle: Bundle, engine: str, kind: str, when: str) 
         before = begun(lived(reader_of(bundle, SAFE, engine), stream(clean)))
         times = [entry for entry in begun(found) if entry[0] < recovered + 0.3]
         assert times == [entry for entry in before if entry[0] < onset]
-        ends = [e for d in found for e in d.events if e.what == "ended" and onset <= e.t_s <= faults[0].t_s + 1e-9]
+        ends = [e for d in found for e in d.events if e.kind == "ended" and onset <= e.t_s <= faults[0].t_s + 1e-9]
         assert len(ends) == (when in ("in a stroke", "in a blow")), "what was going on ended"
         # It recovers by itself: 0.3 s of good frames, the span again, and then the next blow is felt.
         after = [d for d in found if d.t_s > faults[0].t_s][:-1]
@@ -133,7 +133,7 @@ def test_ten_seconds_of_nothing_and_a_clock_reset(bundle: Bundle) -> None:
         found = lived(reader_of(bundle, SAFE, "float"), frames)
         lost = [d for d in found[:-1] if d.state == "no signal"]
         assert [round(d.t_s, 3) for d in lost] == [2.99], "the time of the last frame before"
-        assert [e.what for e in lost[0].events] == ["ended"]
+        assert [e.kind for e in lost[0].events] == ["ended"]
         at = found.index(lost[0])
         assert [d.state for d in found[at + 1 : at + 10]] == ["warming"] * 9
         assert found[at + 11].state == "tracking"
@@ -180,7 +180,7 @@ def test_a_toy_that_says_nothing_that_is_a_frame_has_no_signal(bundle: Bundle, w
         live = run_live(device, reader_of(bundle, SAFE, "int8"), silence_s=0.3)
         found = list(live)
     lost = [d for d in found if d.state == "no signal"]
-    assert len(lost) == 1 and [e.what for e in lost[0].events] == ["ended"]
+    assert len(lost) == 1 and [e.kind for e in lost[0].events] == ["ended"]
     assert lost[0].t_s == pytest.approx(2.99)
     assert (live.summary().no_signal, live.summary().faults) == (1, 0)
     assert [affect for _, affect, _ in begun(found)] == ["positive", "positive", "negative"], "the stroke goes on"

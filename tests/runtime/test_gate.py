@@ -16,9 +16,9 @@ BLOW = Rule((Term(0, 32, times=2),), affect=3, gesture=255, within=3, deaf=5)
 LEVELS = GateSettings((Signal(LEVEL, (0,), floor=10),), (BLOW,))
 
 
-def fired(plan: GateSettings, rows: list[list[int]], suspects: set[int] = frozenset()) -> list[tuple[int, int]]:
+def fired(settings: GateSettings, rows: list[list[int]], suspects: set[int] = frozenset()) -> list[tuple[int, int]]:
     """(sample, rule) of every firing."""
-    gate = Gate(plan)
+    gate = Gate(settings)
     heard = [(at, gate.push(row, at in suspects)) for at, row in enumerate(rows)]
     return [(at, rule) for at, rule in heard if rule >= 0]
 
@@ -53,31 +53,31 @@ def test_what_trembles_more_must_stand_out_further() -> None:
 
 @pytest.mark.parametrize(("sign", "up", "down"), [(0, 1, 1), (1, 1, 0), (-1, 0, 1)])
 def test_a_sign_hears_one_way_only(sign: int, up: int, down: int) -> None:
-    plan = GateSettings(LEVELS.signals, (Rule((Term(0, 32, sign),), 3, 255),))
-    assert len(fired(plan, tremble([100] * 9 + [200] * 9))) == up
-    assert len(fired(plan, tremble([100] * 9 + [0] * 9))) == down
+    settings = GateSettings(LEVELS.signals, (Rule((Term(0, 32, sign),), 3, 255),))
+    assert len(fired(settings, tremble([100] * 9 + [200] * 9))) == up
+    assert len(fired(settings, tremble([100] * 9 + [0] * 9))) == down
 
 
 def test_terms_must_hold_together_but_may_come_a_little_apart() -> None:
     both = Rule((Term(0, 32, times=1), Term(1, 32, times=1)), 3, 7, within=3)
-    plan = GateSettings((Signal(JERK, (0,), floor=10), Signal(JERK, (1,), floor=10)), (both,))
+    settings = GateSettings((Signal(JERK, (0,), floor=10), Signal(JERK, (1,), floor=10)), (both,))
 
     def rows(apart: int) -> list[list[int]]:
         return [[100 * (at >= 10), 100 * (at >= 10 + apart), at % 2] for at in range(40)]
 
-    assert fired(plan, rows(0)) == [(10, 0)]
-    assert fired(plan, rows(3)) == [(13, 0)]
-    assert fired(plan, rows(4)) == []
+    assert fired(settings, rows(0)) == [(10, 0)]
+    assert fired(settings, rows(3)) == [(13, 0)]
+    assert fired(settings, rows(4)) == []
 
 
 def test_the_first_of_two_rules_speaks() -> None:
-    plan = GateSettings(LEVELS.signals, (Rule((Term(0, 999),), 1, 255), BLOW, BLOW))
-    assert fired(plan, tremble([100] * 9 + [200] * 4)) == [(10, 1)]
+    settings = GateSettings(LEVELS.signals, (Rule((Term(0, 999),), 1, 255), BLOW, BLOW))
+    assert fired(settings, tremble([100] * 9 + [200] * 4)) == [(10, 1)]
 
 
 def test_jerk_adds_the_changes_of_several_inputs() -> None:
-    plan = GateSettings((Signal(JERK, (0, 1), lag=2, floor=10),), (Rule((Term(0, 32, times=2),), 3, 255),))
-    gate = Gate(plan)
+    settings = GateSettings((Signal(JERK, (0, 1), lag=2, floor=10),), (Rule((Term(0, 32, times=2),), 3, 255),))
+    gate = Gate(settings)
     for row in ([0, 0], [1, 1], [2, 2], [15, -13]):
         gate.push(row)
     assert gate.deviations == [14 + 14 - (4 >> 7)] and gate.sizes == [28 * 16 // 10]
@@ -92,10 +92,10 @@ def test_suspect_samples_are_not_read_and_after_some_it_begins_anew() -> None:
     """A sensor at its end stop: neither the jump there nor the one back is a blow."""
     jump = [100] * 30 + [30_000] * 20 + [100] * 30
     jerks = GateSettings((Signal(JERK, (0,), lag=4, floor=10),), (BLOW,))
-    for plan in (LEVELS, jerks):
-        assert fired(plan, tremble(jump))  # nobody said that it is broken
-        assert fired(plan, tremble(jump), set(range(31, 50))) == []
-        assert fired(plan, tremble([*jump, 900, 900]), set(range(31, 50)))[0][0] == 81
+    for settings in (LEVELS, jerks):
+        assert fired(settings, tremble(jump))  # nobody said that it is broken
+        assert fired(settings, tremble(jump), set(range(31, 50))) == []
+        assert fired(settings, tremble([*jump, 900, 900]), set(range(31, 50)))[0][0] == 81
 
 
 def test_a_blow_that_touches_the_end_stop_is_one() -> None:

@@ -16,7 +16,7 @@ from plushsense.runtime.health import MOST_MS, Health, HealthSettings
 ACCEL = load_layout("accel-3")
 LOW, HIGH = int(ACCEL.valid_min_int[0]), int(ACCEL.valid_max_int[0])
 Timed = tuple[int, tuple[int, ...]]
-PLAN = HealthSettings((-900, -900, -900), (900, 900, 900), fault_ms=200, still_ms=300, recover_ms=100)
+SETTINGS = HealthSettings((-900, -900, -900), (900, 900, 900), fault_ms=200, still_ms=300, recover_ms=100)
 
 
 def trembling(at: int, **fixed: int) -> tuple[int, int, int]:
@@ -24,14 +24,14 @@ def trembling(at: int, **fixed: int) -> tuple[int, int, int]:
     return fixed.get("x", at % 7), fixed.get("y", -(at % 5)), fixed.get("z", 250 + at % 3)
 
 
-def followed(frames: Iterable[Timed], plan: HealthSettings = PLAN) -> list[tuple[int, str, bool, bool]]:
+def followed(frames: Iterable[Timed], settings: HealthSettings = SETTINGS) -> list[tuple[int, str, bool, bool]]:
     """(ms, what was said, fault, suspect) of every frame."""
-    health = Health(plan, ACCEL)
+    health = Health(settings, ACCEL)
     return [(ms, health.push(ms, values), health.fault, health.suspect) for ms, values in frames]
 
 
-def said(frames: Iterable[Timed], plan: HealthSettings = PLAN) -> list[tuple[int, str]]:
-    return [(ms, word) for ms, word, _, _ in followed(frames, plan) if word]
+def said(frames: Iterable[Timed], settings: HealthSettings = SETTINGS) -> list[tuple[int, str]]:
+    return [(ms, word) for ms, word, _, _ in followed(frames, settings) if word]
 
 
 def test_a_living_toy_is_believed() -> None:
@@ -49,7 +49,7 @@ def test_a_value_out_of_its_valid_range_is_wrong_at_once_and_a_fault_after_fault
 
 
 def test_the_ends_of_the_valid_range_and_of_the_limits_are_inside() -> None:
-    free = replace(PLAN, low=(), high=())
+    free = replace(SETTINGS, low=(), high=())
     assert not followed(((10 * i, trembling(i, x=HIGH, y=LOW)) for i in range(60)), free)[-1][3]
     assert not followed((10 * i, trembling(i, x=900, y=-900)) for i in range(60))[-1][3]
 
@@ -61,7 +61,7 @@ def test_a_value_beyond_the_limits_is_wrong_when_it_repeats_exactly() -> None:
         assert [(ms, word) for ms, word, _, _ in found if word] == [(210, "fault")]
     moving = followed((10 * i, trembling(i, x=901 + i % 2)) for i in range(100))
     assert not any(suspect for *_, suspect in moving)
-    unknown = followed(((10 * i, trembling(i, x=901)) for i in range(100)), replace(PLAN, low=(), high=()))
+    unknown = followed(((10 * i, trembling(i, x=901)) for i in range(100)), replace(SETTINGS, low=(), high=()))
     assert not any(suspect for *_, suspect in unknown), "where the limits are not known it may stay"
 
 
@@ -86,10 +86,10 @@ def test_a_toy_that_is_still_is_suspect_after_half_the_time_and_then_a_fault() -
 
 def test_a_time_of_0_switches_its_rule_off() -> None:
     bad = [(10 * i, trembling(i, x=HIGH + 1)) for i in range(300)]
-    assert said(bad, replace(PLAN, fault_ms=0)) == []
-    assert followed(bad, replace(PLAN, fault_ms=0))[-1][3], "it is suspect all the same"
+    assert said(bad, replace(SETTINGS, fault_ms=0)) == []
+    assert followed(bad, replace(SETTINGS, fault_ms=0))[-1][3], "it is suspect all the same"
     still = [(10 * i, trembling(0)) for i in range(300)]
-    assert not any(word or suspect for _, word, _, suspect in followed(still, replace(PLAN, still_ms=0)))
+    assert not any(word or suspect for _, word, _, suspect in followed(still, replace(SETTINGS, still_ms=0)))
 
 
 def test_it_recovers_when_no_frame_was_suspect_for_recover_ms() -> None:
@@ -100,14 +100,14 @@ def test_it_recovers_when_no_frame_was_suspect_for_recover_ms() -> None:
 
     assert said(frames(40)) == [(200, "fault"), (500, "recovered")]
     assert said(frames(40, (45, 54))) == [(200, "fault"), (650, "recovered")]
-    assert said(frames(40), replace(PLAN, recover_ms=0)) == [(200, "fault"), (400, "recovered")]
+    assert said(frames(40), replace(SETTINGS, recover_ms=0)) == [(200, "fault"), (400, "recovered")]
     # At rest a frame now and then repeats the one before: that keeps nobody away.
     rest = [(10 * i, trembling(i, x=bad) if i < 40 else trembling(i // 2)) for i in range(120)]
     assert said(rest) == [(200, "fault"), (500, "recovered")]
 
 
 def test_a_fault_may_come_again_and_is_counted() -> None:
-    health = Health(PLAN, ACCEL)
+    health = Health(SETTINGS, ACCEL)
     words = [health.push(10 * i, trembling(i, x=HIGH + 1 if i % 80 < 40 else 1)) for i in range(240)]
     assert [word for word in words if word] == ["fault", "recovered"] * 3
     assert health.faults == 3
@@ -117,7 +117,7 @@ def test_a_fault_may_come_again_and_is_counted() -> None:
 
 def test_after_a_gap_all_times_are_counted_anew_but_a_fault_goes_on() -> None:
     bad = HIGH + 1
-    health = Health(PLAN, ACCEL)
+    health = Health(SETTINGS, ACCEL)
     for i in range(15):
         assert health.push(10 * i, trembling(i, x=bad)) == ""
     health.clear()
@@ -139,7 +139,7 @@ def test_after_a_gap_all_times_are_counted_anew_but_a_fault_goes_on() -> None:
 
 
 def test_plain_values_and_back() -> None:
-    assert DecideSpec.from_dict({"health": asdict(PLAN)}).health == PLAN
+    assert DecideSpec.from_dict({"health": asdict(SETTINGS)}).health == SETTINGS
     assert DecideSpec.from_dict({"health": {}}).health == HealthSettings()
     with pytest.raises(ConfigError, match="Unknown key 'fault' in decision settings, health"):
         DecideSpec.from_dict({"health": {"fault": 3}})

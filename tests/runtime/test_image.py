@@ -170,8 +170,11 @@ def test_what_a_toy_cannot_hold() -> None:
             other(model, gestures=wrong)
     for rules, words in (
         (Rules(health=HealthSettings((0,), (1,))), "limits are of 1 channels, layout 'plain' has 4"),
-        (Rules(gate=GateSettings((Signal(LEVEL, (2,)),), (PULL,))), "an input that there is not: the model has 2"),
-        (Rules(gate=GateSettings((Signal(LEVEL, (1,)),), (replace(PULL, gesture=3),))), "a gesture that there is not"),
+        (Rules(gate=GateSettings((Signal(LEVEL, (2,)),), (PULL,))), "an unknown input: the model has 2"),
+        (
+            Rules(gate=GateSettings((Signal(LEVEL, (1,)),), (replace(PULL, gesture=3),))),
+            "an unknown gesture: the model has 3",
+        ),
     ):
         with pytest.raises(BundleError, match=words):
             other(model, rules=rules)

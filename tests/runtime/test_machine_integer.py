@@ -74,7 +74,7 @@ def of_live(model: IntegerModel, frames: list[Frame]) -> np.ndarray:
             since = before if d.state == "no signal" else zero
             for e in d.events:
                 gesture = 255 if e.gesture is None else labels.index(e.gesture)
-                what = ("begun", "named", "ended").index(e.what) + 1, gesture, AFFECT_CODES[e.affect]
+                what = ("begun", "named", "ended").index(e.kind) + 1, gesture, AFFECT_CODES[e.affect]
                 source = int(e.source == "gate")
                 events.append([1, row, ms(e.t_s, since), e.number, *what, source, ms(e.since_s, since), 0])
             if d.source == "gate" or d.state in ("no signal", "sensor fault"):

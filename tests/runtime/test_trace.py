@@ -54,7 +54,7 @@ def test_an_event_that_a_fault_ends_ends_with_the_fault() -> None:
     spec = DecideSpec(**{**spec.__dict__, "health": HealthSettings(fault_ms=150, recover_ms=100)})
     decisions = same(BUNDLE, spec, "int8", frames)
     fault = next(d for d in decisions if d.state == "sensor fault")
-    assert [(e.what, e.t_s) for e in fault.events] == [("ended", fault.t_s)]
+    assert [(e.kind, e.t_s) for e in fault.events] == [("ended", fault.t_s)]
 
 
 @pytest.mark.parametrize("padding", ["causal", "mirror"])
@@ -120,7 +120,7 @@ def test_silence_in_the_middle_ends_the_event_and_the_stream_goes_on() -> None:
     frames = stream(5, 900, [])
     reader = reader_of(BUNDLE, argmax_spec(), "float")
     first = lived(reader, frames.slice(0, 500))
-    assert first[-1].state == "no signal" and [e.what for e in first[-1].events] == ["ended"]
+    assert first[-1].state == "no signal" and [e.kind for e in first[-1].events] == ["ended"]
     after = lived(reader, frames.slice(500, 900))
     assert after[0].state == "tracking", "the gap was none on the toy's clock"
     assert next(e.number for d in after for e in d.events) == first[-1].events[0].number + 1

@@ -92,7 +92,7 @@ def test_from_now_on_rows_are_on_disk_within_a_second(workspace: Workspace) -> N
     assert steps.min() > 0
     assert steps.max() < 60
     events = list(read_events(clip.folder))
-    assert [e.what for e in events if e.what != "gap"] == ["open", "finished", "close"]
+    assert [e.kind for e in events if e.kind != "gap"] == ["open", "finished", "close"]
     assert events[-1].details["rows"] == clip.rows
 
 

@@ -44,7 +44,7 @@ def test_export_verify_and_break(
     marked(page, "name").fill("one")
     marked(page, "do").click()
     marked(page, "export-facts").wait_for(timeout=60_000)
-    command = [sys.executable, "-m", "plushsense.cli.main", "export", str(home / "bundles" / "little.plush")]
+    command = [sys.executable, "-m", "plushsense", "export", str(home / "bundles" / "little.plush")]
     subprocess.run([*command, str(tmp_path / "two")], check=True, capture_output=True)
     assert sums(home / "exports" / "one") == sums(tmp_path / "two")
     assert "8,330 bytes" in marked(page, "export-facts").inner_text()

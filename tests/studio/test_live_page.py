@@ -148,7 +148,7 @@ def toy() -> Iterator[Callable[[int], tuple[subprocess.Popen[str], str]]]:
     begun: list[subprocess.Popen[str]] = []
 
     def begin(port: int = 0) -> tuple[subprocess.Popen[str], str]:
-        command = [sys.executable, "-m", "plushsense.cli.main", "toy", "--tcp", str(port), "--json"]
+        command = [sys.executable, "-m", "plushsense", "toy", "--tcp", str(port), "--json"]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         begun.append(process)
         assert process.stdout is not None

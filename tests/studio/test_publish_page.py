@@ -48,7 +48,7 @@ def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture,
     assert axe(page) == []
     shots(page, "publish-done")
     key, made = few / "keys" / "virtual.key", few / "packages" / "one.zip"
-    command = [sys.executable, "-m", "plushsense.cli.main", "publish", str(few / "datasets" / "virtual")]
+    command = [sys.executable, "-m", "plushsense", "publish", str(few / "datasets" / "virtual")]
     said = ("--contact", "Ada <ada@example.org>", "--key", str(key))
     subprocess.run([*command, str(tmp_path / "two"), *said], check=True, capture_output=True)
     assert made.read_bytes() == (tmp_path / "two.zip").read_bytes(), "the command makes the same package, byte for byte"

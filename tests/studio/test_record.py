@@ -60,7 +60,7 @@ def test_what_is_typed_is_no_command(studio: Fixture, look: Fixture, tmp_path: P
     assert marked(page, "note").input_value() == "so soft, paws & bears"
     page.keyboard.press("Enter")
     until(lambda: "note" in whats(tmp_path / "home"))
-    note = next(e.details for e in events(tmp_path / "home") if e.what == "note")
+    note = next(e.details for e in events(tmp_path / "home") if e.kind == "note")
     assert (note["text"], note["gesture"]) == ("so soft, paws & bears", "Head stroke 1")
     assert note["file"].startswith("Back stroke 1_")
     assert showing(page, "").startswith("idle.1.1.0.0")

@@ -114,7 +114,7 @@ def test_a_command_counts_once(controller: RecordController, tmp_path: Path) -> 
     assert session.recorder.status().state == "paused"
     assert press(session, "p")
     assert press(session, "s")
-    assert [e.what for e in read_events(tmp_path / "recordings" / "S01" / "1")].count("countdown") <= 1
+    assert [e.kind for e in read_events(tmp_path / "recordings" / "S01" / "1")].count("countdown") <= 1
 
 
 def test_two_tabs_begin_one_session(controller: RecordController) -> None:

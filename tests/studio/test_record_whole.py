@@ -72,7 +72,7 @@ def test_51_recordings_by_the_space_bar(studio: Fixture, look: Fixture, shots: F
     assert check_whole(folder, toy) == 51
     made = Counter(n.label for p in recordings(folder) if (n := parse_name(p.name)) is not None)
     assert made == dict.fromkeys(GESTURES, 3)
-    events = Counter(e.what for e in read_events(folder))
+    events = Counter(e.kind for e in read_events(folder))
     assert (events["take"], events["redo"], events["unfinished"], events["finished"]) == (51, 0, 1, 1)
     head = SessionHead.read(folder)
     assert head is not None and head.simulated

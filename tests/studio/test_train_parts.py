@@ -166,7 +166,7 @@ def test_curves_of_a_training() -> None:
         for e in (1, 2, 3)
     ]
     loss, accuracy = progress_charts(job("train", [{"stage": "reading"}, *rows, {"stage": "deciding", "epoch": 3}]))
-    assert (loss.what, loss.x, loss.lines[0]) == ("loss", [1.0, 2.0, 3.0], [1.0, 0.5, 1 / 3])
+    assert (loss.metric, loss.x, loss.lines[0]) == ("loss", [1.0, 2.0, 3.0], [1.0, 0.5, 1 / 3])
     assert loss.lines[1] == [None, None, None]
     assert accuracy.lines[0] == pytest.approx([0.1, 0.2, 0.3])
 

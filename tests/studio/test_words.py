@@ -17,8 +17,12 @@ from plushsense.studio.app.words import LANGUAGES, Words
 
 
 def texts(language: str) -> dict[str, Any]:
-    file = resources.files("plushsense.studio.app").joinpath(f"words/{language}.toml")
-    return tomllib.loads(file.read_text(encoding="utf-8"))
+    """Return the tables of a language, those of the pages' own files too."""
+    studio, tables = Path(str(resources.files("plushsense.studio"))), dict[str, Any]()
+    for path in (studio / f"app/words/{language}.toml", *studio.glob(f"pages/*/{language}.toml")):
+        for table, entries in tomllib.loads(path.read_text(encoding="utf-8")).items():
+            tables[table] = tables.get(table, {}) | entries
+    return tables
 
 
 def fields(text: str) -> set[str]:

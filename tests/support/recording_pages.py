@@ -76,7 +76,7 @@ def events(home: Path, name: str = "S01/1") -> list[SessionEvent]:
 
 def whats(home: Path, name: str = "S01/1") -> list[str]:
     """What happened, in words."""
-    return [e.what for e in events(home, name)]
+    return [e.kind for e in events(home, name)]
 
 
 def files(home: Path, name: str = "S01/1") -> list[dict[str, Any]]:

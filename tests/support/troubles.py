@@ -137,7 +137,7 @@ def lived(reader: StreamReader, frames: Frames) -> list[Decision]:
 
 def events_of(decisions: list[Decision]) -> list[tuple[Any, ...]]:
     return [
-        (e.what, e.number, e.affect, e.gesture, e.source, round(e.since_s * 1e6), round(e.t_s * 1e6))
+        (e.kind, e.number, e.affect, e.gesture, e.source, round(e.since_s * 1e6), round(e.t_s * 1e6))
         for d in decisions
         for e in d.events
     ]

@@ -17,7 +17,7 @@ from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import ONE
 from plushsense.tuning.decisions import (
     LabelledSteps,
-    covered,
+    coverage_of,
     fit_decisions,
     known_threshold,
     labelled_steps,
@@ -59,7 +59,7 @@ def test_the_threshold_is_the_corrected_quantile_of_split_conformal_prediction(n
     steps = labelled(shares, ["a"] * n, range(n))
     assert sure_threshold(steps, coverage) * ONE == 100 * rank
     assert known_threshold(steps, coverage) == 200 * rank / 256
-    assert covered(steps, sure_threshold(steps, coverage)) == pytest.approx((n - rank + 1) / n)
+    assert coverage_of(steps, sure_threshold(steps, coverage)) == pytest.approx((n - rank + 1) / n)
 
 
 def test_coverage_of_the_left_out_uses_the_others_threshold():
@@ -77,7 +77,7 @@ def test_split_conformal_covers_what_it_states_on_new_people():
     for _ in range(300):
         draws = (rng.beta(4, 2, (2, 40)) * ONE).astype(int)
         calibration, new = (labelled(row, ["a"] * 40, range(40)) for row in draws)
-        reached.append(covered(new, sure_threshold(calibration, 0.9)))
+        reached.append(coverage_of(new, sure_threshold(calibration, 0.9)))
     assert np.mean(reached) == pytest.approx(1 - 4 / 41, abs=0.012)  # rank floor(0.1 * 41) = 4 of 40
 
 
@@ -123,7 +123,7 @@ def test_a_fit_on_streams_says_on_what_and_comes_back_from_a_bundle(made, bundle
     assert fitted["health"]["people"] == 3
     heard = marked_streams(model, dataset, ["P1", "P2"], spec)
     steps = labelled_steps(model, heard, spec)
-    assert covered(steps, spec.sure) >= 0.8
+    assert coverage_of(steps, spec.sure) >= 0.8
     assert float((weights_of(steps) * (steps.highest >= spec.known * 256)).sum()) >= 0.95
     back = DecideSpec.from_dict(replace(model, decision=spec.to_dict()).decision)
     assert back == spec

@@ -56,9 +56,9 @@ def session(number: int, world: World, repetitions: int) -> tuple[Frames, list[G
     return Frames(values, device_ms), [mark for e in episodes for mark in e.marks]
 
 
-def heard(plan: GateSettings, frames: Frames) -> list[float]:
+def heard(settings: GateSettings, frames: Frames) -> list[float]:
     """Device times in ms at which the gate fired."""
-    gate, times = Gate(plan), []
+    gate, times = Gate(settings), []
     for segment in resample(frames, PLUSH):
         gate.reset()
         for at, row in enumerate(network_inputs(segment.data, PLUSH).tolist()):
@@ -67,12 +67,12 @@ def heard(plan: GateSettings, frames: Frames) -> list[float]:
     return times
 
 
-def on_strangers(plan: GateSettings, world: World, repetitions: int = 2) -> tuple[float, float, float]:
+def on_strangers(settings: GateSettings, world: World, repetitions: int = 2) -> tuple[float, float, float]:
     """(share of the blows answered within 0.2 s, share of gentle gestures called negative, firings elsewhere)."""
     quick, gentle, elsewhere = [], [], 0
     for number in STRANGERS:
         frames, marks = session(number, world, repetitions)
-        fired = heard(plan, frames)
+        fired = heard(settings, frames)
         ms = frames.device_ms
         left = set(fired)
         for mark in marks:
@@ -93,11 +93,11 @@ def test_what_is_energetic_calm_and_unknown(virtual: Dataset) -> None:
     assert len(material.trials) == 2 * 2 * 3 and {g for _, g in material.trials} == set(BLOWS)
     assert len(material.calm) == 2 * 2 * 14
     for stretch in material.stretches:
-        edges = np.flatnonzero(np.diff((stretch.what >= 0).astype(int)))
+        edges = np.flatnonzero(np.diff((stretch.trial >= 0).astype(int)))
         for edge in edges.tolist():
-            around = stretch.what[max(0, edge - 60) : edge + 60]
+            around = stretch.trial[max(0, edge - 60) : edge + 60]
             assert BETWEEN not in around and (around >= 0).any() and (around == LEFT_OUT).any()
-        assert ((stretch.what == CALM) == (stretch.calm >= 0)).all()
+        assert ((stretch.trial == CALM) == (stretch.calm >= 0)).all()
     assert sum(material.hours(w) for w in (CALM, BETWEEN)) > 0.1
 
 
@@ -118,14 +118,14 @@ def test_it_finds_the_blows_it_was_fitted_on(fitted: GateFit) -> None:
     assert report["people"] == 12 and report["recordings"] == 72
     assert report["recall"] >= 0.95
     assert report["false_alarms_per_hour"] <= 2.0
-    for rule in fitted.plan.rules:
+    for rule in fitted.settings.rules:
         assert rule.affect == AFFECT_CODES["negative"] and rule.gesture == 255
-        heard_by = [set(fitted.plan.signals[t.signal].inputs) for t in rule.terms]
+        heard_by = [set(fitted.settings.signals[t.signal].inputs) for t in rule.terms]
         assert len(heard_by) == 2 and not heard_by[0] & heard_by[1]  # no broken sensor fires it alone
 
 
 def test_strangers_blows_are_answered_at_once_and_caresses_are_not_called_blows(fitted: GateFit) -> None:
-    quick, gentle, elsewhere = on_strangers(fitted.plan, WORLD)
+    quick, gentle, elsewhere = on_strangers(fitted.settings, WORLD)
     assert quick >= 0.93
     assert gentle <= 0.02
     assert elsewhere <= 2
@@ -143,7 +143,7 @@ def test_strangers_blows_are_answered_at_once_and_caresses_are_not_called_blows(
     ids=["damp and dry days", "the same day", "damp skin", "small hands", "large hands"],
 )
 def test_neither_humidity_nor_the_hand_matters_much(fitted: GateFit, world: World) -> None:
-    quick, gentle, _ = on_strangers(fitted.plan, world)
+    quick, gentle, _ = on_strangers(fitted.settings, world)
     assert quick >= 0.85
     assert gentle <= 0.03
 
@@ -159,26 +159,26 @@ def test_one_energetic_gesture_is_named(virtual: Dataset) -> None:
     calm = [dataclasses.replace(g, energetic=g.label == "Tail hit 2") for g in virtual.gestures.gestures]
     chosen = GestureSet("one", tuple(g for g in calm if g.label not in ("Tail hit 1", "Tail pull")))
     fit = fit_gate(virtual, chosen, virtual.subjects[:3])
-    assert fit.plan.rules and {r.gesture for r in fit.plan.rules} == {chosen.index("Tail hit 2")}
+    assert fit.settings.rules and {r.gesture for r in fit.settings.rules} == {chosen.index("Tail hit 2")}
     assert set(fit.report["recall_by_gesture"]) == {"Tail hit 2"}
 
 
 def test_gestures_without_affect_give_rules_without_one(virtual: Dataset) -> None:
     plain = [dataclasses.replace(g, affect="none") for g in virtual.gestures.gestures]
     fit = fit_gate(virtual, GestureSet("plain", tuple(plain)), virtual.subjects[:3])
-    assert {rule.affect for rule in fit.plan.rules} == {AFFECT_CODES["none"]}
+    assert {rule.affect for rule in fit.settings.rules} == {AFFECT_CODES["none"]}
 
 
 def test_where_nothing_is_energetic_there_is_no_gate(virtual: Dataset) -> None:
     quiet = GestureSet("quiet", tuple(dataclasses.replace(g, energetic=False) for g in virtual.gestures.gestures))
     fit = fit_gate(virtual, quiet, virtual.subjects)
-    assert fit.plan == GateSettings() and "no gesture of 'quiet' is energetic" in fit.report["reason"]
+    assert fit.settings == GateSettings() and "no gesture of 'quiet' is energetic" in fit.report["reason"]
     unknown = GestureSet("other", (*quiet.gestures, Gesture("Kick", energetic=True)))
     assert "nobody here recorded Kick" in fit_gate(virtual, unknown, virtual.subjects).report["reason"]
 
 
 def test_a_plan_from_plain_values_is_the_same(fitted: GateFit) -> None:
-    assert DecideSpec.from_dict({"gate": dataclasses.asdict(fitted.plan)}).gate == fitted.plan
+    assert DecideSpec.from_dict({"gate": dataclasses.asdict(fitted.settings)}).gate == fitted.settings
 
 
 def test_on_real_people(real_data: Path, tmp_path: Path) -> None:
@@ -190,11 +190,11 @@ def test_on_real_people(real_data: Path, tmp_path: Path) -> None:
     fit = fit_gate(dataset, dataset.gestures, ["P01", "P02", "P03", "P04"], false_alarms_per_hour=60.0)
     assert fit.report["recall"] > 0.3
     others = material_of(dataset, dataset.gestures, ["P05"])
-    found = measure_gate(fit.plan, others, dataset.layout)
+    found = measure_gate(fit.settings, others, dataset.layout)
     assert found["recordings"] == 25 and 0.0 <= found["recall"] <= 1.0
     gate_at_rest = 0
     for stretch in others.stretches:
-        gate = Gate(fit.plan)
+        gate = Gate(fit.settings)
         fired = [gate.push(row) >= 0 for row in stretch.x.tolist()]
         gate_at_rest += sum(
             f and c >= 0 and others.calm[c][1] == "At Rest" for f, c in zip(fired, stretch.calm, strict=True)

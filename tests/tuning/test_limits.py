@@ -39,8 +39,8 @@ def made(tmp_path):
     return make
 
 
-def faults(plan, values):
-    health, frames = Health(plan, ACCEL), stream(values)
+def faults(settings, values):
+    health, frames = Health(settings, ACCEL), stream(values)
     for ms, row in zip(frames.device_ms.tolist(), frames.values.tolist(), strict=True):
         health.push(ms, row)
     return health.faults
@@ -51,8 +51,8 @@ def test_limits_are_a_tenth_beyond_what_those_people_only_showed(made):
     fit = fit_health(made(mine, other), ["P1"])
     low, high = mine.min(axis=0), mine.max(axis=0)
     margin = np.ceil(0.1 * (high - low)).astype(int)
-    assert fit.plan.low == tuple(low - margin)
-    assert fit.plan.high == tuple(high + margin)
+    assert fit.settings.low == tuple(low - margin)
+    assert fit.settings.high == tuple(high + margin)
     assert fit.widened == ()
     assert fit.frames == 4000
     assert fit.seconds == pytest.approx(39.99)
@@ -62,7 +62,7 @@ def test_a_sensor_stuck_beyond_them_is_a_fault_and_peoples_own_end_stop_is_none(
     plain = touched(0)
     hung = touched(2, 500)
     hung[100:200, 1] = 30_000
-    assert faults(fit_health(made(plain), ["P1"]).plan, hung) == 1
+    assert faults(fit_health(made(plain), ["P1"]).settings, hung) == 1
     assert faults(HealthSettings(), hung) == 0
 
 
@@ -70,12 +70,12 @@ def test_where_people_touch_the_end_stop_only_staying_there_is_wrong(made):
     reaching = touched(0)
     reaching[1000, 1] = 32_767
     fit = fit_health(made(reaching), ["P1"])
-    assert fit.plan.high[1] == 32_766
+    assert fit.settings.high[1] == 32_766
     assert fit.widened == ()
-    assert faults(fit.plan, reaching) == 0
+    assert faults(fit.settings, reaching) == 0
     hung = touched(2, 500)
     hung[100:200, 1] = 32_767
-    assert faults(fit.plan, hung) == 1
+    assert faults(fit.settings, hung) == 1
 
 
 def test_an_end_stop_that_people_reach_is_believed(made):
@@ -83,11 +83,11 @@ def test_an_end_stop_that_people_reach_is_believed(made):
     reaching[5000:5030, 1] = 30_000  # 0.3 s, more than half of what makes a fault; too rare for the quantile
     fit = fit_health(made(reaching), ["P1"])
     assert fit.widened == (ACCEL.names[1],)
-    assert fit.plan.high[1] == 30_000
+    assert fit.settings.high[1] == 30_000
     hung = touched(2, 500)
     hung[100:200, 1] = 30_000
-    assert faults(fit.plan, hung) == 0
-    assert faults(fit.plan, reaching) == 0
+    assert faults(fit.settings, hung) == 0
+    assert faults(fit.settings, reaching) == 0
 
 
 @pytest.mark.parametrize(("rows", "still_ms"), [(10, 500), (100, 2000), (600, 0)])
@@ -96,8 +96,8 @@ def test_stillness_is_twice_what_was_seen_at_least_half_a_second_and_off_beyond_
     held[1000 : 1000 + rows + 1] = held[1000]
     fit = fit_health(made(held), ["P1"])
     assert fit.still_ms == rows * 10
-    assert fit.plan.still_ms == still_ms
-    assert faults(fit.plan, held) == 0
+    assert fit.settings.still_ms == still_ms
+    assert faults(fit.settings, held) == 0
 
 
 def test_repeats_over_a_gap_are_no_stillness():
@@ -110,5 +110,5 @@ def test_repeats_over_a_gap_are_no_stillness():
 
 def test_nobody_leaves_the_plan_as_it_is(made):
     fit = fit_health(made(touched(0)), [], HealthSettings(fault_ms=700))
-    assert fit.plan == HealthSettings(fault_ms=700)
+    assert fit.settings == HealthSettings(fault_ms=700)
     assert fit.frames == 0

@@ -1,4 +1,4 @@
-"""The old rules: what they answer, and that they fail as the paper says they did."""
+"""The rule baseline: what it answers, and that it fails as the paper reports of its rules."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from plushsense.devices.virtual.stream import channel_columns
 from plushsense.devices.virtual.world import draw_person
 from plushsense.runtime.classifier import GestureEvent
 from plushsense.tuning.rule_baseline import (
-    BaselineReader,
-    BaselineSettings,
-    baseline_events,
+    RuleBaselineReader,
+    RuleBaselineSettings,
     fit_rule_baseline,
+    rule_baseline_events,
     sensors_of,
 )
 from plushsense.workflow.api import simulate
 
 PLUSH = load_layout("plush-15")
-PLAN = BaselineSettings(shock=40_000, touch_shock=4_000, swing=300)
+SETTINGS = RuleBaselineSettings(shock=40_000, touch_shock=4_000, swing=300)
 
 
 def frames_of(touch: np.ndarray, z: np.ndarray | None = None, electrode: str = "back") -> Frames:
@@ -40,15 +40,15 @@ def frames_of(touch: np.ndarray, z: np.ndarray | None = None, electrode: str = "
 
 def begun(events: list[GestureEvent]) -> list[tuple[str, float]]:
     """(affect, seconds) of every beginning, rounded to a sample."""
-    return [(e.affect, round(e.t_s, 2)) for e in events if e.what == "begun"]
+    return [(e.affect, round(e.t_s, 2)) for e in events if e.kind == "begun"]
 
 
 def test_a_blow_is_answered_within_50_ms_and_is_over_after_a_second() -> None:
     z = np.full(600, 16_384)
     z[300:303] = (32_000, 3_000, 30_000)
-    events = baseline_events(frames_of(np.zeros(600), z), PLUSH, PLAN)
+    events = rule_baseline_events(frames_of(np.zeros(600), z), PLUSH, SETTINGS)
     assert begun(events) == [("negative", 3.0)]
-    assert [e.what for e in events] == ["begun", "ended"]
+    assert [e.kind for e in events] == ["begun", "ended"]
     assert 4.0 <= events[1].t_s <= 4.2
     assert events[0].gesture is None and events[0].source == "gate"
 
@@ -56,15 +56,15 @@ def test_a_blow_is_answered_within_50_ms_and_is_over_after_a_second() -> None:
 def test_broad_strokes_are_answered_when_they_have_gone_to_and_fro() -> None:
     t = np.arange(900) / 100
     strokes = 1_600 * np.sin(np.pi * np.clip(t - 2, 0, 5) / 1.3) ** 2
-    assert [a for a, _ in begun(baseline_events(frames_of(strokes), PLUSH, PLAN))] == ["positive"]
-    at = begun(baseline_events(frames_of(strokes), PLUSH, PLAN))[0][1]
+    assert [a for a, _ in begun(rule_baseline_events(frames_of(strokes), PLUSH, SETTINGS))] == ["positive"]
+    at = begun(rule_baseline_events(frames_of(strokes), PLUSH, SETTINGS))[0][1]
     assert 3.0 <= at <= 5.0
 
 
 @pytest.mark.parametrize("size", [1_600, 4_000])
 def test_a_hand_that_rests_is_no_caress(size: int) -> None:
     held = size * np.clip((np.arange(900) - 200) / 60, 0, 1)
-    assert baseline_events(frames_of(held), PLUSH, PLAN) == []
+    assert rule_baseline_events(frames_of(held), PLUSH, SETTINGS) == []
 
 
 def test_the_sum_of_all_electrodes_and_a_near_hand_are_no_touch() -> None:
@@ -77,18 +77,18 @@ def test_the_sum_of_all_electrodes_and_a_near_hand_are_no_touch() -> None:
 def test_after_a_gap_it_begins_anew() -> None:
     frames = frames_of(np.r_[np.zeros(200), np.full(200, 9_000)])
     late = Frames(frames.values, frames.device_ms + 500 * (np.arange(400) >= 200))
-    assert begun(baseline_events(frames, PLUSH, PLAN)) == [("negative", 2.0)]
-    assert baseline_events(late, PLUSH, PLAN) == []
+    assert begun(rule_baseline_events(frames, PLUSH, SETTINGS)) == [("negative", 2.0)]
+    assert rule_baseline_events(late, PLUSH, SETTINGS) == []
 
 
 def test_what_goes_on_when_nothing_is_heard_ends() -> None:
-    reader = BaselineReader(PLUSH, PLAN)
+    reader = RuleBaselineReader(PLUSH, SETTINGS)
     frames = frames_of(np.r_[np.zeros(50), np.full(10, 9_000)])
     events: list[GestureEvent] = []
     for ms, values in zip(frames.device_ms.tolist(), frames.values.tolist(), strict=True):
         events += reader.push(Frame(0, ms, tuple(values)))
-    assert [e.what for e in events] == ["begun"]
-    assert [e.what for e in reader.silence()] == ["ended"]
+    assert [e.kind for e in events] == ["begun"]
+    assert [e.kind for e in reader.silence()] == ["ended"]
     assert reader.silence() == []
 
 
@@ -101,7 +101,7 @@ def virtual(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 def test_tuned_by_hand_they_do_what_the_paper_saw(virtual: Dataset) -> None:
     """A simulation: blows at once, most broad strokes, hardly any fine scratch, nothing to holding."""
-    plan, report = fit_rule_baseline(virtual, virtual.gestures, virtual.subjects)
+    settings, report = fit_rule_baseline(virtual, virtual.gestures, virtual.subjects)
     assert report["people"] == 6 and max(report["answered_as_a_caress"].values()) <= 0.02
     answered: dict[str, list[bool]] = {"stroke": [], "scratch": [], "blow": [], "hold": []}
     kinds = {
@@ -117,7 +117,7 @@ def test_tuned_by_hand_they_do_what_the_paper_saw(virtual: Dataset) -> None:
         episodes = [sitting.perform(label, 2) for label in kinds]
         values = np.concatenate([e.values for e in episodes])[:, channel_columns(PLUSH)]
         ms = np.concatenate([e.device_ms for e in episodes])
-        events = baseline_events(Frames(values, ms), PLUSH, plan)
+        events = rule_baseline_events(Frames(values, ms), PLUSH, settings)
         for mark in [m for e in episodes for m in e.marks]:
             answered[kinds[mark.label]].append(_answered(mark, events, ms))
     shares = {kind: float(np.mean(each)) for kind, each in answered.items()}
@@ -148,8 +148,10 @@ def test_a_toy_without_electrodes_has_blows_only() -> None:
     values = np.random.default_rng(1).integers(-50, 51, (400, 3)) + np.array([0, 0, 16_384])
     values[200:204] += 20_000 * np.array([[1], [-1], [1], [-1]])
     frames = Frames(values.clip(-32_768, 32_767).astype(np.int64), 10 * np.arange(400))
-    assert [a for a, _ in begun(baseline_events(frames, layout, BaselineSettings(shock=5_000)))] == ["negative"]
+    assert [a for a, _ in begun(rule_baseline_events(frames, layout, RuleBaselineSettings(shock=5_000)))] == [
+        "negative"
+    ]
 
 
 def test_the_file_of_a_plan() -> None:
-    assert BaselineSettings(**PLAN.to_dict()) == PLAN
+    assert RuleBaselineSettings(**SETTINGS.to_dict()) == SETTINGS

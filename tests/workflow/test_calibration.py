@@ -11,7 +11,6 @@ import pytest
 import plushsense as ps
 from plushsense.core.errors import ArchError, BundleError, ConfigError
 from plushsense.dataset.store import Dataset
-from plushsense.deploy.emit import without_people
 from plushsense.deploy.quantize import calibration, integer_model
 from plushsense.models.bundle import Bundle
 from plushsense.windows.cut import WindowSpec
@@ -46,7 +45,7 @@ def test_data_of_other_content_is_used_with_a_word_and_of_other_people_refused(d
     with pytest.raises(BundleError, match="has no window of the 1 people"):
         calibrated_on(replace(bundle, provenance=origin | {"subjects": ["P99"]}), dataset)
     with pytest.raises(BundleError, match="belongs to an export.*plushsense train wrote"):
-        calibrated_on(replace(bundle, provenance=without_people(origin)), dataset)
+        calibrated_on(bundle.without_people(), dataset)
     with pytest.raises(BundleError, match="does not name the people of its training windows|which calibration needs"):
         calibrated_on(replace(bundle, provenance=origin | {"split": "windows:holdout"}), dataset)
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import plushsense as ps
 from plushsense.dataset.store import Dataset
-from plushsense.deploy.emit import without_people
 from plushsense.workflow.datasets import forget
 
 Cli = Callable[..., Any]
@@ -52,8 +51,7 @@ def test_forget_asks_first_and_names_the_models(cli: Cli, dataset: Dataset, bund
     models = tmp_path / "models"
     models.mkdir()
     shutil.copy(bundle, models / "m.plush")
-    given = ps.load(bundle)
-    replace(given, provenance=without_people(given.provenance)).save(models / "given.plush")
+    ps.load(bundle).without_people().save(models / "given.plush")
     (models / "torn.plush").write_bytes(bundle.read_bytes()[:100])
     before = {p: p.read_bytes() for p in dataset.path.rglob("*") if p.is_file()}
     ran = cli("forget", dataset.path, "P1", "--bundles", models, "--json")

@@ -92,7 +92,7 @@ def verification_lines(done: VerificationReport) -> list[str]:
     ]
     head = ("target", "compiler", "flags", "vectors", "mismatches", "largest difference", "seconds")
     lines = [done.title, *streams, "", table(head, rows)]
-    lines += [f"not run: {what} ({why})" for what, why in done.not_run]
+    lines += [f"not run: {part} ({reason})" for part, reason in done.not_run]
     if done.mutants:
         targets = list(dict.fromkeys(m.target for m in done.mutants))
         by_mutant: dict[tuple[str, str], dict[str, str]] = {}
@@ -212,7 +212,7 @@ def _bytes(costs: list[Cost]) -> list[str]:
         for c in costs
         if c.stack_functions
     )
-    proof += f" Largest frames, as the compiler says: {frames}." if frames else ""
+    proof += f" Largest frames, as reported by the compiler: {frames}." if frames else ""
     proof += " Stack comes on top of RAM; an ESP32, S2 or S3 has windows of registers and needs more than xtensa here."
     return ["Bytes", table(["", *(c.target for c in costs)], rows), *textwrap.wrap(proof, 118)]
 

@@ -39,9 +39,9 @@ def run(args: argparse.Namespace) -> int:
             say(f"warning: {line}")
         if len(result["warnings"]) > _MOST_WARNINGS:
             say(f"... and {len(result['warnings']) - _MOST_WARNINGS} more warnings; all are in {args.dest}/*.csv")
-        for what, entries in (("left out", done.left_out), ("rejected", done.rejected)):
+        for status, entries in (("left out", done.left_out), ("rejected", done.rejected)):
             for entry in entries:
-                say(f"{what}: {entry['file']}: {entry['reason']}")
+                say(f"{status}: {entry['file']}: {entry['reason']}")
     new = f", {done.added['recordings']} of them new, {done.already_there} files already there" if args.add else ""
     emit(
         args,

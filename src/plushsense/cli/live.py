@@ -78,11 +78,11 @@ def format_update(decision: Decision, state_changed: bool, reactions: Sequence[R
 
 def _event(event: GestureEvent) -> str:
     affect = "" if event.affect == "none" else event.affect
-    what = ": ".join(part for part in (affect, event.gesture) if part) or "something"
-    if event.what == "ended":
-        return f"  end of {event.number}, {what}"
-    by = " (gate)" if event.source == "gate" and event.what == "begun" else ""
-    return f"{event.number} {what}{by}" if event.what == "begun" else f"{event.number} it is {what}"
+    name = ": ".join(part for part in (affect, event.gesture) if part) or "something"
+    if event.kind == "ended":
+        return f"  end of {event.number}, {name}"
+    by = " (gate)" if event.source == "gate" and event.kind == "begun" else ""
+    return f"{event.number} {name}{by}" if event.kind == "begun" else f"{event.number} it is {name}"
 
 
 def _reaction(reaction: Reaction) -> str:

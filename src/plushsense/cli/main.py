@@ -99,7 +99,3 @@ def _sentence(error: OSError) -> str:
     if not paths:
         return f"The system refused: {why}."
     return f"{paths} cannot be used: {why[0].lower()}{why[1:]}; check the path and whether you may write there."
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -91,6 +91,6 @@ def _removal_lines(result: Forgotten) -> list[str]:
         lines.append(f"published as https://doi.org/{plan.published}: publish a new version without them")
     lines.append(
         "Out of reach: backups, published copies, copies under pseudonyms and their key, evaluations and models kept "
-        "elsewhere. docs/privacy.md says what to do about them."
+        "elsewhere. docs/privacy.md describes what to do about them."
     )
     return lines

@@ -314,7 +314,7 @@ class Screen:
             sys.stderr.write("\x1b[H" + "".join(f"{line}\x1b[K\n" for line in screen) + "\x1b[J")
             sys.stderr.flush()
 
-    def _on_change(self, what: str, s: RecorderStatus) -> None:
+    def _on_change(self, change: str, s: RecorderStatus) -> None:
         """Queue a line that describes a change, for a log or a screen reader."""
         where = f"{s.step.gesture}, {s.step.repetition} of {s.repetitions}"
         line = {
@@ -325,7 +325,7 @@ class Screen:
             "finished": f"all done: {s.done} of {s.steps} recorded, {s.skipped} skipped"
             if s.state == "finished"
             else "",
-        }.get(what, "")
+        }.get(change, "")
         if s.message and s.message != self._message:
             self._messages.put(s.message + "\n")
         if line and line != self._line:

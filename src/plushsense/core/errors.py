@@ -115,15 +115,15 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return f" Did you mean '{lowered[matches[0]]}'?" if matches else ""
 
 
-def check_known(value: object, known: Iterable[str], what: str, error: type[BadInput]) -> None:
+def check_known(value: object, known: Iterable[str], kind: str, error: type[BadInput]) -> None:
     """Raise ``error`` for a value that is not among the known ones, and suggest a similar one.
 
     Args:
-        what: kind of the value, such as "preset".
+        kind: kind of the value, such as "preset".
     """
     known = tuple(known)
     if value not in known:
-        raise error(f"Unknown {what} '{value}': accepted are {', '.join(known)}.{nearest(str(value), known)}")
+        raise error(f"Unknown {kind} '{value}': accepted are {', '.join(known)}.{nearest(str(value), known)}")
 
 
 def need(module: str, extra: str) -> ModuleType:

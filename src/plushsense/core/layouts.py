@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +75,13 @@ class CsvFormat:
     columns: tuple[str, ...]
     header: tuple[str, ...]
     separator: str
+
+
+class StreamColumns(NamedTuple):
+    """Indices of a layout's channels in a sample of a stream, and of the device clock (None if the stream has none)."""
+
+    channels: tuple[int, ...]
+    clock: int | None = None
 
 
 @dataclass(frozen=True)
@@ -196,6 +203,32 @@ class Layout:
                 f"{nearest(name, self.names)}"
             )
         return self.names.index(name)
+
+    def match_columns(self, labels: Sequence[str], width: int) -> StreamColumns | str:
+        """Match the ``width`` columns of a stream by label, or by position; return why if the stream does not fit.
+
+        Labels are names of channels or header texts of the CSV format, in any order and without regard to case and
+        surrounding spaces; the stream may have further columns. If no label is a channel, the stream must have exactly
+        the channels of the layout, or the fields of its wire format.
+        """
+        texts = dict(zip((h.casefold() for h in self.csv.header), self.csv.columns, strict=True))
+        texts |= {n.casefold(): n for n in (*self.names, DEVICE_MS)}
+        keys = [texts.get(label.strip().casefold(), "") for label in labels] if len(labels) == width else []
+        if set(keys) & set(self.names):
+            if wrong := [n for n in self.names if keys.count(n) != 1]:
+                return f"its labels do not name {', '.join(wrong)} exactly once"
+        elif width == self.n_channels:
+            return StreamColumns(tuple(range(width)))
+        elif width == len(self.wire):
+            keys = list(self.wire)
+        else:
+            named = f" ({', '.join(labels[:6])}{', …' if len(labels) > 6 else ''})" if any(labels) else ""
+            return (
+                f"it has {width} channels{named}, and layout '{self.name}' needs {self.n_channels}, or the "
+                f"{len(self.wire)} of its wire format"
+            )
+        clock = keys.index(DEVICE_MS) if DEVICE_MS in keys else None
+        return StreamColumns(tuple(keys.index(n) for n in self.names), clock)
 
     def samples(self, seconds: float) -> int:
         """Return the number of samples in ``seconds``, at least one."""

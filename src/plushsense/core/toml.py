@@ -34,7 +34,7 @@ def builtin_names(folder: str) -> tuple[str, ...]:
     return tuple(sorted(p.name.removesuffix(".toml") for p in root.iterdir() if p.name.endswith(".toml")))
 
 
-def read_named(name_or_path: str | Path, folder: str, what: str, error: type[BadInput]) -> tuple[dict[str, Any], str]:
+def read_named(name_or_path: str | Path, folder: str, kind: str, error: type[BadInput]) -> tuple[dict[str, Any], str]:
     """Read a built-in TOML file by its name, or any other by its path; return its table and its name for messages.
 
     Raises:
@@ -48,22 +48,22 @@ def read_named(name_or_path: str | Path, folder: str, what: str, error: type[Bad
     if path.suffix != ".toml" and not path.is_file():
         known = builtin_names(folder)
         raise error(
-            f"Unknown {what} '{text}': the built-in ones are {', '.join(known)}; "
+            f"Unknown {kind} '{text}': the built-in ones are {', '.join(known)}; "
             f"or give the path of a TOML file.{nearest(text, known)}"
         )
-    return read_toml(path, what, error), text
+    return read_toml(path, kind, error), text
 
 
-def read_toml(path: Path, what: str, error: type[BadInput]) -> dict[str, Any]:
-    """Read the TOML file at ``path``; ``what`` names its content in messages. Raise ``error`` if that fails."""
+def read_toml(path: Path, kind: str, error: type[BadInput]) -> dict[str, Any]:
+    """Read the TOML file at ``path``; ``kind`` names its content in messages. Raise ``error`` if that fails."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
-        raise error(f"There is no {what} file '{path}': check the path.") from None
+        raise error(f"There is no {kind} file '{path}': check the path.") from None
     except (OSError, UnicodeDecodeError) as cause:
-        raise error(f"The {what} file '{path}' cannot be read ({cause}): give a UTF-8 TOML file.") from None
+        raise error(f"The {kind} file '{path}' cannot be read ({cause}): give a UTF-8 TOML file.") from None
     except (tomllib.TOMLDecodeError, RecursionError) as cause:
-        raise error(f"The {what} file '{path}' is not valid TOML: {cause}.") from None
+        raise error(f"The {kind} file '{path}' is not valid TOML: {cause}.") from None
 
 
 def load_table(table: object, kind: type[T], where: str, error: type[BadInput]) -> T:

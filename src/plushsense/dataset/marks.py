@@ -84,7 +84,7 @@ def _refuse_contradictions(mark: Mark, where: str) -> None:
         raise DatasetError(f"{where}: rows {mark.start} to {mark.stop} keep nothing; stop must be above start, or -1.")
 
 
-def match_ids(pattern: str, known: Iterable[str], what: str) -> list[str]:
+def match_ids(pattern: str, known: Iterable[str], kind: str) -> list[str]:
     """Return the ids of ``known`` that ``pattern`` matches: an id, or a glob such as ``P19/*``.
 
     Raises:
@@ -95,7 +95,7 @@ def match_ids(pattern: str, known: Iterable[str], what: str) -> list[str]:
     if not matched:
         hint = nearest(pattern, ids)
         example = f" For example '{ids[0]}', or a pattern such as 'P01/*'." if ids and not hint else ""
-        raise DatasetError(f"There is no {what} '{pattern}'.{hint}{example}")
+        raise DatasetError(f"There is no {kind} '{pattern}'.{hint}{example}")
     return matched
 
 

@@ -328,6 +328,15 @@ class Dataset:
             self._cached = (stream, self._frames(read_stream, info.file))
         return self._cached[1]
 
+    def read_people(self, subjects: Iterable[str]) -> Iterator[Frames]:
+        """Yield the frames of each person's streams, or of their used recordings if there are none."""
+        for subject in subjects:
+            streams = [s for s in self.streams if s.subject == subject]
+            if streams:
+                yield from (self.read_stream(s.id) for s in streams)
+            else:
+                yield from (self.read(r) for r in self.used if r.subject == subject)
+
     def _frames(self, read: Callable[[Path, Layout], ReadResult], file: str) -> Frames:
         try:
             return read(self.path / file, self.layout).frames
@@ -436,7 +445,7 @@ def read_people(path: Path) -> dict[str, PersonInfo]:
     return people
 
 
-def read_csv_rows(path: Path, what: str) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+def read_csv_rows(path: Path, kind: str) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
     """Read a CSV file that a user wrote, separated by ``,`` or ``;``.
 
     Returns:
@@ -458,7 +467,7 @@ def read_csv_rows(path: Path, what: str) -> tuple[list[str], list[tuple[int, dic
     except FileNotFoundError:
         raise
     except (OSError, UnicodeDecodeError, csv.Error) as cause:
-        raise DatasetError(f"The {what} '{path}' cannot be read ({cause}): give a CSV file in UTF-8.") from None
+        raise DatasetError(f"The {kind} '{path}' cannot be read ({cause}): give a CSV file in UTF-8.") from None
     return columns, rows
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
@@ -13,10 +12,8 @@ from typing import Any
 
 from plushsense.core.errors import BadInput
 from plushsense.core.files import new_folder
-from plushsense.core.gestures import NOBODY
 from plushsense.core.templates import fill_text
 from plushsense.deploy.golden import write_golden
-from plushsense.live.adaptation import without_subject
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.image import HEAD_BYTES, IntegerModel, image_head, layout_check, memory_bytes
 
@@ -27,7 +24,6 @@ LIBRARY = ("plushsense.h", "plushsense.c")
 MODEL = ("plush_model.h", "plush_model.c")
 GOLDEN = "golden"
 TOY_BYTES = 452  # size of a plush_toy with 32-bit pointers (a test compiles it)
-_PEOPLE = ("subjects", "validation_subjects")
 
 Extra = Callable[[Path, dict[str, Any]], object]
 
@@ -91,8 +87,8 @@ def read_facts(folder: str | Path) -> dict[str, Any]:
         facts = json.loads(path.read_text(encoding="utf-8"))
         needed = {"title", "channels", "classes", "memory_bytes", "model_bytes"} - set(facts)
     except (FileNotFoundError, NotADirectoryError):
-        what = f"'{folder}' is no export" if Path(folder).exists() else f"There is no export '{folder}'"
-        raise BadInput(f"{what}: make one with plushsense export BUNDLE OUT.") from None
+        problem = f"'{folder}' is no export" if Path(folder).exists() else f"There is no export '{folder}'"
+        raise BadInput(f"{problem}: make one with plushsense export BUNDLE OUT.") from None
     except (OSError, ValueError, TypeError) as cause:
         raise BadInput(f"'{path}' cannot be read ({cause}): export the model again.") from None
     if needed:
@@ -101,7 +97,7 @@ def read_facts(folder: str | Path) -> dict[str, Any]:
 
 
 def _write(model: IntegerModel, bundle: Bundle, folder: Path) -> dict[str, Any]:
-    bundle = replace(bundle, provenance=without_people(bundle.provenance), personal=without_subject(bundle.personal))
+    bundle = bundle.without_people()
     code = code_files(model, bundle)
     for name, content in code.items():
         (folder / name).write_bytes(content)
@@ -163,28 +159,6 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
         **({"personal": bundle.personal} if bundle.personal else {}),
         "code_version": version("plushsense"),
     }
-
-
-def without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a bundle's provenance with the number of people instead of their codes; idempotent."""
-    people = {
-        key: {str(n) for n in provenance[key]} - {NOBODY} for key in _PEOPLE if isinstance(provenance.get(key), list)
-    }
-    names = set().union(*people.values())
-    named = re.compile(
-        "|".join(rf"(?<!\w){re.escape(n)}(?!\w)" for n in sorted(names, key=len, reverse=True)) or "(?!)"
-    )
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {key: plain(each) for key, each in value.items() if str(key) not in names}
-        if isinstance(value, list | tuple):
-            return [plain(each) for each in value]
-        return named.sub("…", value) if isinstance(value, str) else value
-
-    counted = {key: provenance[key] for key in _PEOPLE if isinstance(provenance.get(key), int)}
-    others = {key: plain(value) for key, value in provenance.items() if key not in _PEOPLE}
-    return others | counted | {key: len(codes) for key, codes in people.items()}
 
 
 def c_names(labels: Sequence[str]) -> tuple[str, ...]:

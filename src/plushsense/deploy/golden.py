@@ -16,7 +16,7 @@ from plushsense.core.errors import BadInput
 from plushsense.core.layouts import MAGNITUDE_FRACTION_BITS, Layout
 from plushsense.core.templates import fill_text
 from plushsense.runtime.events import AFFECT_CODES
-from plushsense.runtime.fixed import InputScale
+from plushsense.runtime.fixed import InputScale, Ints
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel
 from plushsense.runtime.machine import Moment, ToyMachine
@@ -138,7 +138,7 @@ class FrameGenerator:
             self.put(np.array(self.rows[-1][1:], dtype=np.int64))
             self.now += self.pace()
 
-    def frames_of(self, ms: int) -> int:
+    def frames_in(self, ms: int) -> int:
         """Return the number of frames in ``ms`` milliseconds, rounded up."""
         return -(-ms * 1000 // self.layout.period_us)
 
@@ -148,25 +148,25 @@ class FrameGenerator:
         A channel is out of range, or stuck outside the range of touches, first only briefly; then all channels are
         frozen. There are also too few good frames for a recovery, and a gap during a failure.
         """
-        few, enough = self.frames_of(health.fault_ms) // 2, self.frames_of(health.fault_ms + health.recover_ms) + 20
-        back = self.frames_of(health.recover_ms) + after
+        few, enough = self.frames_in(health.fault_ms) // 2, self.frames_in(health.fault_ms + health.recover_ms) + 20
+        back = self.frames_in(health.recover_ms) + after
         if health.fault_ms:
             ends = self._beyond(health)
             self.touches(few + 3, stuck=ends)
             self.touches(30)
             self.touches(enough, stuck=ends)
-            self.touches(self.frames_of(health.recover_ms) // 2)
+            self.touches(self.frames_in(health.recover_ms) // 2)
             self.touches(20, garbage=0.5)
             self.touches(back, blows=0.02)
             self.touches(enough, garbage_channel=len(self.mean) - 1)
             self.wait(self.layout.gap_ms + 40)
             self.touches(back)
         if health.still_ms:
-            self.frozen(self.frames_of(health.still_ms) * 3 // 4)
+            self.frozen(self.frames_in(health.still_ms) * 3 // 4)
             self.wait(self.layout.gap_ms + 10)
             self.frozen(4)
-            self.touches(self.frames_of(health.still_ms) // 2)
-            self.frozen(self.frames_of(health.still_ms) + 20)
+            self.touches(self.frames_in(health.still_ms) // 2)
+            self.frozen(self.frames_in(health.still_ms) + 20)
             self.now = 40
             self.touches(back, blows=0.02)
 
@@ -265,7 +265,6 @@ _KINDS = {
     EVENT: "a change of an event",
     HEALTH: "a change of the sensor health",
 }
-Ints = NDArray[np.int64]
 
 
 def column(rows: NDArray[Any], name: str, kind: int = ANSWER) -> NDArray[Any]:
@@ -353,9 +352,9 @@ class _RowTable:
         if answer is None or moment.logits is None or moment.smoothed is None:
             self._add(ANSWER, ms, count, WARMING)
             return
-        what = answer.best, self.affects[answer.best], answer.share, answer.kind, answer.known
+        values = answer.best, self.affects[answer.best], answer.share, answer.kind, answer.known
         numbers = [*moment.logits.tolist(), *moment.smoothed.tolist()]
-        self._add(ANSWER, ms, count, TRACKING, *what, numbers=numbers)
+        self._add(ANSWER, ms, count, TRACKING, *values, numbers=numbers)
 
     def add_health(self, ms: int) -> None:
         """Add the current state of the health check."""
@@ -366,9 +365,9 @@ class _RowTable:
     def _ms(self, time_us: int) -> int:
         return (time_us + self.toy.frames.zero_us) // 1000
 
-    def _add(self, kind: int, ms: int, *what: int, numbers: Sequence[int] = ()) -> None:
+    def _add(self, kind: int, ms: int, *values: int, numbers: Sequence[int] = ()) -> None:
         counts = self.toy.frames.clock.restarts, self.toy.frames.clock.invalid
-        row = [kind, self.frame, ms, *what, *[0] * (HEAD - 5 - len(what)), *counts, *numbers]
+        row = [kind, self.frame, ms, *values, *[0] * (HEAD - 5 - len(values)), *counts, *numbers]
         self.rows.append(row + [0] * (HEAD + 2 * len(self.affects) - len(row)))
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ProgramError, ToolError
 from plushsense.core.toml import load_table, read_toml
@@ -30,6 +29,7 @@ from plushsense.deploy.targets import (
     tool_output,
 )
 from plushsense.models.arch import Arch
+from plushsense.runtime.fixed import Ints
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Core:
         if self.flash_mb_s is None:
             return self.why
         return (
-            f"{self.why}; high also fetches code and model from the serial flash anew for every sample, at "
+            f"{self.why}; high also fetches code and model from the serial flash again for every sample, at "
             f"{self.flash_mb_s:g} MB/s, as if its cache had kept nothing (in RAM they never are)"
         )
 
@@ -128,7 +128,6 @@ _HEAP = ("malloc", "calloc", "realloc", "free", "reallocarray", "aligned_alloc",
 _FLOAT = re.compile(r"^__(\w*[sdt]f\d?$|float|fix|aeabi_[fd](?!iv)|aeabi_u?[il]2[fd])")
 _SECTIONS = {"text": (".text", ".literal"), "rodata": (".rodata", ".srodata"), "data": (".data", ".sdata")}
 _SECTIONS["bss"] = (".bss", ".sbss")
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -300,7 +299,7 @@ def _whole(program: Program, step: int) -> tuple[list[int], Ints, Ints]:
     if (len(even), len(jittered)) != (STEPS, STEPS + 1):
         raise ProgramError(
             f"The C in the export gave {len(even)} answers on {program.target.name} where {STEPS} steps of {step} "
-            "samples should: plushsense verify says where it goes wrong."
+            "samples should: plushsense verify shows where it goes wrong."
         )
     return numbers[:6].tolist(), even, jittered
 

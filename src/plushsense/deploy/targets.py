@@ -212,7 +212,7 @@ def tool_output(command: Sequence[str]) -> str:
     return result.stdout.decode(errors="replace")
 
 
-def _compile(command: Sequence[str], cwd: Path, what: str) -> None:
+def _compile(command: Sequence[str], cwd: Path, name: str) -> None:
     try:
         # `_error_line` needs English messages.
         env = os.environ | {"LC_ALL": "C"}
@@ -221,7 +221,7 @@ def _compile(command: Sequence[str], cwd: Path, what: str) -> None:
         raise ToolError(f"{command[0]} cannot be started: {cause.strerror or cause}.") from None
     if result.returncode != 0:
         errors = result.stderr.decode(errors="replace").strip()
-        raise BuildError(f"{command[0]} refused {what}: {_error_line(errors)}", errors)
+        raise BuildError(f"{command[0]} refused {name}: {_error_line(errors)}", errors)
 
 
 def _error_line(output: str) -> str:

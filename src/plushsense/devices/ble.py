@@ -212,9 +212,9 @@ class BleDevice(Device):
             here = f"there are {', '.join(there[:8])}" + (f" and {len(there) - 8} more" if len(there) > 8 else "")
         else:
             here = f"there are {len(names)} without a name" if names else "nothing advertises here"
-        what = f"named '{target.name}'" if target.address is None else f"with the address {target.address}"
+        described = f"named '{target.name}'" if target.address is None else f"with the address {target.address}"
         raise DeviceError(
-            f"'{self.url}': no Bluetooth device {what} advertised within {target.find_s:g} s; {here}; "
+            f"'{self.url}': no Bluetooth device {described} advertised within {target.find_s:g} s; {here}; "
             "is it switched on, near, and not connected elsewhere?"
         )
 

@@ -9,14 +9,13 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 from urllib.parse import quote, unquote
 
 from plushsense.core.errors import ConfigError, DeviceError, need
-from plushsense.core.layouts import DEVICE_MS, Layout
+from plushsense.core.layouts import DEVICE_MS, Layout, StreamColumns
 from plushsense.devices.base import Device, Frame, LossCounter, now_ms
 from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
 from plushsense.devices.virtual.server import ToyCounters, ToyServer
@@ -52,49 +51,6 @@ def load_pylsl() -> ModuleType:
         return pylsl
 
 
-@dataclass(frozen=True)
-class LslColumns:
-    """Indices of the layout's channels in an LSL sample, and of the device clock (None if the stream has none)."""
-
-    channels: tuple[int, ...]
-    clock: int | None = None
-
-
-def match_columns(layout: Layout, labels: list[str] | None, width: int, what: str) -> LslColumns:
-    """Match the columns of a stream to a layout by label, or by position if no label is a channel of the layout.
-
-    Labels are compared without case and surrounding spaces; the stream may have further columns. By position, the
-    stream must have exactly the channels of the layout, or the fields of its wire format.
-
-    Raises:
-        DeviceError: if the stream does not fit; ``what`` names it in the message.
-    """
-    texts = [label.strip().casefold() for label in labels or ()]
-    known = [name.casefold() for name in layout.names]
-    if len(texts) == width and set(known) & set(texts):
-        missing = [name for name, key in zip(layout.names, known, strict=True) if key not in texts]
-        double = [name for name, key in zip(layout.names, known, strict=True) if texts.count(key) > 1]
-        if missing or double:
-            fault = f"lacks {', '.join(missing)}" if missing else f"has {', '.join(double)} more than once"
-            raise DeviceError(
-                f"{what} {fault}; it carries {', '.join(labels or ())}: "
-                f"choose the layout that fits with ?layout= (the requested layout is {layout.name})."
-            )
-        return LslColumns(
-            tuple(texts.index(key) for key in known), texts.index(DEVICE_MS) if DEVICE_MS in texts else None
-        )
-    if width == layout.n_channels:
-        return LslColumns(tuple(range(width)))
-    if width == len(layout.wire):
-        clock = layout.wire.index(DEVICE_MS) if DEVICE_MS in layout.wire else None
-        return LslColumns(tuple(layout.wire.index(name) for name in layout.names), clock)
-    named = f" ({', '.join(texts[:6])}{', …' if len(texts) > 6 else ''})" if texts else ""
-    raise DeviceError(
-        f"{what} has {width} channels{named}, and layout {layout.name} needs {layout.n_channels}, or the "
-        f"{len(layout.wire)} of its wire: choose the layout that fits with ?layout=."
-    )
-
-
 class LslDevice(Device):
     """A device that receives an LSL stream. Reading raises DeviceError when the source is gone.
 
@@ -120,7 +76,10 @@ class LslDevice(Device):
         self._inlet: Any = self._pylsl.StreamInlet(found, recover=False)
         try:
             labels = stream_labels(self._inlet.info(timeout=FIND_S))
-            self._columns = match_columns(layout, labels, found.channel_count(), f"The stream '{url}'")
+            columns = layout.match_columns(labels, found.channel_count())
+            if isinstance(columns, str):
+                raise DeviceError(f"The stream '{url}' does not fit: {columns}; choose another layout with ?layout=.")
+            self._columns = columns
             self._inlet.open_stream(timeout=FIND_S)
         except RuntimeError:  # pylsl's TimeoutError and LostError, which it keeps elsewhere in each version
             raise DeviceError(
@@ -128,7 +87,7 @@ class LslDevice(Device):
             ) from None
         if found.channel_format() == self._pylsl.cf_float32 and self._columns.clock is not None:
             # A float32 is exact for less than five hours of milliseconds.
-            self._columns = LslColumns(self._columns.channels)
+            self._columns = StreamColumns(self._columns.channels)
 
     def _find(self, key: str, value: str, find_s: float) -> Any:
         mark = '"' if "'" in value else "'"
@@ -210,14 +169,14 @@ def _steps(value: float, step: float) -> int | None:
     return round(number)
 
 
-def stream_labels(info: Any) -> list[str] | None:
-    """Return the labels in a full stream description, in order; None when there are none."""
+def stream_labels(info: Any) -> list[str]:
+    """Return the labels in a full stream description, in order; none if all are empty."""
     labels: list[str] = []
     channel = info.desc().child("channels").child("channel")
     while not channel.empty() and len(labels) < 10_000:
         labels.append(channel.child_value("label"))
         channel = channel.next_sibling("channel")
-    return labels if any(labels) else None
+    return labels if any(labels) else []
 
 
 def name_url(name: str) -> str:

@@ -210,23 +210,23 @@ def list_devices(scan_s: float = SCAN_S) -> DeviceListing:
         raise ConfigError(f"The time to look for toys is {scan_s:g} s; accepted is above 0 to 600.")
     results: dict[str, DeviceListing] = {}
 
-    def look(what: str, search: str) -> None:
+    def look(scheme: str, search: str) -> None:
         try:
-            results[what] = pkgutil.resolve_name(search)(scan_s)
+            results[scheme] = pkgutil.resolve_name(search)(scan_s)
         except MissingExtraError as refusal:
-            results[what] = DeviceListing(notes=[f"{what}: not looked at. {refusal}"])
+            results[scheme] = DeviceListing(notes=[f"{scheme}: not looked at. {refusal}"])
         except PlushSenseError as refusal:
-            results[what] = DeviceListing(notes=[str(refusal)])
+            results[scheme] = DeviceListing(notes=[str(refusal)])
         except Exception as cause:  # noqa: BLE001, RUF100
-            results[what] = DeviceListing(notes=[f"{what} cannot be used: {' '.join(str(cause).split())}."])
+            results[scheme] = DeviceListing(notes=[f"{scheme} cannot be used: {' '.join(str(cause).split())}."])
 
     threads = [threading.Thread(target=look, args=item, daemon=True) for item in SEARCHES.items()]
     for thread in threads:
         thread.start()
     listing = DeviceListing()
-    for thread, what in zip(threads, SEARCHES, strict=True):
+    for thread, scheme in zip(threads, SEARCHES, strict=True):
         thread.join(scan_s + _GRACE_S)
-        part = results.get(what) or DeviceListing(notes=[f"{what} did not answer within {scan_s + _GRACE_S:g} s."])
+        part = results.get(scheme) or DeviceListing(notes=[f"{scheme} did not answer within {scan_s + _GRACE_S:g} s."])
         listing.devices += part.devices
         listing.notes += part.notes
     listing.devices.append(DeviceInfo("virtual://?person=7", "virtual", "virtual toy", "in this program; a simulation"))

@@ -278,11 +278,11 @@ class _FoldWork:
         if out.deployed is not None:
             arrays["deployed"] = out.deployed
         expected = (len(task.test), len(score.labels))
-        for what, probabilities in arrays.items():
-            arrays[what] = probabilities = np.asarray(probabilities, dtype=np.float32)
+        for name, probabilities in arrays.items():
+            arrays[name] = probabilities = np.asarray(probabilities, dtype=np.float32)
             if probabilities.shape != expected:
                 raise ConfigError(
-                    f"fit_predict gave {what} of the shape {probabilities.shape}; {expected} (windows, classes) is "
+                    f"fit_predict gave {name} of the shape {probabilities.shape}; {expected} (windows, classes) is "
                     "expected."
                 )
         return {

@@ -38,7 +38,7 @@ from plushsense.training.spec import TrainSpec
 from plushsense.tuning.decisions import (
     COVERAGE,
     KNOWN_SHARE,
-    covered,
+    coverage_of,
     known_threshold,
     labelled_steps,
     marked_streams,
@@ -110,7 +110,7 @@ def fold_answers(
     each = [steps.take(steps.person == person) for person in people]
     return {
         "people": people,
-        "covered": [covered(mine, sure) for mine in each],
+        "covered": [coverage_of(mine, sure) for mine in each],
         "size": [float((mine.shares >= sure * ONE).sum(axis=1).mean()) for mine in each],
         "sure": sure,
         "known": known,

@@ -68,7 +68,7 @@ def score_adaptation(
     Args:
         windows: of everybody.
         times: when each recording was made, by its id: recordings of a gesture are numbered in this order.
-        use: recordings of each gesture to adapt to. The choices are all sets of so many numbers, the same for all
+        use: recordings of each gesture to adapt to. The choices are all sets of ``use`` numbers, the same for all
             gestures (10 of 5 recordings); the first choice is the first recordings of each gesture.
         random: further choices, drawn for each gesture on its own.
         progress: called with each person who is done.
@@ -221,7 +221,7 @@ class Adapted:
     """The outcome of `adapt`.
 
     ``tested``: with ``use``, the scores on the other recordings, before and after; None where all were used.
-    ``left_out`` says for each label why recordings could not be used.
+    ``left_out`` maps each label to the reason why recordings could not be used.
     """
 
     personal: Personal
@@ -283,7 +283,7 @@ def adapt(
     Args:
         recordings: a data set, or the folder of a recorder.
         subject: the person; may be left out where there is only one.
-        use: adapt to the first so many recordings of each gesture only, and score the rest before and after.
+        use: number of recordings of each gesture to adapt to, the first ones; the rest are scored before and after.
         warn: called with what was left out, and what limits the meaning of the scores.
 
     Raises:
@@ -340,7 +340,7 @@ def _person(dataset: Dataset, subject: str | None) -> str:
         return people[0]
     listed = ", ".join(people) or "nobody"
     if subject is None:
-        raise DatasetError(f"'{dataset.head.name}' holds recordings of {listed}: say whose with --subject CODE.")
+        raise DatasetError(f"'{dataset.head.name}' holds recordings of {listed}: choose a person with --subject CODE.")
     if subject not in people:
         raise DatasetError(
             f"'{dataset.head.name}' holds no recording of '{subject}': there are {listed}.{nearest(subject, people)}"
@@ -362,10 +362,10 @@ def _same_layout(bundle: Bundle, dataset: Dataset) -> None:
 
 
 def _warn_of_training(bundle: Bundle, person: str, warn: Warn) -> None:
-    for key, what in (("subjects", "trained"), ("validation_subjects", "validated")):
+    for key, used in (("subjects", "trained"), ("validation_subjects", "validated")):
         people = bundle.provenance.get(key, ())
         if isinstance(people, list | tuple) and person in people:
-            warn(f"the bundle was {what} on a person {person}: if it is the same one, the scores before are too high")
+            warn(f"the bundle was {used} on a person {person}: if it is the same one, the scores before are too high")
 
 
 def _recordings_of(dataset: Dataset, person: str, bundle: Bundle, warn: Warn) -> tuple[Dataset, dict[str, str]]:

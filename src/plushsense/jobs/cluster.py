@@ -86,7 +86,7 @@ def _knock(address: str) -> None:
     if found is None or not 0 < int(found[3]) < 65536:
         raise ConfigError(
             f"'{address}' is not the address of a cluster: accepted are auto, local, HOST:PORT (as  ray start --head  "
-            "says) and ray://HOST:10001."
+            "prints) and ray://HOST:10001."
         )
     try:
         with socket.create_connection((found[1] or found[2], int(found[3])), timeout=_ANSWER_S) as line:
@@ -209,10 +209,10 @@ def _outcome(ray: Any, ref: Any, job: Job) -> JobEvent:
         return JobEvent(job, "failed", lost)
     except errors.RayError as cause:
         raise _unfit(str(cause)) from cause
-    what = pickle.loads(packed)
+    payload = pickle.loads(packed)
     if kind == "lost":
-        raise what
-    return JobEvent(job, kind, what)
+        raise payload
+    return JobEvent(job, kind, payload)
 
 
 def _unfit(reason: str) -> PlushSenseError:

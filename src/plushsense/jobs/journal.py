@@ -50,11 +50,11 @@ class JobWork(Protocol):
 
 
 class JobEvent(NamedTuple):
-    """An event of a job: it started (again), or sent a message, a result or an exception, which is ``what``."""
+    """An event of a job: it started (again), or sent a ``payload``: a message, a result or an exception."""
 
     job: Job
     kind: Literal["started", "report", "done", "failed"]
-    what: Any = None
+    payload: Any = None
 
 
 # Returns the next job, or None if there are no more; called only when the job can start immediately.

@@ -110,21 +110,21 @@ def run_jobs(
         saved = cluster is None and workers > 1
         # Close the engine explicitly, which ends its processes.
         with closing(engine):  # type: ignore[type-var]
-            for job, kind, what in engine:
+            for job, kind, payload in engine:
                 if kind == "started" and on_start is not None:
                     on_start(job)
                 elif kind == "report" and on_report is not None:
-                    on_report(job, what)
+                    on_report(job, payload)
                 elif kind == "done":
                     if journal is not None and not saved:
-                        journal.save(job.id, what)
+                        journal.save(job.id, payload)
                     left.release(job)
-                    done(job, what, False)
+                    done(job, payload, False)
                 elif kind == "failed":
                     left.release(job)
                     if on_failed is None:
-                        raise what
-                    on_failed(job, what)
+                        raise payload
+                    on_failed(job, payload)
     return results
 
 

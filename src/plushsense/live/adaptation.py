@@ -17,7 +17,6 @@ bundle is adapted only if more of them are predicted correctly, their log loss c
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -291,8 +290,3 @@ def restore_original(bundle: Bundle) -> Bundle:
             "that plushsense adapt wrote."
         ) from None
     return replace(bundle, weights={**bundle.weights, **dense}, personal={})
-
-
-def without_subject(personal: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a bundle's ``personal`` for an export, without the person's code and the original weights."""
-    return {key: value for key, value in personal.items() if key not in ("subject", "original")}

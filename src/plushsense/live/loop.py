@@ -139,7 +139,7 @@ class LiveRun(Iterator[Decision]):
         self._decisions += 1
         self._warming += decision.state == "warming"
         self._no_signal += decision.state == "no signal"
-        self._events += sum(event.what == "begun" for event in decision.events)
+        self._events += sum(event.kind == "begun" for event in decision.events)
         return decision
 
     def summary(self) -> LiveSummary:

@@ -182,7 +182,7 @@ class Reactor:
         return [
             reaction
             for event in reported.events
-            if not (event.what == "ended" and (lost or (reported.state == "warming" and event.since_s == event.t_s)))
+            if not (event.kind == "ended" and (lost or (reported.state == "warming" and event.since_s == event.t_s)))
             and (reaction := self._react(event)) is not None
         ]
 
@@ -205,6 +205,6 @@ class Reactor:
 def _due(line: ReactionRule, event: GestureEvent) -> bool:
     """Return whether a rule reacts to this change; an event that begins with a gesture is named at once."""
     if line.when == "named":
-        return event.what != "ended" and event.gesture is not None
+        return event.kind != "ended" and event.gesture is not None
     # The rule of a gesture can only be found once the event is named, which may be after it has begun.
-    return event.what == line.when or (line.when == "begun" and bool(line.gesture) and event.what == "named")
+    return event.kind == line.when or (line.when == "begun" and bool(line.gesture) and event.kind == "named")

@@ -72,7 +72,7 @@ def slashed(filters: Iterable[int]) -> str:
     return "/".join(map(str, filters))
 
 
-def _number(text: str, at: int, what: str, symbol: bool = True) -> tuple[int, int]:
+def _number(text: str, at: int, name: str, symbol: bool = True) -> tuple[int, int]:
     """Return the number that starts at ``at``, 1 to MAX_NUMBER, and the position after it."""
     end = at
     while end < len(text) and text[end] in "0123456789":
@@ -80,19 +80,19 @@ def _number(text: str, at: int, what: str, symbol: bool = True) -> tuple[int, in
     if end == at:
         is_missing = at == len(text) or text[at] in "_,"
         problem = "nothing stands here" if is_missing else f"unknown token {text[at]!r}"
-        fail(f"{problem}: {what} is expected, a whole number from 1", text, at, symbol)
+        fail(f"{problem}: {name} is expected, a whole number from 1", text, at, symbol)
     if text[at:end].strip("0") == "":
-        fail(f"{what} is 0: the smallest is 1", text, at, symbol)
+        fail(f"{name} is 0: the smallest is 1", text, at, symbol)
     if end - at > 9 or int(text[at:end]) > MAX_NUMBER:
-        fail(f"{what} is too large: the largest is {MAX_NUMBER}", text, at, symbol)
+        fail(f"{name} is too large: the largest is {MAX_NUMBER}", text, at, symbol)
     return int(text[at:end]), end
 
 
 def fail(why: str, text: str, at: int, symbol: bool = True) -> NoReturn:
     """Raise ArchError with the reason, the text, and a caret under position ``at``."""
     printable = "".join(c if c.isprintable() else "?" for c in text)
-    what = "Architecture" if symbol else "Filters"
-    raise ArchError(f"{what} '{printable}', place {at + 1}: {why}.\n    {printable}\n    {' ' * at}^")
+    kind = "Architecture" if symbol else "Filters"
+    raise ArchError(f"{kind} '{printable}', place {at + 1}: {why}.\n    {printable}\n    {' ' * at}^")
 
 
 Padding = Literal["stream", "causal", "mirror"]
@@ -371,6 +371,6 @@ def reflected(length: int, left: int) -> NDArray[np.intp]:
     return np.asarray(np.minimum(folded, 2 * (length - 1) - folded), dtype=np.intp)
 
 
-def _in_range(what: str, value: object, low: int, high: int, of_high: str = "") -> None:
+def _in_range(name: str, value: object, low: int, high: int, of_high: str = "") -> None:
     if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-        raise ArchError(f"{what} is {value!r}: accepted are whole numbers from {low} to {high}{of_high}.")
+        raise ArchError(f"{name} is {value!r}: accepted are whole numbers from {low} to {high}{of_high}.")

@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from plushsense.windows.features import Scaler
 
 FORMAT = "plushsense-bundle"
 VERSION = 1
+_PEOPLE = ("subjects", "validation_subjects")
 _AGAIN = "copy it again from where it came, or train again"
 
 
@@ -64,14 +66,14 @@ class Bundle:
 
     def __post_init__(self) -> None:
         check_weights(self.arch, self.weights)
-        for what, found, needed in (
+        for name, found, needed in (
             ("inputs in the layout", self.layout.n_inputs, self.arch.channels),
             ("offsets in the scaling", np.size(self.scaler.offset), self.arch.channels),
             ("scales in the scaling", np.size(self.scaler.scale), self.arch.channels),
             ("gestures in the set", len(self.gestures), self.arch.classes),
         ):
             if found != needed:
-                raise BundleError(f"The bundle does not fit together: {found} {what}, the network needs {needed}.")
+                raise BundleError(f"The bundle does not fit together: {found} {name}, the network needs {needed}.")
         if not (np.isfinite(self.scaler.offset).all() and np.isfinite(self.scaler.scale).all()):
             raise BundleError("The bundle's scaling holds a value that is not finite: train again.")
 
@@ -90,6 +92,11 @@ class Bundle:
     def network(self) -> Network:
         """Return the NumPy network with these weights."""
         return Network(self.arch, self.weights)
+
+    def without_people(self) -> Bundle:
+        """Return the bundle for an export: without people's codes and the weights before an adaptation; idempotent."""
+        personal = {key: value for key, value in self.personal.items() if key not in ("subject", "original")}
+        return replace(self, provenance=_without_people(self.provenance), personal=personal)
 
     def save(self, path: str | Path) -> Path:
         """Write the bundle atomically, creating missing folders; return the path.
@@ -213,9 +220,31 @@ class Bundle:
 
 def known_people(provenance: Mapping[str, Any]) -> set[str]:
     """Return the codes of the people in the training and validation data, without "nobody" and unknown people."""
-    listed = [provenance.get(key) for key in ("subjects", "validation_subjects")]
+    listed = [provenance.get(key) for key in _PEOPLE]
     codes = {str(code) for each in listed if isinstance(each, list | tuple) for code in each}
     return codes - {NOBODY, UNKNOWN_SUBJECT}
+
+
+def _without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a bundle's provenance with the number of people instead of their codes; idempotent."""
+    people = {
+        key: {str(n) for n in provenance[key]} - {NOBODY} for key in _PEOPLE if isinstance(provenance.get(key), list)
+    }
+    names = set().union(*people.values())
+    named = re.compile(
+        "|".join(rf"(?<!\w){re.escape(n)}(?!\w)" for n in sorted(names, key=len, reverse=True)) or "(?!)"
+    )
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: plain(each) for key, each in value.items() if str(key) not in names}
+        if isinstance(value, list | tuple):
+            return [plain(each) for each in value]
+        return named.sub("…", value) if isinstance(value, str) else value
+
+    counted = {key: provenance[key] for key in _PEOPLE if isinstance(provenance.get(key), int)}
+    others = {key: plain(value) for key, value in provenance.items() if key not in _PEOPLE}
+    return others | counted | {key: len(codes) for key, codes in people.items()}
 
 
 def _header(data: bytes, path: str | Path) -> dict[str, Any]:

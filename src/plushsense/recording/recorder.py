@@ -294,8 +294,8 @@ def prompt_virtual(recorder: Recorder) -> None:
         return
     inner.follow()
 
-    def on_change(what: str, status: RecorderStatus) -> None:
-        if what == "countdown" and status.state == "countdown":
+    def on_change(change: str, status: RecorderStatus) -> None:
+        if change == "countdown" and status.state == "countdown":
             inner.perform(status.step.gesture, recorder.begins_ms)
 
     recorder.subscribe(on_change)

@@ -98,7 +98,7 @@ def is_finished(folder: Path) -> bool:
     """Return whether the session in ``folder`` was completed, and no step was reopened since."""
     finished = False
     for event in read_events(folder):
-        finished = event.what == "finished" or (finished and event.what not in ("redo", "go"))
+        finished = event.kind == "finished" or (finished and event.kind not in ("redo", "go"))
     return finished
 
 
@@ -235,9 +235,9 @@ def _repair(folder: Path, layout: Layout, log: LogFile) -> SessionProgress:
     return progress
 
 
-def new_event(what: str, **details: Any) -> SessionEvent:
+def new_event(kind: str, **details: Any) -> SessionEvent:
     """Return an event with the current time."""
-    return SessionEvent(what, now_ms(), details)
+    return SessionEvent(kind, now_ms(), details)
 
 
 def _key(more: dict[str, Any]) -> Key | None:
@@ -255,23 +255,23 @@ def replay_log(folder: Path, progress: SessionProgress) -> tuple[Key | None, dic
     open_key: Key | None = None
     for event in read_events(folder):
         key, file = _key(event.details), str(event.details.get("file") or "")
-        if event.what == "start":
+        if event.kind == "start":
             open_key = key
-        elif event.what in ("take", "abandon", "unfinished"):
+        elif event.kind in ("take", "abandon", "unfinished"):
             open_key = None
-        if event.what == "take" and key is not None and file:
+        if event.kind == "take" and key is not None and file:
             of[file] = key
             progress.takes[key] = file
             progress.skipped.discard(key)
-        elif event.what == "redo" and file in of:
+        elif event.kind == "redo" and file in of:
             progress.discarded.setdefault(of[file], []).append(file)
             if progress.takes.get(of[file]) == file:
                 del progress.takes[of[file]]
-        elif event.what == "keep" and file in of:
+        elif event.kind == "keep" and file in of:
             if file in (discarded := progress.discarded.get(of[file], [])):
                 discarded.remove(file)
             progress.takes[of[file]] = file
-        elif event.what == "skip" and key is not None:
+        elif event.kind == "skip" and key is not None:
             progress.skipped.add(key)
     return open_key, of
 

@@ -67,7 +67,7 @@ class SessionHead:
 
 @dataclass(frozen=True)
 class SessionEvent:
-    """Event of a session: its kind ``what``, the computer's time ``at_ms``, and details.
+    """Event of a session: its ``kind``, the computer's time ``at_ms``, and details.
 
     Kinds, with their details: ``open`` and ``close`` (a program opened or closed the session), ``countdown``
     (``gesture``, ``repetition``, ``countdown_s``), ``start`` (of a recording, with its first row), ``take`` (finished
@@ -77,13 +77,13 @@ class SessionEvent:
     ``mended`` (repaired after a crash), ``failed``, ``finished``. Readers ignore other kinds.
     """
 
-    what: str
+    kind: str
     at_ms: int
     details: dict[str, Any] = field(default_factory=dict)
 
     def to_line(self) -> str:
         """Return the event as a line of the log."""
-        return json.dumps({"what": self.what, "at_ms": self.at_ms} | self.details, ensure_ascii=False) + "\n"
+        return json.dumps({"what": self.kind, "at_ms": self.at_ms} | self.details, ensure_ascii=False) + "\n"
 
 
 def read_events(folder: Path) -> Iterator[SessionEvent]:
@@ -107,8 +107,8 @@ def discarded_recordings(folder: Path) -> dict[str, str]:
     discarded: dict[str, str] = {}
     for event in read_events(folder):
         file = str(event.details.get("file") or "")
-        if event.what == "redo" and file:
+        if event.kind == "redo" and file:
             discarded[file] = str(event.details.get("why") or "recorded again")
-        elif event.what == "keep":
+        elif event.kind == "keep":
             discarded.pop(file, None)
     return discarded

@@ -126,8 +126,8 @@ def store_take(
         message = f"Nobody stopped the recording: it ended after {longest_s:g} s; r records it again."
     elif take.gaps:
         longest = max(gap["missing_ms"] for gap in take.gaps) / 1000.0
-        what = f"has a gap of {longest:.1f} s" if longest >= 0.05 else "has a jump in the toy's clock"
-        message = f"This recording {what}; it is kept, r records it again."
+        fault = f"has a gap of {longest:.1f} s" if longest >= 0.05 else "has a jump in the toy's clock"
+        message = f"This recording {fault}; it is kept, r records it again."
     return path.name, message
 
 
@@ -271,7 +271,7 @@ class RecordingMachine:
         self._reader = threading.Thread(target=self._read, name="plushsense-reader", daemon=True)
 
     def subscribe(self, listener: Listener) -> None:
-        """Call ``listener(what, status)`` at every change, in the thread that caused it; it must not block."""
+        """Call ``listener(change, status)`` at every change, in the thread that caused it; it must not block."""
         self._listeners.append(listener)
 
     def status(self) -> RecorderStatus:
@@ -316,20 +316,20 @@ class RecordingMachine:
             yield
         with self._changed:
             changes, self._changes = self._changes, []
-        for what in changes:
+        for change in changes:
             for listener in tuple(self._listeners):
                 # An error in a listener must not end a recording.
                 with contextlib.suppress(Exception):
-                    listener(what, self.status())
+                    listener(change, self.status())
 
-    def _log(self, what: str, **more: Any) -> None:
+    def _log(self, kind: str, **more: Any) -> None:
         if self._writer is not None:
-            self._writer.submit(SessionEvent(what, self._receiver.now_ms(), more))
-        self._changes.append(what)
+            self._writer.submit(SessionEvent(kind, self._receiver.now_ms(), more))
+        self._changes.append(kind)
 
-    def _log_step(self, what: str, **more: Any) -> None:
+    def _log_step(self, kind: str, **more: Any) -> None:
         step = self._plan.step
-        self._log(what, gesture=step.gesture, repetition=step.repetition, **more)
+        self._log(kind, gesture=step.gesture, repetition=step.repetition, **more)
 
     def _show_message(self, text: str) -> None:
         self._message = text

@@ -288,5 +288,5 @@ class FrameReceiver:
             known = [gap.reason for gap in getattr(self._device, "gaps", ())]
             return known[-1] if known and known[-1] else "the toy was away and came back"
         if odd:
-            return "the toy's clock began anew" if step_ms < 0 else "the toy's clock jumped"
+            return "the toy's clock restarted" if step_ms < 0 else "the toy's clock jumped"
         return "nothing came"

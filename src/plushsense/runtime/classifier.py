@@ -29,7 +29,7 @@ class GestureEvent:
     """A change of an event. Each gesture of the person is one event with a beginning and an end.
 
     Attributes:
-        what: ``begun``, ``named`` (its gesture became certain) or ``ended``.
+        kind: ``begun``, ``named`` (its gesture became certain) or ``ended``.
         number: number of the event in the stream, from 1.
         affect: ``positive``, ``neutral``, ``negative`` or ``none``.
         gesture: the label, or None while only the affect is certain.
@@ -38,7 +38,7 @@ class GestureEvent:
         t_s: time of the report.
     """
 
-    what: Literal["begun", "named", "ended"]
+    kind: Literal["begun", "named", "ended"]
     number: int
     affect: str
     gesture: str | None
@@ -48,7 +48,9 @@ class GestureEvent:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        return asdict(self) | {"since_s": round(self.since_s, _DECIMALS), "t_s": round(self.t_s, _DECIMALS)}
+        rounded = {"since_s": round(self.since_s, _DECIMALS), "t_s": round(self.t_s, _DECIMALS)}
+        values = asdict(self) | rounded
+        return {"what": values.pop("kind"), **values}
 
 
 State = Literal["warming", "tracking", "no signal", "sensor fault"]

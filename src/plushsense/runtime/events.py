@@ -129,8 +129,8 @@ class EventMachine:
     smoothed highest logit in steps of 2^-20; None before the first step.
     """
 
-    def __init__(self, plan: EventSettings, smoothing: int, gestures: GestureSet) -> None:
-        self.plan, self.smoothing = plan, smoothing
+    def __init__(self, settings: EventSettings, smoothing: int, gestures: GestureSet) -> None:
+        self.settings, self.smoothing = settings, smoothing
         self._affects = [AFFECT_CODES[a] for a in gestures.affects]
         self._idle = [g.idle for g in gestures.gestures]
         self.reset()
@@ -169,13 +169,13 @@ class EventMachine:
         """
         updates: list[Update] = []
         if self.open and (self.affect == affect or self.source == GATE):
-            self._wait, self._away = self.plan.wait, 0
+            self._wait, self._away = self.settings.wait, 0
             return updates
         if self.open:
             updates.append(self._end(now, now))
         self._wait = 0
         updates.append(self._begin(affect, gesture, GATE, now, now))
-        self._wait = self.plan.wait
+        self._wait = self.settings.wait
         return updates
 
     def step(self, logits: Ints, now: int, suspect: bool = False) -> tuple[Answer, list[Update]]:
@@ -223,17 +223,17 @@ class EventMachine:
         if self._away == 0:
             self._away_since = now
         self._away += 1
-        if self._away >= self.plan.end and self._lasted >= self.plan.hold:
+        if self._away >= self.settings.end and self._lasted >= self.settings.hold:
             return [self._end(self._away_since, now)]
         return []
 
     def _kind(self, shares: list[int], best: int, known: int) -> int:
-        plan = self.plan
-        if known < plan.known:
+        settings = self.settings
+        if known < settings.known:
             return UNKNOWN
         if self._idle[best]:
             return IDLE
-        members = [k for k, share in enumerate(shares) if share >= plan.sure]
+        members = [k for k, share in enumerate(shares) if share >= settings.sure]
         if len(members) == 1:
             return SURE
         affects = {self._affects[k] for k in members}
@@ -253,11 +253,11 @@ class EventMachine:
         """Return the candidate of a step: gesture (or `NO_GESTURE`) and affect; (`NO_GESTURE`, 0) for none."""
         if answer.kind in (UNKNOWN, IDLE):
             return NO_GESTURE, 0
-        if answer.share >= self.plan.enter:
+        if answer.share >= self.settings.enter:
             return answer.best, self._affects[answer.best]
         totals = self._affect_shares(shares)
         most = max(range(1, 4), key=lambda a: (totals[a], -a))
-        return NO_GESTURE, most if totals[most] >= self.plan.enter_affect else 0
+        return NO_GESTURE, most if totals[most] >= self.settings.enter_affect else 0
 
     def _count(self, gesture: int, affect: int, now: int) -> None:
         """Count successive steps with the same candidate."""
@@ -275,17 +275,17 @@ class EventMachine:
         if self._resting > 0:
             self._resting -= 1
             return []
-        if (gesture != NO_GESTURE or affect) and self._candidate_steps >= self.plan.least:
+        if (gesture != NO_GESTURE or affect) and self._candidate_steps >= self.settings.least:
             return [self._begin(affect, self._named(gesture), CNN, self._candidate_since, now)]
         return []
 
     def _named(self, gesture: int) -> int:
-        return gesture if gesture != NO_GESTURE and self._gesture_steps >= self.plan.least else NO_GESTURE
+        return gesture if gesture != NO_GESTURE and self._gesture_steps >= self.settings.least else NO_GESTURE
 
     def _open_step(
         self, shares: list[int], best: int, gesture: int, affect: int, now: int, suspect: bool
     ) -> list[Update]:
-        plan = self.plan
+        settings = self.settings
         self._lasted += 1
         locked = self._wait > 0
         if locked:
@@ -300,14 +300,14 @@ class EventMachine:
         if another and self.gesture == NO_GESTURE and affect == self.affect:
             another = False  # the event has no gesture yet and may get this one
         row = self._gesture_steps if gesture != NO_GESTURE and affect == self.affect else self._candidate_steps
-        if another and row >= plan.switch and self._lasted >= plan.hold:
+        if another and row >= settings.switch and self._lasted >= settings.hold:
             ended = self._end(now, now)
             return [ended, self._begin(affect, self._named(gesture), CNN, now, now)]
         share = shares[self.gesture] if self.gesture != NO_GESTURE else self._affect_shares(shares)[self.affect]
-        stays = share >= (plan.leave if self.gesture != NO_GESTURE else plan.leave_affect)
+        stays = share >= (settings.leave if self.gesture != NO_GESTURE else settings.leave_affect)
         if self.gesture == NO_GESTURE and self.affect == 0:
             stays = False  # begun by the gate without affect: no share to compare
-        if self._idle[best] and shares[best] >= plan.enter:
+        if self._idle[best] and shares[best] >= settings.enter:
             stays = False
         if stays:
             self._away = 0
@@ -323,5 +323,5 @@ class EventMachine:
 
     def _end(self, since: int, now: int) -> Update:
         update = Update(ENDED, self.number, self.affect, self.gesture, self.source, since, now)
-        self._close(self.plan.rest)
+        self._close(self.settings.rest)
         return update

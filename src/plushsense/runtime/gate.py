@@ -108,24 +108,24 @@ def _all_within(part: Signal | Rule | Term, **ranges: tuple[int, int]) -> None:
         _within(name, getattr(part, name), low, high)
 
 
-def _within(what: str, value: int, low: int, high: int) -> None:
+def _within(name: str, value: int, low: int, high: int) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise BundleError(f"The gate's plan has {what} {value!r}; accepted are {low} to {high}.")
+        raise BundleError(f"The gate's settings have {name} {value!r}; accepted are {low} to {high}.")
 
 
 class Gate:
     """The gate of one stream; ``sizes`` and ``deviations`` are those of each signal at the last sample not skipped."""
 
-    def __init__(self, plan: GateSettings) -> None:
-        self.plan = plan
-        self._longest = max((s.lag for s in plan.signals if s.kind == JERK), default=1)
+    def __init__(self, settings: GateSettings) -> None:
+        self.settings = settings
+        self._longest = max((s.lag for s in settings.signals if s.kind == JERK), default=1)
         self._signals = []
-        for at, s in enumerate(plan.signals):
+        for at, s in enumerate(settings.signals):
             several, lag = s.inputs if len(s.inputs) > 1 else (), s.lag if s.kind == JERK else 0
             self._signals.append((at, s.inputs[0], several, lag, s.shift, s.baseline, s.noise, s.floor))
         self._rules = [
             (at, [(t.signal, t.threshold, t.sign, t.times) for t in rule.terms], rule.within + 1)
-            for at, rule in enumerate(plan.rules)
+            for at, rule in enumerate(settings.rules)
         ]
         self.reset()
 
@@ -135,13 +135,13 @@ class Gate:
         self._forget()
 
     def _forget(self) -> None:
-        n = len(self.plan.signals)
+        n = len(self.settings.signals)
         self._past: list[list[int]] = []  # earlier samples, newest last, as many as the longest lag
         self._baseline = [0] * n
         self._noise = [0] * n
         self.deviations, self.sizes = [0] * n, [0] * n
-        self._rows = [[0] * len(rule.terms) for rule in self.plan.rules]
-        self._holds = [[0] * len(rule.terms) for rule in self.plan.rules]
+        self._rows = [[0] * len(rule.terms) for rule in self.settings.rules]
+        self._holds = [[0] * len(rule.terms) for rule in self.settings.rules]
 
     def push(self, inputs: Sequence[int], suspect: bool = False) -> int:
         """Add the inputs (I,) of one sample; return the index of the rule that fires, or -1."""
@@ -166,7 +166,7 @@ class Gate:
         fired = self._judge()
         if deaf or fired < 0:
             return -1
-        self._deaf = self.plan.rules[fired].deaf
+        self._deaf = self.settings.rules[fired].deaf
         return fired
 
     def _follow(self, now: list[int]) -> None:

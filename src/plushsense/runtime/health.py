@@ -7,8 +7,8 @@ This module is the specification that ``deploy/c/plushsense.c`` implements. It c
 - The toy is *still* while all channels repeat the frame before. Working sensors are noisy; ones that hang are not.
 - A frame is *suspect* if a channel is wrong, or the toy was still for ``still_ms`` / 2. No event begins at it.
 - A *fault* begins when for ``fault_ms`` every frame had a wrong channel (not always the same one), or the toy was still
-  for ``still_ms``. Frames are then ignored until none was suspect for ``recover_ms``; after that the stream begins
-  anew.
+  for ``still_ms``. Frames are then ignored until none was suspect for ``recover_ms``; after that a new stream
+  begins.
 - After a gap or a reset of the clock, all these times are counted from 0 (`Health.clear`), also during a fault.
 """
 
@@ -55,10 +55,10 @@ class HealthSettings:
 class Health:
     """Checks the sensor health of one stream of frames."""
 
-    def __init__(self, plan: HealthSettings, layout: Layout) -> None:
-        self.plan = plan
+    def __init__(self, settings: HealthSettings, layout: Layout) -> None:
+        self.settings = settings
         self._valid = [(int(a), int(b)) for a, b in zip(layout.valid_min_int, layout.valid_max_int, strict=True)]
-        usual = list(zip(plan.low, plan.high, strict=True)) or self._valid
+        usual = list(zip(settings.low, settings.high, strict=True)) or self._valid
         if len(usual) != len(self._valid):
             raise BundleError(
                 f"The health limits are of {len(usual)} channels, the layout has {len(self._valid)}: train again."
@@ -85,7 +85,7 @@ class Health:
 
         Returns ``"fault"`` if a fault begins with this frame, ``"recovered"`` if one ends, else ``""``.
         """
-        plan, last = self.plan, self._last
+        settings, last = self.settings, self._last
         wrong = False
         for i, (value, (low, high)) in enumerate(zip(values, self._inside, strict=True)):
             # For most values only the first comparison is evaluated.
@@ -98,24 +98,24 @@ class Health:
             self._wrong = None
         elif self._wrong is None:
             self._wrong = ms
-        wrong_too_long = self._wrong is not None and plan.fault_ms > 0 and ms - self._wrong >= plan.fault_ms
+        wrong_too_long = self._wrong is not None and settings.fault_ms > 0 and ms - self._wrong >= settings.fault_ms
         now = list(values)
-        still = last is not None and plan.still_ms > 0 and now == last
+        still = last is not None and settings.still_ms > 0 and now == last
         if not still:
             self._still = ms
         still_for = ms - (self._still if self._still is not None else ms)
         self._last = now
-        self.suspect = wrong or (still and 2 * still_for >= plan.still_ms)
+        self.suspect = wrong or (still and 2 * still_for >= settings.still_ms)
         if self.fault:
             if self.suspect:
                 self._good = None
             elif self._good is None:
                 self._good = ms
-            if self._good is None or ms - self._good < plan.recover_ms:
+            if self._good is None or ms - self._good < settings.recover_ms:
                 return ""
             self.fault, self._good = False, None
             return "recovered"
-        if wrong_too_long or (still and still_for >= plan.still_ms):
+        if wrong_too_long or (still and still_for >= settings.still_ms):
             self.faults += 1
             self.fault, self._good = True, None
             return "fault"

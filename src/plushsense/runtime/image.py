@@ -76,13 +76,13 @@ class IntegerModel:
                 f"The model does not fit together: {self.layout.n_inputs} inputs and {len(self.gestures)} gestures, "
                 f"{arch.title} needs {arch.channels} and {arch.classes}."
             )
-        for what, found in (
+        for name, found in (
             ("measured channels", len(self.layout.channels)),
             ("inputs", arch.channels),
             ("gestures", arch.classes),
         ):
             if found > 255:
-                raise BundleError(f"The model has {found} {what}: in the toy there may be at most 255.")
+                raise BundleError(f"The model has {found} {name}: in the toy there may be at most 255.")
         for n, layer in enumerate(arch.layers, 1):
             if layer.reach + 1 >= 1 << 16:
                 raise BundleError(
@@ -115,9 +115,9 @@ class IntegerModel:
                 f"{len(self.layout.channels)}: train again."
             )
         if any(i >= arch.channels for s in gate.signals for i in s.inputs):
-            raise BundleError(f"The gate reads an input that there is not: the model has {arch.channels}; train again.")
+            raise BundleError(f"The gate reads an unknown input: the model has {arch.channels}; train again.")
         if any(arch.classes <= r.gesture != NO_GESTURE for r in gate.rules):
-            raise BundleError(f"The gate says a gesture that there is not: there are {arch.classes}; train again.")
+            raise BundleError(f"The gate reports an unknown gesture: the model has {arch.classes}; train again.")
         for gesture in self.gestures.gestures:
             if "\0" in gesture.label or gesture.label.encode(errors="replace").decode() != gesture.label:
                 raise BundleError(f"The gesture {gesture.label!r} has a character that the toy cannot keep: rename it.")
@@ -158,18 +158,18 @@ class IntegerModel:
         for i, name in enumerate(layout.inputs):
             parts = derived.get(name) or (layout.index(name),)
             row = (int(getattr(scale, n)[i]) for n in ("offset", "bias", "multiplier", "before", "after"))
-            plan = bytes([name in derived, len(parts), *parts])
-            sections.append((f"input '{name}': where from; offset, bias, multiplier, shifts", plan))
+            source = bytes([name in derived, len(parts), *parts])
+            sections.append((f"input '{name}': where from; offset, bias, multiplier, shifts", source))
             sections.append(("", struct.pack("<iiHBB", *row)))
         for n, (layer, read, part) in enumerate(zip(arch.layers, arch.inputs, self.network.layers, strict=True), 1):
             shape = struct.pack("<HHHH", layer.kernel, layer.dilation, read, layer.filters)
-            what = f"kernel {layer.kernel}, dilation {layer.dilation}, reads {read} channels, {layer.filters} filters"
-            sections.append((f"layer {n}: {what}", shape))
+            sizes = f"kernel {layer.kernel}, dilation {layer.dilation}, reads {read} channels, {layer.filters} filters"
+            sections.append((f"layer {n}: {sizes}", shape))
             sections.append((f"layer {n}: bias, multiplier, shifts of each filter", _scales(part.bias, part.scale)))
             for first, group in enumerate(grouped_weights(part.weights)):
                 last = min(GROUP * first + GROUP, layer.filters)
-                what = f"layer {n}: weights of filters {GROUP * first + 1} to {last}, tap by tap"
-                sections.append((what, group.tobytes()))
+                title = f"layer {n}: weights of filters {GROUP * first + 1} to {last}, tap by tap"
+                sections.append((title, group.tobytes()))
         dense = self.network.dense
         sections.append(("dense layer: bias, multiplier, shifts of each class", _scales(dense.bias, dense.scale)))
         sections.append(
@@ -192,8 +192,8 @@ class IntegerModel:
 def _rules(rules: Rules) -> list[tuple[str, bytes]]:
     events, health, gate = rules.events, rules.health, rules.gate
     settings = asdict(events)
-    plan = b"".join(struct.pack("<h" if name == "known" else "<H", value) for name, value in settings.items())
-    sections = [(f"events: {', '.join(settings)}", plan)]
+    packed = b"".join(struct.pack("<h" if name == "known" else "<H", value) for name, value in settings.items())
+    sections = [(f"events: {', '.join(settings)}", packed)]
     times = struct.pack("<HHHBB", health.fault_ms, health.still_ms, health.recover_ms, bool(health.low), 0)
     sections.append(("health: fault, still, recover (ms), whether limits follow", times))
     if health.low:
@@ -204,8 +204,8 @@ def _rules(rules: Rules) -> list[tuple[str, bytes]]:
     sections.append(("gate: signals, rules", bytes([len(gate.signals), len(gate.rules)])))
     for n, s in enumerate(gate.signals, 1):
         row_head = bytes([s.kind, len(s.inputs), *s.inputs, s.lag, s.shift, s.baseline, s.noise])
-        what = f"gate: signal {n}, {'jerk' if s.kind == JERK else 'level'}; inputs, lag, shift, baseline, noise, floor"
-        sections.append((what, row_head + struct.pack("<I", s.floor)))
+        title = f"gate: signal {n}, {'jerk' if s.kind == JERK else 'level'}; inputs, lag, shift, baseline, noise, floor"
+        sections.append((title, row_head + struct.pack("<I", s.floor)))
     for n, r in enumerate(gate.rules, 1):
         row_head = struct.pack("<BBBBH", len(r.terms), r.affect, r.gesture, r.within, r.deaf)
         sections.append((f"gate: rule {n}: terms, affect, gesture, within, deaf", row_head))

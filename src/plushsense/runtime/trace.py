@@ -163,11 +163,11 @@ class _TracedLogits:
         return max(0, (samples - self.arch.span) // self.arch.step + 1)
 
 
-def gate_hits(part: Part, plan: GateSettings) -> list[tuple[int, int]]:
+def gate_hits(part: Part, settings: GateSettings) -> list[tuple[int, int]]:
     """Return the sample index and rule index of every firing of the gate in a part."""
-    if not plan.rules:
+    if not settings.rules:
         return []
-    gate = Gate(plan)
+    gate = Gate(settings)
     rows, suspects = part.inputs.tolist(), part.suspect.tolist()
     fired = [gate.push(row, suspect) for row, suspect in zip(rows, suspects, strict=True)]
     return [(at, rule) for at, rule in enumerate(fired) if rule >= 0]

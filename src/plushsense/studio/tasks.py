@@ -175,7 +175,7 @@ def run_simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
             repetitions=int(spec["repetitions"]),
             seed=int(spec.get("seed", 1)),
             dataset=spec["dest"],
-            progress=lambda what, at, total: reporter.progress(what=what, done=at, total=total),
+            progress=lambda step, at, total: reporter.progress(what=step, done=at, total=total),
         )
     return {"dataset": str(spec["dest"]), "recordings": done["recordings"], "people": done["people"]}
 

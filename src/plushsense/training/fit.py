@@ -235,9 +235,9 @@ def _tensors(windows: WindowSet, scaler: Scaler, arch: Arch, device: torch.devic
     return Windows(x, arch, device), torch.from_numpy(windows.y.astype(np.int64)).to(device)
 
 
-def _check(windows: WindowSet, arch: Arch, what: str, some: bool = True) -> None:
+def _check(windows: WindowSet, arch: Arch, purpose: str, some: bool = True) -> None:
     if some and not len(windows):
-        raise TrainingError(f"There are no windows to {what}: check the data set, the gestures and the split.")
+        raise TrainingError(f"There are no windows to {purpose}: check the data set, the gestures and the split.")
     _, channels, samples = windows.x.shape
     if channels != arch.channels or len(windows.labels) != arch.classes:
         raise TrainingError(

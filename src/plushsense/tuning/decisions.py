@@ -36,33 +36,20 @@ _STILL_MOST_MS = 10_000
 _INT32 = -(1 << 31), (1 << 31) - 1
 
 Bools = NDArray[np.bool_]
-IntsLimits = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class HealthFit:
-    """Fitted ``plan`` and the amount of data; ``widened`` names channels whose limits had to be moved outwards."""
+    """Fitted ``settings`` and the amount of data; ``widened`` names channels whose limits had to be moved outwards."""
 
-    plan: HealthSettings
+    settings: HealthSettings
     frames: int
     seconds: float
     widened: tuple[str, ...]
     still_ms: int
 
 
-def frames_of(dataset: Dataset, subjects: Iterable[str]) -> Iterator[Frames]:
-    """Yield the frames of the streams of some people, or of the recordings of those without a stream."""
-    people = set(subjects)
-    streams = [s for s in dataset.streams if s.subject in people]
-    with_stream = {s.subject for s in streams}
-    for stream in streams:
-        yield dataset.read_stream(stream.id)
-    for recording in dataset.used:
-        if recording.subject in people - with_stream:
-            yield dataset.read(recording)
-
-
-def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings | None = None) -> HealthFit:
+def fit_health(dataset: Dataset, subjects: Iterable[str], settings: HealthSettings | None = None) -> HealthFit:
     """Fit limits with which the sensors of ``subjects`` are never at fault.
 
     A channel's limits are the lowest and the highest valid value in the data, moved outwards by a tenth of the range
@@ -72,13 +59,13 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings |
     is twice the longest time in which all channels repeated, at least 500 ms; above 10 s the rule is disabled.
 
     Args:
-        plan: settings from which ``fault_ms`` and ``recover_ms`` are taken.
+        settings: those from which ``fault_ms`` and ``recover_ms`` are taken.
     """
-    plan = plan or HealthSettings()
+    settings = settings or HealthSettings()
     layout = dataset.layout
-    parts = [f for f in frames_of(dataset, subjects) if len(f)]
+    parts = [f for f in dataset.read_people(sorted(set(subjects))) if len(f)]
     if not parts:
-        return HealthFit(plan, 0, 0.0, (), 0)
+        return HealthFit(settings, 0, 0.0, (), 0)
     values = np.concatenate([f.values for f in parts])
     valid = np.stack([np.maximum(layout.valid_min_int, _INT32[0]), np.minimum(layout.valid_max_int, _INT32[1])])
     valid = valid.astype(np.int64)
@@ -94,7 +81,7 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings |
             high[c] = last + margin if last + margin < valid[1, c] else last - inside
     usual = low.copy(), high.copy()
     for frames in parts:
-        for rows, wrong in _long_wrong(frames, usual, valid, plan.fault_ms / _SAFETY, layout.gap_ms):
+        for rows, wrong in _long_wrong(frames, usual, valid, settings.fault_ms / _SAFETY, layout.gap_ms):
             low = np.minimum(low, np.where(wrong, rows, low).min(axis=0))
             high = np.maximum(high, np.where(wrong, rows, high).max(axis=0))
     moved = (low != usual[0]) | (high != usual[1])
@@ -102,7 +89,7 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], plan: HealthSettings |
     still = max(_longest(f.device_ms, _repeats(f.values, f.device_ms, layout.gap_ms)) for f in parts)
     still_ms = max(_STILL_MS, _SAFETY * still)
     fitted = replace(
-        plan,
+        settings,
         low=tuple(low.tolist()),
         high=tuple(high.tolist()),
         still_ms=still_ms if still_ms <= min(_STILL_MOST_MS, MOST_MS) else 0,
@@ -132,8 +119,8 @@ def _longest(ms: NDArray[np.int64], repeats: Bools) -> int:
 
 
 def _long_wrong(
-    frames: Frames, usual: tuple[IntsLimits, IntsLimits], valid: IntsLimits, longest_ms: float, gap_ms: int
-) -> Iterator[tuple[IntsLimits, NDArray[np.bool_]]]:
+    frames: Frames, usual: tuple[Ints, Ints], valid: Ints, longest_ms: float, gap_ms: int
+) -> Iterator[tuple[Ints, NDArray[np.bool_]]]:
     """Yield stretches of at least ``longest_ms`` in which some channel is wrong throughout.
 
     Yields:
@@ -223,11 +210,11 @@ def fit_decisions(
     everybody = sorted({*people, *training})
     health = fit_health(dataset, everybody, spec.health)
     if "health" not in keep:
-        spec = replace(spec, health=health.plan)
+        spec = replace(spec, health=health.settings)
     gate: dict[str, Any] | None = None
     if "gate" not in keep:
         fitted = fit_gate(dataset, bundle.gestures, everybody, false_alarms_per_hour=false_alarms_per_hour)
-        spec, gate = replace(spec, gate=fitted.plan), fitted.report
+        spec, gate = replace(spec, gate=fitted.settings), fitted.report
     streams = marked_streams(bundle, dataset, people, spec)
     idle = [k for k, gesture in enumerate(bundle.gestures.gestures) if gesture.idle]
     report: dict[str, Any] = {
@@ -436,10 +423,10 @@ def left_out_coverage(labelled: LabelledSteps, coverage: float) -> list[float]:
     for person in people:
         own_steps = labelled.take(labelled.person == person)
         threshold = sure_threshold(labelled.take(labelled.person != person), coverage)
-        out.append(covered(own_steps, threshold))
+        out.append(coverage_of(own_steps, threshold))
     return out
 
 
-def covered(labelled: LabelledSteps, threshold: float) -> float:
+def coverage_of(labelled: LabelledSteps, threshold: float) -> float:
     """Return the share of steps whose set contains the true class; people and recordings have equal weights."""
     return float((weights_of(labelled) * (labelled.of_truth >= threshold * ONE)).sum())

@@ -98,8 +98,6 @@ def _follow_block(block: NDArray[np.int32], signals: Sequence[Signal], deviation
     return block
 
 
-Ints32 = NDArray[np.int32]
-
 _TOGETHER = 6  # number of stretches processed at once with all candidates, which limits memory
 _MOST, _FLOORS = 24, 2  # number of candidates to keep, and of those among them that may differ only in the floor
 
@@ -136,9 +134,9 @@ class GateSpec:
 
 @dataclass(frozen=True)
 class GateFit:
-    """A fitted gate (``plan``), and a ``report`` with the data and results of the fit."""
+    """A fitted gate (``settings``), and a ``report`` with the data and results of the fit."""
 
-    plan: GateSettings
+    settings: GateSettings
     report: dict[str, Any] = field(default_factory=dict)
 
 
@@ -151,7 +149,8 @@ def fit_gate(
 ) -> GateFit:
     """Fit a gate on the streams of ``subjects``, and on their recordings that are in no stream.
 
-    If there is nothing energetic to detect or no rule is good enough, the plan has no rules; the report says why.
+    If there is nothing energetic to detect or no rule is good enough, the settings have no rules; the report has the
+    reason.
 
     Args:
         gestures: the classes of the model; they define which gestures are energetic, and their affect.
@@ -186,12 +185,11 @@ def fit_gate(
                     tuple(terms), AFFECT_CODES[affect], gesture, candidates.within, dataset.layout.samples(spec.deaf_s)
                 )
             )
-    plan = GateSettings(tuple(signals), tuple(rules))
+    settings = GateSettings(tuple(signals), tuple(rules))
     if not rules:
-        return GateFit(plan, {**figures, "reason": "no rule detects enough of them at so few false alarms"})
-    return GateFit(
-        plan, {**figures, "between_recordings_believed": believed, **measure_gate(plan, material, dataset.layout)}
-    )
+        return GateFit(settings, {**figures, "reason": "no rule detects enough of them at so few false alarms"})
+    measured = measure_gate(settings, material, dataset.layout)
+    return GateFit(settings, {**figures, "between_recordings_believed": believed, **measured})
 
 
 def _rules_of(candidates: _Candidates, labels: list[str], spec: GateSpec) -> tuple[list[FoundRule], bool]:
@@ -236,7 +234,7 @@ class _Candidates:
         self.candidates = [candidates[k] for k in promising]
         self._sizes = [self._lasting(sizes) for sizes in self._signed(self._xs, self.candidates)]
 
-    def _signed(self, xs: list[NDArray[np.int64]], candidates: list[tuple[Signal, int]]) -> list[Ints32]:
+    def _signed(self, xs: list[NDArray[np.int64]], candidates: list[tuple[Signal, int]]) -> list[NDArray[np.int32]]:
         sizes = signal_sizes(xs, [signal for signal, _ in candidates])
         for column, (_, sign) in enumerate(candidates):
             for of in sizes:
@@ -244,7 +242,7 @@ class _Candidates:
                 np.copyto(one, np.abs(one) if sign == 0 else np.maximum(one * sign, 0))
         return sizes
 
-    def _lasting(self, sizes: Ints32) -> Ints32:
+    def _lasting(self, sizes: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the largest threshold at which a term holds: minimum over ``times``, then maximum over ``within``."""
         lasting = sizes.copy()
         for back in range(1, self.times):
@@ -270,8 +268,8 @@ class _Candidates:
         levels = [k for k, s in enumerate(signals) if s.kind == LEVEL]
         pieces, trials = [], []
         for stretch in self.material.stretches:
-            for trial in np.unique(stretch.what[stretch.what >= 0]).tolist():
-                at = np.flatnonzero(stretch.what == trial)
+            for trial in np.unique(stretch.trial[stretch.trial >= 0]).tolist():
+                at = np.flatnonzero(stretch.trial == trial)
                 pieces.append(stretch.x[max(0, int(at[0]) - 300) : int(at[-1]) + 1])
                 trials.append(len(at))
         some = slice(None, None, max(1, len(pieces) // 100))
@@ -289,7 +287,7 @@ class _Candidates:
         for first in range(0, len(self._xs), _TOGETHER):
             some = self.material.stretches[first : first + _TOGETHER]
             for stretch, sizes in zip(some, self._signed([s.x for s in some], candidates), strict=True):
-                kind = np.where(stretch.what >= 0, stretch.what, np.where(stretch.what == LEFT_OUT, -2, -1))
+                kind = np.where(stretch.trial >= 0, stretch.trial, np.where(stretch.trial == LEFT_OUT, -2, -1))
                 edges = np.flatnonzero(np.append(True, (np.diff(kind) != 0) | (np.arange(1, len(kind)) % 50 == 0)))
                 tops, kinds = np.maximum.reduceat(sizes, edges, axis=0), kind[edges]
                 calm.append(tops[kinds == -1])
@@ -314,15 +312,15 @@ class _Candidates:
         calm, chunks, rough, trials, delays = [], [], [], [], []
         first_chunk = 0
         for stretch, sizes in zip(self.material.stretches, self._sizes, strict=True):
-            quiet = (stretch.what == CALM) | ((stretch.what == BETWEEN) & between)
+            quiet = (stretch.trial == CALM) | ((stretch.trial == BETWEEN) & between)
             calm.append(sizes[quiet])
             chunks.append(first_chunk + np.flatnonzero(quiet) // self.chunk)
             first_chunk += len(quiet) // self.chunk + 1
-            at = np.flatnonzero(stretch.what >= 0)
-            at = at[chosen[stretch.what[at]]]
+            at = np.flatnonzero(stretch.trial >= 0)
+            at = at[chosen[stretch.trial[at]]]
             rough.append(sizes[at])
-            trials.append(stretch.what[at])
-            delays.append(np.arange(len(at)) - np.searchsorted(stretch.what[at], stretch.what[at]))
+            trials.append(stretch.trial[at])
+            delays.append(np.arange(len(at)) - np.searchsorted(stretch.trial[at], stretch.trial[at]))
         together = np.concatenate(trials)
         order = np.argsort(together, kind="stable")
         heights = Heights.of(
@@ -366,7 +364,7 @@ def signals_of(layout: Layout, spec: GateSpec) -> list[Signal]:
     return [Signal(kind, group, lag, 0, slow, slower) for kind, group, lag in watched]
 
 
-def measure_gate(plan: GateSettings, material: Material, layout: Layout) -> dict[str, Any]:
+def measure_gate(settings: GateSettings, material: Material, layout: Layout) -> dict[str, Any]:
     """Run the `Gate` on the material of some people; return a report as plain values.
 
     It has recall by gesture, false alarms per hour in calm recordings and between recordings, and the median time from
@@ -377,24 +375,24 @@ def measure_gate(plan: GateSettings, material: Material, layout: Layout) -> dict
     calm_hit: set[int] = set()
     wrong_by: dict[str, int] = {}
     for stretch in material.stretches:
-        gate = Gate(plan)
-        begun = {int(t): int(np.argmax(stretch.what == t)) for t in np.unique(stretch.what) if t >= 0}
+        gate = Gate(settings)
+        begun = {int(t): int(np.argmax(stretch.trial == t)) for t in np.unique(stretch.trial) if t >= 0}
         for at, row in enumerate(stretch.x.tolist()):
             if gate.push(row) < 0:
                 continue
-            what = int(stretch.what[at])
-            if what >= 0:
-                first.setdefault(what, at - begun[what])
-            elif what != LEFT_OUT:
-                wrong[what] += 1
-                if what == CALM:
+            trial = int(stretch.trial[at])
+            if trial >= 0:
+                first.setdefault(trial, at - begun[trial])
+            elif trial != LEFT_OUT:
+                wrong[trial] += 1
+                if trial == CALM:
                     calm_hit.add(int(stretch.calm[at]))
                     label = material.calm[int(stretch.calm[at])][1]
                     wrong_by[label] = wrong_by.get(label, 0) + 1
     by_gesture: dict[str, list[int]] = {}
     for trial, (_, label) in enumerate(material.trials):
         by_gesture.setdefault(label, []).append(trial)
-    hours = {what: material.hours(what) for what in (CALM, BETWEEN)}
+    hours = {kind: material.hours(kind) for kind in (CALM, BETWEEN)}
     total = sum(hours.values())
     delays = [at / layout.rate_hz for at in first.values()]
     return {

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.gestures import GestureSet
 from plushsense.dataset.store import Dataset, RecordingInfo
+from plushsense.runtime.fixed import Ints
 from plushsense.windows.clock import Segment, resample
 from plushsense.windows.cut import recordings_in_time
 from plushsense.windows.features import network_inputs
@@ -25,13 +26,13 @@ GUARD_S = 0.7
 class Stretch:
     """Evenly spaced samples of one person without a break.
 
-    ``x`` (T, I): raw inputs. ``what`` (T,): index of the energetic recording in `Material.trials`, or `BETWEEN`, `CALM`
-    or `LEFT_OUT`. ``calm`` (T,): index of the recording of a calm sample in `Material.calm`, else -1.
+    ``x`` (T, I): raw inputs. ``trial`` (T,): index of the energetic recording in `Material.trials`, or `BETWEEN`,
+    `CALM` or `LEFT_OUT`. ``calm`` (T,): index of the recording of a calm sample in `Material.calm`, else -1.
     """
 
     subject: str
     x: NDArray[np.int64]
-    what: NDArray[np.int64]
+    trial: NDArray[np.int64]
     calm: NDArray[np.int64]
 
 
@@ -44,9 +45,9 @@ class Material:
     calm: tuple[tuple[str, str], ...]
     rate_hz: float
 
-    def hours(self, what: int) -> float:
+    def hours(self, kind: int) -> float:
         """Return the total duration of samples of one kind, in hours."""
-        return sum(int((s.what == what).sum()) for s in self.stretches) / self.rate_hz / 3600
+        return sum(int((s.trial == kind).sum()) for s in self.stretches) / self.rate_hz / 3600
 
 
 def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str]) -> Material:
@@ -81,16 +82,16 @@ def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str
             numbers.append(calm_index if k == CALM else -1)
             calm_index += k == CALM
         for segment in segments:
-            what = np.full(len(segment), rest)
+            trial = np.full(len(segment), rest)
             which = np.full(len(segment), -1)
             spans = [np.searchsorted(segment.row_of, edge, side="left").tolist() for edge in [k[:2] for k in kinds]]
             for (first, last), (_, _, k) in zip(spans, kinds, strict=True):
                 if k >= 0 and last > first:
-                    around = what[max(0, first - guard) : last + guard]
+                    around = trial[max(0, first - guard) : last + guard]
                     around[around == BETWEEN] = LEFT_OUT
             for (first, last), (_, _, k), number in zip(spans, kinds, numbers, strict=True):
-                what[first:last], which[first:last] = k, number
-            stretches.append(Stretch(subject, network_inputs(segment.data, layout), what, which))
+                trial[first:last], which[first:last] = k, number
+            stretches.append(Stretch(subject, network_inputs(segment.data, layout), trial, which))
 
     for stream in dataset.streams:
         if stream.subject in people:
@@ -108,7 +109,6 @@ def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str
 
 
 Ints32 = NDArray[np.int32]
-Whole = NDArray[np.int64]
 
 _PERCENTILES = (0.5, 1, 2, 4, 7, 10, 15, 20, 30, 40, 50, 65, 80)
 """Percentiles of the trials' highest values to try as thresholds of the first term."""
@@ -134,16 +134,16 @@ class Heights:
     """
 
     calm: Ints32
-    chunks: Whole
+    chunks: Ints
     rough: Ints32
-    trials: Whole
-    delays: Whole
-    least: Whole
+    trials: Ints
+    delays: Ints
+    least: Ints
     apart: NDArray[np.bool_]
 
     @classmethod
     def of(
-        cls, calm: Ints32, chunks: Whole, rough: Ints32, trials: Whole, delays: Whole, apart: NDArray[np.bool_]
+        cls, calm: Ints32, chunks: Ints, rough: Ints32, trials: Ints, delays: Ints, apart: NDArray[np.bool_]
     ) -> Heights:
         """Set ``least``, and drop the calm samples at which no rule can fire."""
         least = np.ones(rough.shape[1], dtype=np.int64)
@@ -260,7 +260,7 @@ def _settle(heights: Heights, first: int, threshold: int, second: int, alarms: i
     return FoundRule(rule.terms, len(trials), float(np.mean(near)), rule.alarms_in(heights), delay)
 
 
-def _highest(heights: Ints32, groups: Whole) -> tuple[Ints32, Whole]:
+def _highest(heights: Ints32, groups: Ints) -> tuple[Ints32, Ints]:
     """Return the highest value in each column of each group of consecutive rows."""
     if not len(groups):
         return heights[:0], groups[:0]
@@ -268,7 +268,7 @@ def _highest(heights: Ints32, groups: Whole) -> tuple[Ints32, Whole]:
     return np.maximum.reduceat(heights, starts, axis=0), groups[starts]
 
 
-def _needed(calm: Ints32, chunks: Whole, alarms: int) -> Whole:
+def _needed(calm: Ints32, chunks: Ints, alarms: int) -> Ints:
     """Return the lowest threshold of each column that at most ``alarms`` chunks reach; at least 1."""
     tops, _ = _highest(calm, chunks)
     if len(tops) <= alarms:

@@ -44,7 +44,7 @@ _NEGATIVE, _POSITIVE = AFFECT_CODES["negative"], AFFECT_CODES["positive"]
 
 
 @dataclass(frozen=True)
-class BaselineSettings:
+class RuleBaselineSettings:
     """Settings of the rule baseline, in raw counts and seconds; a count of 0 switches its rule off.
 
     Attributes:
@@ -99,15 +99,15 @@ class _Swings:
 class _Rules:
     """Applies the rules to evenly sampled inputs."""
 
-    def __init__(self, layout: Layout, plan: BaselineSettings) -> None:
+    def __init__(self, layout: Layout, settings: RuleBaselineSettings) -> None:
         touch, shock = sensors_of(layout)
-        self.plan = plan
+        self.settings = settings
         self._touch, self._shock = touch, shock
         self._lag = layout.samples(_LAG_S)
-        self._window = layout.samples(plan.window_s)
+        self._window = layout.samples(settings.window_s)
         self._timeout = {
-            _NEGATIVE: layout.samples(plan.negative_s),
-            _POSITIVE: layout.samples(plan.positive_s),
+            _NEGATIVE: layout.samples(settings.negative_s),
+            _POSITIVE: layout.samples(settings.positive_s),
         }
         self._weight = -math.expm1(-1.0 / (_SMOOTHING_S * layout.rate_hz))
         self.number = 0
@@ -116,14 +116,14 @@ class _Rules:
     def forget(self) -> None:
         """Discard earlier samples, after a break of the stream."""
         self._past: list[list[int]] = []
-        self._swings = [_Swings(self.plan.swing, self._weight) for _ in self._touch]
+        self._swings = [_Swings(self.settings.swing, self._weight) for _ in self._touch]
         self._sample = 0
         self.affect = 0
         self._met_at = 0
 
     def _affect_of(self, row: list[int]) -> int:
         """Return the affect whose rule is met at this sample, 0 for none."""
-        plan, past = self.plan, self._past
+        settings, past = self.settings, self._past
         self._sample += 1
         past.append(row)
         affect = 0
@@ -131,14 +131,14 @@ class _Rules:
             before = past.pop(0)
             shock = sum(abs(row[i] - before[i]) for i in self._shock)
             pressed = abs(sum(row[i] - before[i] for i in self._touch))
-            if 0 < plan.shock <= shock or 0 < plan.touch_shock <= pressed:
+            if 0 < settings.shock <= shock or 0 < settings.touch_shock <= pressed:
                 affect = _NEGATIVE
-        if plan.swing > 0:
+        if settings.swing > 0:
             most = max(
                 (s.push(row[i], self._sample, self._window) for s, i in zip(self._swings, self._touch, strict=True)),
                 default=0,
             )
-            if most >= plan.swings and not affect:
+            if most >= settings.swings and not affect:
                 affect = _POSITIVE
         return affect
 
@@ -174,17 +174,17 @@ def sensors_of(layout: Layout) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return tuple(touch), tuple(i for i, n in enumerate(layout.inputs) if kinds[n] == "acceleration")
 
 
-class BaselineReader:
+class RuleBaselineReader:
     """Applies the rule baseline to the frames of one toy; its events have an affect, no gesture and source ``gate``."""
 
-    def __init__(self, layout: Layout, plan: BaselineSettings) -> None:
-        self.layout, self.plan = layout, plan
+    def __init__(self, layout: Layout, settings: RuleBaselineSettings) -> None:
+        self.layout, self.settings = layout, settings
         self.reset()
 
     def reset(self) -> None:
         """Begin a new stream at time 0."""
         self._frames = FrameReader(self.layout, HealthSettings(fault_ms=0))
-        self._rules = _Rules(self.layout, self.plan)
+        self._rules = _Rules(self.layout, self.settings)
 
     def push(self, frame: Frame) -> list[GestureEvent]:
         """Process one frame; return changes of events, with times in seconds since the stream's first frame."""
@@ -208,9 +208,9 @@ def _to_event(update: Update) -> GestureEvent:
     return GestureEvent(KINDS[update.kind], update.number, affect, None, source, update.since / 1e6, update.now / 1e6)
 
 
-def baseline_events(frames: Frames, layout: Layout, plan: BaselineSettings) -> list[GestureEvent]:
+def rule_baseline_events(frames: Frames, layout: Layout, settings: RuleBaselineSettings) -> list[GestureEvent]:
     """Return the events of a whole stream; an event that is open at the end of the stream ends there."""
-    reader = BaselineReader(layout, plan)
+    reader = RuleBaselineReader(layout, settings)
     host = frames.host_ms if frames.host_ms is not None else frames.device_ms
     events: list[GestureEvent] = []
     for at, ms, values in zip(host.tolist(), frames.device_ms.tolist(), frames.values.tolist(), strict=True):
@@ -222,7 +222,7 @@ def fit_rule_baseline(
     dataset: Dataset,
     gestures: GestureSet,
     subjects: Collection[str],
-) -> tuple[BaselineSettings, dict[str, Any]]:
+) -> tuple[RuleBaselineSettings, dict[str, Any]]:
     """Tune the thresholds on the recordings of ``subjects``.
 
     ``shock`` and ``touch_shock`` are the lowest counts at which at most 2 % of the positive and neutral recordings
@@ -237,7 +237,7 @@ def fit_rule_baseline(
     """
     if not gestures.has_affect:
         raise ConfigError(
-            f"The gesture set '{gestures.name}' has no affects, which the old rules need: "
+            f"The gesture set '{gestures.name}' has no affects, which the rule baseline needs: "
             "give each gesture an affect in its TOML file, or use another set."
         )
     layout, people = dataset.layout, set(subjects)
@@ -260,31 +260,31 @@ def fit_rule_baseline(
     if not peaks:
         raise ConfigError("None of these people recorded a gesture that is not negative: include other people.")
     thresholds = np.ceil(np.quantile(np.array(peaks), 1.0 - _MAX_WRONG / 2, axis=0)).astype(int) + 1
-    plan = BaselineSettings(int(thresholds[0]) if shock else 0, int(thresholds[1]) if touch else 0)
+    settings = RuleBaselineSettings(int(thresholds[0]) if shock else 0, int(thresholds[1]) if touch else 0)
     shares: dict[str, float] = {}
     for swing in _SWINGS if touch else ():
-        candidate = BaselineSettings(plan.shock, plan.touch_shock, swing)
+        candidate = RuleBaselineSettings(settings.shock, settings.touch_shock, swing)
         shares = {
             a: float(np.mean([_is_answered_positive(x, layout, candidate) for x in xs]))
             for a, xs in unanswered.items()
             if xs
         }
         if max(shares.values(), default=0.0) <= _MAX_WRONG:
-            plan = candidate
+            settings = candidate
             break
     report = {
         "people": len(people),
         "recordings": len(used),
         "wrong_allowed": _MAX_WRONG,
         "answered_as_a_caress": {a: round(s, 4) for a, s in shares.items()},
-        **plan.to_dict(),
+        **settings.to_dict(),
     }
-    return plan, report
+    return settings, report
 
 
 _SWINGS = tuple(round(100 * 1.25**n) for n in range(18))
 
 
-def _is_answered_positive(x: NDArray[np.int64], layout: Layout, plan: BaselineSettings) -> bool:
-    rules = _Rules(layout, plan)
+def _is_answered_positive(x: NDArray[np.int64], layout: Layout, settings: RuleBaselineSettings) -> bool:
+    rules = _Rules(layout, settings)
     return any(u.affect == _POSITIVE for at, row in enumerate(x.tolist()) for u in rules.push(row, at))

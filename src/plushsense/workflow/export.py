@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from plushsense.core.gestures import NOBODY
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.convert import CONVERTERS, check_format, convert
-from plushsense.deploy.emit import ExportResult, emit, without_people
+from plushsense.deploy.emit import ExportResult, emit
 from plushsense.deploy.package import package
 from plushsense.deploy.quantize import calibrated, integer_model, refuse_undeployable
 from plushsense.models.bundle import Bundle
@@ -127,7 +127,7 @@ def export(
             windows = windows[:: -(-len(windows) // _TRIED)]
         given = calibrated_on(given, dataset, warn if windows is None else silent)
     model = integer_model(given)
-    given = replace(given, provenance=without_people(given.provenance))
+    given = given.without_people()
 
     def converted(folder: Path, facts: dict[str, Any]) -> None:
         for name in dict.fromkeys(also):

@@ -22,20 +22,20 @@ from plushsense.models.bundle import Bundle
 from plushsense.workflow.config import RunConfig
 
 
-def check_folder(out: Path, what: str) -> None:
+def check_folder(out: Path, name: str) -> None:
     """Raise ConfigError if results cannot be written to the folder ``out``; ``what`` names them, as in "A sweep"."""
     there = next(p for p in (out.absolute(), *out.absolute().parents) if p.exists())
     if not there.is_dir():
-        raise ConfigError(f"{what} cannot be written to '{out}': '{there}' is a file; give a folder.")
+        raise ConfigError(f"{name} cannot be written to '{out}': '{there}' is a file; give a folder.")
     if not os.access(there, os.W_OK | os.X_OK):
-        raise ConfigError(f"{what} cannot be written to '{out}': you may not write in '{there}'.")
+        raise ConfigError(f"{name} cannot be written to '{out}': you may not write in '{there}'.")
 
 
-def check_results(out: Path, what: str, summary: str, identity: str | None = None, *, replace: bool = False) -> None:
+def check_results(out: Path, name: str, summary: str, identity: str | None = None, *, replace: bool = False) -> None:
     """Check before the work that its results can be written to the folder ``out``.
 
     Args:
-        what: name of the results in messages, as in "A sweep".
+        name: that of the results in messages, as in "A sweep".
         summary: name of their JSON file, which contains the ``id`` of the results.
         identity: the id of the new results; if None, any earlier results are an error.
         replace: accept a folder with other results.
@@ -43,7 +43,7 @@ def check_results(out: Path, what: str, summary: str, identity: str | None = Non
     Raises:
         ConfigError: if ``out`` cannot be a folder, or has results of other settings or other data.
     """
-    check_folder(out, what)
+    check_folder(out, name)
     path = out / summary
     if replace or not path.exists():
         return
@@ -56,7 +56,7 @@ def check_results(out: Path, what: str, summary: str, identity: str | None = Non
         details = ", ".join(str(held[key]) for key in ("name", "split") if key in held) if held else "unknown"
         other = "already" if identity is None else f"of other settings or other data ({details})"
         raise ConfigError(
-            f"'{out}' holds {what[0].lower()}{what[1:]} {other}: choose another --out, or --force to replace it; "
+            f"'{out}' holds {name[0].lower()}{name[1:]} {other}: choose another --out, or --force to replace it; "
             "finished trainings are kept in the cache of the data set."
         )
 

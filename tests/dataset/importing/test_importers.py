@@ -117,7 +117,7 @@ def test_defects_come_as_warnings(tmp_path: Path) -> None:
         "never stopped",
         "backwards",
         "gap",
-        "its name says 61",
+        "its name states 61",
         "33.3 Hz",
         "same content",
     ):

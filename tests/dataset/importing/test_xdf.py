@@ -16,7 +16,7 @@ from plushsense.core.gestures import load_gestures
 from plushsense.core.layouts import load_layout
 from plushsense.dataset.importing import xdf
 from plushsense.dataset.importing.importers import import_recordings
-from plushsense.dataset.importing.xdf import Marker, complete_chunks, match_columns, person_and_session, segments_of
+from plushsense.dataset.importing.xdf import Marker, complete_chunks, person_and_session, segments_of
 
 ACCEL = load_layout("accel-3")
 PLUSH = load_layout("plush-15")
@@ -179,13 +179,6 @@ def test_who_is_in_the_name_or_the_folder() -> None:
     assert person_and_session(Path("sub-P1_ses-S2_task-a_run-3_eeg.xdf"), "x") == ("P1", "S2-3")
     assert person_and_session(Path("monday.xdf"), "ana") == ("ana", "monday")
     assert person_and_session(Path("monday.xdf"), None) == (None, "monday")
-
-
-def test_columns_by_label_by_header_and_by_place() -> None:
-    assert match_columns(ACCEL, ["Arduino Timestamp (ms)", "Z", "Y", "X"], 4) == ([3, 2, 1], 0)
-    assert match_columns(PLUSH, ["?"] * 15, 15) == (list(range(13)), 13)
-    assert match_columns(ACCEL, ["x", "y", "q"], 3) == "its labels do not name z exactly once"
-    assert match_columns(ACCEL, [], 4)[0:2] != ([0, 1, 2], None), "device_ms comes first on this layout's wire"
 
 
 def test_the_reader_stays_quiet(

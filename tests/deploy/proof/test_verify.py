@@ -23,7 +23,7 @@ from plushsense.deploy.golden import EVENT, FAULT, HEALTH, column
 from plushsense.deploy.package import ARDUINO, package
 from plushsense.deploy.profile import profile
 from plushsense.deploy.proof.mutants import RULES, mutants_of, source_mutants
-from plushsense.deploy.proof.scenarios import all_outcomes, covered, scenarios_of
+from plushsense.deploy.proof.scenarios import all_outcomes, outcomes_of, scenarios_of
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.proof.verify import Setting, VerificationReport, verify
 from plushsense.deploy.quantize import integer_model
@@ -126,7 +126,7 @@ def test_a_last_layer_that_was_adapted_and_rules_that_were_fitted(c_compiler: st
 def test_scenarios_cover_all_outcomes(small: Path) -> None:
     export = Export(small)
     found = scenarios_of(export.model, export.bundle.scaler)
-    assert set().union(*map(covered, found)) == all_outcomes()
+    assert set().union(*map(outcomes_of, found)) == all_outcomes()
 
 
 MAIN = {
@@ -198,7 +198,7 @@ def test_scenarios_have_sensors_that_are_stuck_where_they_may_be(small: Path) ->
     for scenario in scenarios_of(export.model, wide):
         limits = scenario.model.rules.health
         assert (np.array(limits.low) > low).any() and (np.array(limits.high) < high).any()
-        assert "fault" in covered(scenario)
+        assert "fault" in outcomes_of(scenario)
 
 
 @pytest.mark.parametrize(

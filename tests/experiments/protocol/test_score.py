@@ -203,7 +203,7 @@ def test_each_system_hears_the_very_events_of_the_live_reader(model, sitting):
         replayed = [e for e in outputs[key].events if e.t_s <= reader.time_s]
         assert len(live) > 4
         assert replayed[: len(live)] == live
-        assert all(e.what == "ended" for e in replayed[len(live) :]), "only that the stream is over"
+        assert all(e.kind == "ended" for e in replayed[len(live) :]), "only that the stream is over"
     assert any(e.source == "gate" for e in outputs["hybrid"].events)
     assert not any(e.source == "gate" for e in outputs["cnn"].events)
 

@@ -29,7 +29,7 @@ SMALL: dict[str, Any] = {
     "workers": 1,
 }
 QUICK: dict[str, Any] = {"rungs": (1, 2, 4), "share": 0.6}
-COMMAND = [sys.executable, "-m", "plushsense.cli.main", "search"]
+COMMAND = [sys.executable, "-m", "plushsense", "search"]
 
 
 def frame(folder: Path, name: str) -> polars.DataFrame:

@@ -103,7 +103,7 @@ def test_quick_replays_give_the_events_of_the_live_loop(seed: int) -> None:
     inputs = np.cumsum(draw.integers(-9, 10, (1600, 3)), axis=0) + 400 * (draw.random((1600, 1)) > 0.99)
     trace = made_trace(parts, inputs, tuple(draw.integers(0, 900, 40).tolist()))
     counts = {name: int(draw.integers(low, 9)) for low, name in ((1, "least"), (1, "switch"), (1, "end"), (0, "hold"))}
-    plan = EventSettings(
+    settings = EventSettings(
         enter=int(draw.integers(0, ONE)),
         leave=int(draw.integers(0, ONE)),
         enter_affect=int(draw.integers(ONE // 3, ONE + 2)),
@@ -116,7 +116,7 @@ def test_quick_replays_give_the_events_of_the_live_loop(seed: int) -> None:
     listener = TraceReplayer(trace)
     for gate in (GateSettings(), GATE):
         for smoothing_s in (0.0, 0.2):
-            rules, weight = Rules(plan, gate), smoothing_weight(smoothing_s, STEP_S)
+            rules, weight = Rules(settings, gate), smoothing_weight(smoothing_s, STEP_S)
             assert listener.replay(rules, weight) == list(replay(trace, rules, weight).updates)
 
 
@@ -220,8 +220,8 @@ def test_a_gate_is_heard_at_once_and_named_by_the_network() -> None:
     inputs[::2] = 1
     inputs[32:60] = 4000 * np.tile([[1], [1], [-1], [-1]], (7, 1))
     trace = made_trace([steps((REST, 20), (HIT, 10), (REST, 30))], inputs)
-    plan = replace(GATE, rules=(replace(GATE.rules[0], gesture=255),))
-    spec = replace(argmax_spec(), enter=0.9, end_s=0.2, wait_s=2.0, gate=plan)
+    settings = replace(GATE, rules=(replace(GATE.rules[0], gesture=255),))
+    spec = replace(argmax_spec(), enter=0.9, end_s=0.2, wait_s=2.0, gate=settings)
     found = score(StreamTrace(truth, TraceReplayer(trace), 1.0, 1.0, 0.0), spec)
     affect, gesture = found.total("affect"), found.total()
     assert found.gate_events == 1 and affect.hits == gesture.hits == 1

@@ -34,7 +34,7 @@ SMALL: dict[str, Any] = {
     "workers": 1,
 }
 SCORES = ["accuracy", "macro_f1", "validation_accuracy", "validation_macro_f1", "train_loss", "acr"]
-COMMAND = [sys.executable, "-m", "plushsense.cli.main", "sweep"]
+COMMAND = [sys.executable, "-m", "plushsense", "sweep"]
 
 
 def frame(folder: Path, name: str) -> polars.DataFrame:

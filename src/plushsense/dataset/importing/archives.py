@@ -121,7 +121,7 @@ def unpack_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, target: Path,
             while chunk := member.read(_CHUNK):
                 written += len(chunk)
                 if written > min(info.file_size, limit):
-                    raise zipfile.BadZipFile("it holds more than its size says")
+                    raise zipfile.BadZipFile("it holds more data than its stated size")
                 out.write(chunk)
     except BaseException as cause:
         target.unlink(missing_ok=True)

@@ -59,9 +59,9 @@ def refuse_merged(files: Sequence[SourceFile], there: Iterable[str] = ()) -> Non
     not_met = set(codes)
     folders = [("people", f.subject, folder_name(f.subject), "") for f in files]
     folders += [("sessions", f.session, session_folder(f.session), folder_name(f.subject)) for f in files if f.session]
-    for what, code, folder, within in folders:
+    for kind, code, folder, within in folders:
         if len(folder.encode("utf-8")) > _LONGEST:
-            raise DatasetError(f"The code '{code[:40]}…' is too long: codes of {what} have {_LONGEST} bytes at most.")
+            raise DatasetError(f"The code '{code[:40]}…' is too long: codes of {kind} have {_LONGEST} bytes at most.")
         key = (folder.casefold(), within)
         first = codes.setdefault(key, code)
         if key in not_met and first == folder:
@@ -70,7 +70,7 @@ def refuse_merged(files: Sequence[SourceFile], there: Iterable[str] = ()) -> Non
             codes[key] = code
         elif first != code:
             raise DatasetError(
-                f"The {what} '{first}' and '{code}' would share the folder '{folder}': rename one of them."
+                f"The {kind} '{first}' and '{code}' would share the folder '{folder}': rename one of them."
             )
 
 
@@ -297,7 +297,7 @@ def merge_people(
         for key in keys:
             new, old = getattr(info, key), getattr(known, key)
             if new and old and new != old:
-                notes.append(f"the {key.replace('_', ' ')} of '{code}' is kept as '{old}'; a session says '{new}'")
+                notes.append(f"the {key.replace('_', ' ')} of '{code}' is kept as '{old}'; a session states '{new}'")
         values = {key: getattr(known, key) or getattr(info, key) for key in keys}
         people[code] = replace(known, **values, more=info.more | known.more)
     strangers = [code for code in file if folder_name(code) not in subjects]

@@ -351,10 +351,10 @@ def _temporary_folders(dest: Path) -> Iterator[Callable[[str], Path]]:
     """Yield a function that creates folders beside ``dest`` for unpacked or converted files; remove them at the end."""
     with ExitStack() as stack:
 
-        def create(what: str) -> Path:
+        def create(purpose: str) -> Path:
             real = dest.resolve()
             place = next(p for p in real.parents if p.is_dir())
-            folder = Path(tempfile.mkdtemp(prefix=f".{real.name}-{what}-", dir=place))
+            folder = Path(tempfile.mkdtemp(prefix=f".{real.name}-{purpose}-", dir=place))
             stack.callback(shutil.rmtree, folder, ignore_errors=True)
             return folder
 

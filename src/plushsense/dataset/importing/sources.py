@@ -83,12 +83,12 @@ def source_files(source: Path) -> list[Path]:
         folders.sort()
         here = Path(place)
         if HEAD in names:
-            what = (
+            problem = (
                 f"'{source}' is a data set already: open it as it is, with  plushsense info {source}"
                 if here == source
                 else f"'{here}' in '{source}' is a data set already: give the recorder's folder, or move it away first"
             )
-            raise DatasetError(f"{what}; importing it again would mix its copies of files with its people.")
+            raise DatasetError(f"{problem}; importing it again would mix its copies of files with its people.")
         files += [here / name for name in sorted(names + [f for f in folders if (here / f).is_symlink()])]
     return files
 
@@ -321,9 +321,9 @@ def common_layout(sessions: Sessions, given: Layout | None, of: str) -> Layout |
         if agreed is None:
             agreed, of = own, f"session '{place.name}'"
         elif own.to_dict() != agreed.to_dict():
-            what = f"'{own.name}'" if own.name != agreed.name else f"another '{own.name}'"
+            other = f"'{own.name}'" if own.name != agreed.name else f"another '{own.name}'"
             raise DatasetError(
-                f"Session '{place.name}' was recorded with the layout {what}, but {of} is '{agreed.name}': "
+                f"Session '{place.name}' was recorded with the layout {other}, but {of} is '{agreed.name}': "
                 "a data set has one layout, so import them apart."
             )
     if agreed is not None and agreed.is_labelled and any(isinstance(h, SessionHead) for h in sessions.values()):

@@ -347,13 +347,13 @@ def read_table(
     good = usable_rows(raw, device, host)
     if note:
         yield f"{display_name}: {note}"
-    for count, what in (
+    for count, reason in (
         (columns.malformed, "of another width than the header"),
         (int(np.sum(~good)), "without a number in every column"),
         (int(np.sum(good & ~known)), "without a subject"),
     ):
         if count:
-            yield f"{display_name}: {count} row{'s' if count > 1 else ''} {what} left out"
+            yield f"{display_name}: {count} row{'s' if count > 1 else ''} {reason} left out"
     good &= known
     if not good.any():
         raise FileFormatError(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import FileFormatError, need
 from plushsense.core.gestures import GestureSet
-from plushsense.core.layouts import DEVICE_MS, Layout
+from plushsense.core.layouts import Layout, StreamColumns
 from plushsense.core.recorder_csv import LONGEST_LABEL, Frames
 from plushsense.dataset.importing.sources import LEFT_OUT, SourceFile
 from plushsense.dataset.importing.tables import (
@@ -196,38 +196,16 @@ def _labels(stream: dict[str, Any]) -> list[str]:
     return [str((c.get("label") or [""])[0] or "") if isinstance(c, dict) else "" for c in listed]
 
 
-def match_columns(layout: Layout, labels: list[str], width: int) -> tuple[list[int], int | None] | str:
-    """Return the positions of the layout's channels and of the device clock in a sample, or why there is no match.
-
-    Channels are matched by label (or header text of the layout's CSV) in any order; if no label matches, by position,
-    provided that the stream has as many channels as the layout or its wire format.
-    """
-    texts = dict(zip((h.casefold() for h in layout.csv.header), layout.csv.columns, strict=True))
-    texts |= {n.casefold(): n for n in (*layout.names, DEVICE_MS)}
-    keys = [texts.get(label.strip().casefold(), "") for label in labels] if len(labels) == width else []
-    if set(keys) & set(layout.names):
-        missing = [n for n in layout.names if keys.count(n) != 1]
-        if missing:
-            return f"its labels do not name {', '.join(missing)} exactly once"
-        return [keys.index(n) for n in layout.names], keys.index(DEVICE_MS) if DEVICE_MS in keys else None
-    if width == layout.n_channels:
-        return list(range(width)), None
-    if width == len(layout.wire):
-        clock = layout.wire.index(DEVICE_MS) if DEVICE_MS in layout.wire else None
-        return [layout.wire.index(n) for n in layout.names], clock
-    return f"it has {width} channels, and layout '{layout.name}' needs {layout.n_channels}"
-
-
 def _frames(
-    stream: dict[str, Any], layout: Layout, channels: list[int], clock: int | None
+    stream: dict[str, Any], layout: Layout, columns: StreamColumns
 ) -> tuple[Frames, NDArray[np.float64], list[str]]:
     """Return the frames of a stream, the time of each frame in seconds, and warnings."""
     series = np.asarray(stream["time_series"], dtype=np.float64).reshape(len(stream["time_stamps"]), -1)
     times = np.asarray(stream["time_stamps"], dtype=np.float64)
-    device = times * 1000.0 if clock is None else series[:, clock]
-    good = usable_rows(series[:, channels], times * 1000.0, device)
+    device = times * 1000.0 if columns.clock is None else series[:, columns.clock]
+    good = usable_rows(series[:, columns.channels], times * 1000.0, device)
     notes = [] if good.all() else [f"{int(np.sum(~good))} samples without a number in every channel left out"]
-    values, warning = whole_steps(series[good][:, channels], layout)
+    values, warning = whole_steps(series[good][:, columns.channels], layout)
     host_ms = np.round(times[good] * 1000.0).astype(np.int64)
     device_ms = np.round(device[good]).astype(np.int64)
     return Frames(values, device_ms, host_ms), times[good], notes + ([warning] if warning else [])
@@ -261,7 +239,7 @@ def read_xdf(
         name = _text(stream, "name")
         if _text(stream, "channel_format") == "string":
             continue
-        columns = match_columns(layout, _labels(stream), np.shape(stream["time_series"])[-1])
+        columns = layout.match_columns(_labels(stream), np.shape(stream["time_series"])[-1])
         if isinstance(columns, str):
             others.append((name, columns))
         elif not len(stream["time_stamps"]):
@@ -269,9 +247,9 @@ def read_xdf(
         elif stream_name and name != stream_name:
             others.append((name, f"the stream '{stream_name}' was selected"))
         else:
-            fitting.append((stream, name, *columns))
+            fitting.append((stream, name, columns))
     if len(fitting) != 1:
-        names = ", ".join(f"'{name}'" for _, name, *_ in fitting)
+        names = ", ".join(f"'{name}'" for _, name, _ in fitting)
         why = (
             f"{len(fitting)} streams fit layout '{layout.name}' ({names}): name one with --column stream=NAME"
             if fitting
@@ -279,8 +257,8 @@ def read_xdf(
             + ("; ".join(f"'{n}': {r}" for n, r in others[:5]) or f"there are {len(texts)} of texts and no other")
         )
         raise FileFormatError(why)
-    stream, name, channels, clock = fitting[0]
-    frames, times, notes = _frames(stream, layout, channels, clock)
+    stream, name, columns = fitting[0]
+    frames, times, notes = _frames(stream, layout, columns)
     markers = [
         Marker(float(time), str(sample[0]))
         for text in texts

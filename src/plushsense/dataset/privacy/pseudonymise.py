@@ -196,9 +196,9 @@ class _Pseudonymisation:
             self._compare(made)
             write_index_files(made)
             old = [p for p in self.people if p not in KEPT]
-            for file, what in find_traces(work, old, self.names, times):
+            for file, name in find_traces(work, old, self.names, times):
                 raise DatasetError(
-                    f"'{file}' would still hold '{what}': nothing was written. If that is a gesture or another word of "
+                    f"'{file}' would still hold '{name}': nothing was written. If that is a gesture or another word of "
                     "the data, rename the person or the gesture first; if the file does not belong there, remove it."
                 )
             files = len(list_files(work))

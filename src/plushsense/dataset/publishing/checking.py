@@ -293,10 +293,10 @@ def _metadata(p: PackageView) -> None:
         }
         for key, path in statements.items():
             if (value := _get(documents[file], *path)) != expected[key]:
-                p.report(file, f"its {key} is {value!r}; {DATA}/dataset.toml and the others say {expected[key]!r}")
+                p.report(file, f"its {key} is {value!r}; {DATA}/dataset.toml and the others state {expected[key]!r}")
     if (p.root / SIMULATION_MARK).is_file() != d.simulated:
         state = "is missing, though" if d.simulated else "exists, but"
-        p.report(SIMULATION_MARK, f"{state} {DATA}/dataset.toml says simulated = {str(d.simulated).lower()}")
+        p.report(SIMULATION_MARK, f"{state} {DATA}/dataset.toml states simulated = {str(d.simulated).lower()}")
     p.looked_at = f"{sum(map(len, _STATEMENTS.values())) + 1} statements"
 
 
@@ -309,10 +309,10 @@ def _times(p: PackageView) -> None:
     for file in sorted({r.file for r in dataset.recordings} | {s.file for s in dataset.streams}):
         frames = read_stream(dataset.path / file, dataset.layout).frames
         if frames.host_ms is not None and int(frames.host_ms.max()) >= LATEST_MS:
-            p.report(f"{DATA}/{file}", f"the computer's clock says {int(frames.host_ms.max())}, which is not shifted")
+            p.report(f"{DATA}/{file}", f"the computer's clock shows {int(frames.host_ms.max())}, which is not shifted")
         latest = int(frames.device_ms.max())
         if latest >= WALL_CLOCK_MS and latest >= LATEST_MS:
-            p.report(f"{DATA}/{file}", f"the toy's clock says {latest}, which is not shifted")
+            p.report(f"{DATA}/{file}", f"the toy's clock shows {latest}, which is not shifted")
     p.looked_at = "every name and row"
 
 
@@ -330,7 +330,7 @@ def _croissant(p: PackageView) -> None:
         if not p.is_local(place):
             p.report(CROISSANT_FILE, f"'{entry.get('@id')}' lies at {place!r}, which is no path of the package")
         elif "sha256" in entry and p.sums.get(place) != entry["sha256"]:
-            p.report(str(place), "has another SHA-256 than croissant.json says")
+            p.report(str(place), "has another SHA-256 than croissant.json states")
     if p.problems:
         return
     mlcroissant = need("mlcroissant", EXTRA)
@@ -398,9 +398,9 @@ def _crate(p: PackageView) -> None:
         elif path not in p.sums:
             p.report(path, "is listed in the crate but is not there")
         elif entity.get("sha256") != p.sums[path]:
-            p.report(path, "has another SHA-256 than the crate says")
+            p.report(path, "has another SHA-256 than the crate states")
         elif str(entity.get("contentSize")) != str((p.root / path).stat().st_size):
-            p.report(path, "has another size than the crate says")
+            p.report(path, "has another size than the crate states")
     for path in sorted(p.sums.keys() - listed - {CRATE_FILE, CHECKSUMS}):
         if not p.is_own(path):
             p.report(path, "is not listed in the crate")
@@ -418,7 +418,7 @@ def _datacite(p: PackageView) -> None:
     if not p.problems:
         xml = (p.root / DATACITE_XML_FILE).read_text(encoding="utf-8")
         if xml != schema.tostring(document):
-            p.report(DATACITE_XML_FILE, f"does not say what {DATACITE_FILE} says")
+            p.report(DATACITE_XML_FILE, f"differs from {DATACITE_FILE}")
     p.looked_at = "schema 4.5"
 
 

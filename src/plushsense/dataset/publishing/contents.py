@@ -365,8 +365,8 @@ class ContentsWriter:
                 self.notes.append(f"No longer found in their stream: {_count(lost, 'recording')}.")
 
 
-def _count(n: int, what: str) -> str:
-    return f"{n} {what}{'' if n == 1 else 's'}"
+def _count(n: int, noun: str) -> str:
+    return f"{n} {noun}{'' if n == 1 else 's'}"
 
 
 def _folder_of(file: str) -> str:

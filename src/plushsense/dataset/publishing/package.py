@@ -182,7 +182,7 @@ def publish(
     """
     began = time.perf_counter()
     require_validators()
-    progress = progress or (lambda what, done, total: None)
+    progress = progress or (lambda step, done, total: None)
     target = check_output_folder(dataset, out)
     options = options or PublishOptions()
     day = published or date.today().isoformat()

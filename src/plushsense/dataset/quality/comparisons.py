@@ -359,13 +359,13 @@ def missing(w: DatasetSummary) -> Iterator[Issue]:
         yield Issue(f"{subject} has {', '.join(listed[:6])}{more}", about=subject)
 
 
-def _balance(counts: dict[str, int], what: str, factor: float) -> Iterator[Issue]:
+def _balance(counts: dict[str, int], noun: str, factor: float) -> Iterator[Issue]:
     """Report the names whose count is more than ``factor`` times above or below the median."""
     usual = float(np.median(list(counts.values()))) if counts else 0.0
     odd = [f"{name} {n}" for name, n in counts.items() if usual and (n * factor < usual or n > factor * usual)]
     if odd:
         yield Issue(
-            f"{len(odd)} of {len(counts)} {what} have far fewer or more recordings than the median ({usual:.0f}): "
+            f"{len(odd)} of {len(counts)} {noun} have far fewer or more recordings than the median ({usual:.0f}): "
             + ", ".join(odd[:8])
             + (", …" if len(odd) > 8 else "")
         )

@@ -26,8 +26,8 @@ def _ranges(rows: NDArray[np.int64], s: Examination, length: int = 1) -> tuple[t
     return tuple((int(r) + s.first_row, int(r) + s.first_row + length) for r in rows[:_SHOWN])
 
 
-def _plural(n: int, what: str) -> str:
-    return f"{n} {what}{'s' if n > 1 else ''}"
+def _plural(n: int, noun: str) -> str:
+    return f"{n} {noun}{'s' if n > 1 else ''}"
 
 
 def _weight(share: float, limits: CheckLimits) -> Severity | None:
@@ -38,7 +38,7 @@ def _weight(share: float, limits: CheckLimits) -> Severity | None:
 def rows_against_name(s: Examination) -> Iterator[Issue]:
     rows = len(s.frames) if s.rows_in_file is None else s.rows_in_file
     if s.rows_named is not None and s.rows_named != rows:
-        yield Issue(f"holds {rows} rows, its name says {s.rows_named}")
+        yield Issue(f"holds {rows} rows, but its name states {s.rows_named}")
 
 
 def never_stopped(s: Examination) -> Iterator[Issue]:
@@ -191,7 +191,7 @@ def rate(s: Examination) -> Iterator[Issue]:
         return
     measured = 1000.0 * len(even) / float(even.sum())
     if abs(measured - nominal) > s.limits.rate * nominal:
-        yield Issue(f"measured {measured:.1f} Hz where the layout says {nominal:g} Hz")
+        yield Issue(f"measured {measured:.1f} Hz, but the rate of the layout is {nominal:g} Hz")
 
 
 def resumed(s: Examination) -> Iterator[Issue]:

@@ -164,7 +164,7 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     return g.to_bytes(bundle)
 
 
-def answers(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32] | None:
+def run_model(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32] | None:
     """Run a model in onnxruntime on raw windows and return the logits (N, K); None if it is not installed."""
     if importlib.util.find_spec("onnxruntime") is None:
         return None
@@ -195,7 +195,7 @@ def to_integer_onnx(job: ConversionJob) -> Conversion:
 
 
 def _conversion(job: ConversionJob, model: bytes, expected: NDArray[np.float64] | None, note: str) -> Conversion:
-    logits = answers(model, job.windows)
+    logits = run_model(model, job.windows)
     if logits is None:
         return Conversion(model, None, (_UNCHECKED, note))
     return compared(job, model, logits, "ONNX", expected, note)

@@ -255,7 +255,7 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     return g.model(bundle, raw, z, g.softmax(z, arch.classes))
 
 
-def answers(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32]:
+def run_model(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32]:
     """Run a model in the LiteRT interpreter on raw windows (N, C, T) and return the logits (N, K)."""
     litert = need("ai_edge_litert.interpreter", "tflite")
     run = litert.Interpreter(model_content=model, num_threads=1).get_signature_runner("serving_default")
@@ -267,11 +267,11 @@ def to_tflite(job: ConversionJob) -> Conversion:
     """Convert the float network."""
     model = float_model(job.bundle)
     note = f"Input '{RAW}' (1, span, {job.bundle.arch.channels})."
-    return compared(job, model, answers(model, job.windows), "LiteRT", note=note)
+    return compared(job, model, run_model(model, job.windows), "LiteRT", note=note)
 
 
 def to_integer_tflite(job: ConversionJob) -> Conversion:
     """Convert the network with int8 convolutions; its outputs are close to those of the C, not bit-identical."""
     network = integer_network(job.bundle)
     model = integer_model(job.bundle, network)
-    return compared(job, model, answers(model, job.windows), "LiteRT", network.forward(job.windows) / 256)
+    return compared(job, model, run_model(model, job.windows), "LiteRT", network.forward(job.windows) / 256)

@@ -68,11 +68,11 @@ def mutants_of(image: bytes, source: str) -> list[Mutant]:
     at = _ImageOffsets(image)
     mutants = []
     for n, layer in enumerate([*at.layers, at.dense], 1):
-        what = f"layer {n}" if layer is not at.dense else "the dense layer"
+        part = f"layer {n}" if layer is not at.dense else "the dense layer"
         weight, filter_ = layer.largest_weight()
-        mutants.append(_in_image("weight", f"one weight of {what} by one", image, weight, "B"))
+        mutants.append(_in_image("weight", f"one weight of {part} by one", image, weight, "B"))
         shift = layer.scales_at + _SCALE_BYTES * filter_ + 7
-        mutants.append(_in_image("shift", f"one shift of {what} by one", image, shift, "B", _MOST_SHIFT))
+        mutants.append(_in_image("shift", f"one shift of {part} by one", image, shift, "B", _MOST_SHIFT))
     mutants.append(_in_image("shift", "one input's shift by one", image, at.inputs[0] + 11, "B", _MOST_SHIFT))
     mutants.append(
         _in_image("constant", "the longest gap by one", image, HEAD_BYTES + _GAP_AT, "I", by=at.units_per_ms)

@@ -24,14 +24,13 @@ from plushsense.deploy.golden import (
     HEALTH,
     TRACKING,
     FrameGenerator,
-    Ints,
     answers_of,
     column,
     measured,
 )
 from plushsense.runtime.decisions import Rules
 from plushsense.runtime.events import ANSWERS, BEGUN, ENDED, GATE, KINDS, NO_GESTURE, ONE, SOURCES, EventSettings
-from plushsense.runtime.fixed import LOGIT_LIMIT, PROBABILITY_BITS, LogitScale, split_ratio
+from plushsense.runtime.fixed import LOGIT_LIMIT, PROBABILITY_BITS, Ints, LogitScale, split_ratio
 from plushsense.runtime.gate import JERK, LEVEL, Gate, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel
@@ -105,14 +104,14 @@ def scenarios_of(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[S
 
 def all_outcomes() -> set[str]:
     """Return the outcomes that scenarios should cover; with few classes some cannot occur."""
-    events = {f"{what} by {source}" for what in KINDS.values() for source in SOURCES}
+    events = {f"{kind} by {source}" for kind in KINDS.values() for source in SOURCES}
     ends = {"lost in silence", "lost in a gap", "lost in a fault", "replaced", "replaced by the gate"}
     health = {"fault", "recovery", "suspect only"}
     return events | ends | health | set(ANSWERS) | {"gate while warming", "unnamed", "without affect", "resting"}
 
 
-def covered(scenario: Scenario) -> set[str]:
-    """Return the subset of `all_outcomes` that a scenario covers."""
+def outcomes_of(scenario: Scenario) -> set[str]:
+    """Return the subset of `all_outcomes` that a scenario reaches."""
     rows, outcomes = scenario.rows.astype(np.int64), set()
     answered = column(rows, "answer")[column(rows, "state") == TRACKING]
     outcomes |= {ANSWERS[k] for k in set(answered.tolist())}
@@ -127,9 +126,9 @@ def covered(scenario: Scenario) -> set[str]:
             fault, suspect = row[state] == 2, row[5]
             outcomes.add("fault" if fault else "suspect only" if suspect else "recovery")
         else:
-            what, source = row[at["what"]], row[at["source"]]
-            outcomes.add(f"{KINDS[what]} by {SOURCES[source]}")
-            if what == BEGUN:
+            kind, source = row[at["what"]], row[at["source"]]
+            outcomes.add(f"{KINDS[kind]} by {SOURCES[source]}")
+            if kind == BEGUN:
                 if source == GATE and not warm:
                     outcomes.add("gate while warming")
                 if row[at["gesture"]] == NO_GESTURE:
@@ -138,7 +137,7 @@ def covered(scenario: Scenario) -> set[str]:
                     outcomes.add("without affect")
                 if ended is not None and row[at["ms"]] - ended > 0:
                     outcomes.add("resting")
-            if what == ENDED:
+            if kind == ENDED:
                 ended = row[at["ms"]]
                 if (
                     after is not None

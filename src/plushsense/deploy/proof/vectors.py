@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from plushsense.deploy.golden import COLUMNS, HEAD, TRACKING, answers_of, column
 from plushsense.deploy.proof.scenarios import scenarios_of
 from plushsense.deploy.quantize import integer_model
 from plushsense.models.bundle import Bundle
+from plushsense.runtime.fixed import Ints
 from plushsense.runtime.image import IntegerModel, memory_bytes
 from plushsense.windows.clock import resample
 
@@ -27,7 +28,7 @@ _LOW, _HIGH = -(1 << 31), (1 << 31) - 1
 _PAUSE_MS = 1000
 
 
-def frames_of(dataset: Dataset, layout: Layout, *, subjects: Sequence[str] = (), rows: int) -> Ints:
+def recorded_frames(dataset: Dataset, layout: Layout, *, subjects: Sequence[str] = (), rows: int) -> Ints:
     """Read frames (n, 1 + C) from a data set: at least ``rows``, or all if it has fewer.
 
     The session streams of each person are read, or the recordings if there are none. Each begins after a pause that
@@ -50,7 +51,7 @@ def frames_of(dataset: Dataset, layout: Layout, *, subjects: Sequence[str] = (),
                 f"The data set '{dataset.head.name}' has nobody '{subject}': accepted are {', '.join(known)}."
                 f"{nearest(subject, known)}"
             )
-    pieces = list(_pieces(dataset, subjects or known))
+    pieces = list(dataset.read_people(subjects or known))
     lengths = np.array([len(p) for p in pieces], dtype=np.int64)
     takes = np.zeros_like(lengths)
     # Shortest first, so that longer pieces supply the rows that shorter ones lack.
@@ -68,16 +69,6 @@ def frames_of(dataset: Dataset, layout: Layout, *, subjects: Sequence[str] = (),
     return np.concatenate(parts) if parts else np.empty((0, 1 + len(layout.channels)), dtype=np.int64)
 
 
-def _pieces(dataset: Dataset, subjects: Sequence[str]) -> Iterator[Frames]:
-    for subject in subjects:
-        streams = [s for s in dataset.streams if s.subject == subject]
-        if streams:
-            yield from (dataset.read_stream(s.id) for s in streams)
-        else:
-            yield from (dataset.read(r) for r in dataset.used if r.subject == subject)
-
-
-Ints = NDArray[np.int64]
 # Fits into the memory of every emulated chip, next to the program.
 MOST_FRAME_BYTES = 8 << 20
 
@@ -248,11 +239,11 @@ class Export:
         return [self.answered("made up", p) for p in in_parts(np.concatenate(pieces))] if pieces else []
 
     def recorded(self, dataset: Dataset, subjects: Sequence[str], samples: int) -> list[Vectors]:
-        """Read recordings for at least ``samples`` samples, or all; raise ConfigError like `frames_of`."""
+        """Read recordings for at least ``samples`` samples, or all; raise ConfigError like `recorded_frames`."""
         layout = self.model.layout
         rows = samples
         while True:
-            frames = frames_of(dataset, layout, subjects=subjects, rows=rows)
+            frames = recorded_frames(dataset, layout, subjects=subjects, rows=rows)
             n_samples = self.samples_of(frames)
             if n_samples >= samples or len(frames) < rows:
                 break
@@ -310,8 +301,8 @@ def _row(row: NDArray[Any]) -> str:
 def _column(field: int, kind: int, labels: Sequence[str]) -> str:
     if field < HEAD:
         return f"'{COLUMNS.get(kind, COLUMNS[0])[field]}'"
-    what, at = divmod(field - HEAD, len(labels))
-    return f"{('the logit', 'the smoothed probability')[what]} of '{labels[at]}'"
+    kind, at = divmod(field - HEAD, len(labels))
+    return f"{('the logit', 'the smoothed probability')[kind]} of '{labels[at]}'"
 
 
 def in_parts(frames: Ints) -> list[Ints]:

@@ -164,7 +164,7 @@ class VerificationReport:
             "first": self.first,
             "streams": [dict(vars(c)) for c in self.counts],
             "runs": [r.to_dict() for r in self.runs],
-            "not_run": [{"what": what, "why": why} for what, why in self.not_run],
+            "not_run": [{"what": part, "why": reason} for part, reason in self.not_run],
             "faults": [m.to_dict() for m in self.mutants],
         }
 

@@ -171,9 +171,9 @@ def classical(
         ConfigError: for an unknown name or kind of features; the message suggests the nearest one.
         MissingExtraError: without scikit-learn.
     """
-    for what, given, known in (("baseline", names, tuple(BASELINES)), ("features", features, tuple(FEATURES))):
+    for kind, given, known in (("baseline", names, tuple(BASELINES)), ("features", features, tuple(FEATURES))):
         for one in given:
-            check_known(one, known, what, ConfigError)
+            check_known(one, known, kind, ConfigError)
     library = f"scikit-learn {need('sklearn', extra=EXTRA).__version__}"
     key = {"version": BASELINES_VERSION, "library": library, "samples": samples, "seed": seed}
     return [

@@ -20,7 +20,7 @@ from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.quantize import integer_model
 from plushsense.experiments.protocol import score as scoring
-from plushsense.experiments.protocol.score import NOTES, Heuristic
+from plushsense.experiments.protocol.score import NOTES, RuleBaseline
 from plushsense.experiments.protocol.sittings import (
     FIRST_STRANGER,
     Progress,
@@ -33,35 +33,35 @@ from plushsense.models.arch import slashed
 from plushsense.models.bundle import Bundle, known_people
 from plushsense.recording.simulate import simulate
 from plushsense.runtime.decisions import DecideSpec
-from plushsense.tuning.rule_baseline import baseline_events, fit_rule_baseline
+from plushsense.tuning.rule_baseline import fit_rule_baseline, rule_baseline_events
 from plushsense.workflow.reporting import check_folder
 
 OTHERS = 4
 _ELSEWHERE = 1_000_003  # added to the seed, for people of another population
 
 
-def virtual_rules(seed: int, layout: Layout, gestures: GestureSet, people: int = OTHERS) -> tuple[Heuristic, str]:
+def virtual_rules(seed: int, layout: Layout, gestures: GestureSet, people: int = OTHERS) -> tuple[RuleBaseline, str]:
     """Tune the rule baseline on virtual people of another population; return it and a sentence on the tuning."""
     with tempfile.TemporaryDirectory() as work:
         raw, folder = Path(work) / "raw", Path(work) / "ds"
         simulate(raw, people, (seed + _ELSEWHERE) % 2**31, 2, at_rest=0, layout=layout)
         dataset = import_recordings(raw, folder, layout=layout, gestures=gestures, name="others").dataset
-        plan, _ = fit_rule_baseline(dataset, gestures, dataset.subjects)
-    heuristic = partial(baseline_events, layout=layout, plan=plan)
-    return heuristic, f"Tuned on {people} other virtual people, of another population."
+        settings, _ = fit_rule_baseline(dataset, gestures, dataset.subjects)
+    baseline = partial(rule_baseline_events, layout=layout, settings=settings)
+    return baseline, f"Tuned on {people} other virtual people, of another population."
 
 
-def recorded_rules(dataset: Dataset, gestures: GestureSet, scored: Collection[str]) -> tuple[Heuristic | None, str]:
+def recorded_rules(dataset: Dataset, gestures: GestureSet, scored: Collection[str]) -> tuple[RuleBaseline | None, str]:
     """Tune the rule baseline on the people not in ``scored``; return it, or None, and a sentence on the tuning."""
     others: Sequence[str] = [code for code in dataset.subjects if code not in scored]
     if not others:
-        return None, "Everybody is scored here, so nobody is left to tune the old rules on: they are left out."
+        return None, "Everybody is scored here, so nobody is left to tune the rule baseline on: it is left out."
     try:
-        plan, _ = fit_rule_baseline(dataset, gestures, others)
+        settings, _ = fit_rule_baseline(dataset, gestures, others)
     except ConfigError as cause:
-        return None, f"The old rules cannot be tuned: {cause}"
-    heuristic = partial(baseline_events, layout=dataset.layout, plan=plan)
-    return heuristic, f"Tuned on people who are not scored here: {len(others)}."
+        return None, f"The rule baseline cannot be tuned: {cause}"
+    baseline = partial(rule_baseline_events, layout=dataset.layout, settings=settings)
+    return baseline, f"Tuned on people who are not scored here: {len(others)}."
 
 
 RESULT, TRIALS, TABLE, PAGE = "protocol.json", "trials.csv", "table.csv", "protocol.html"
@@ -91,7 +91,7 @@ def protocol(
         dataset, session: recorded sessions instead of virtual people: a data set, or a recorder's output folder.
         subjects: people of that data set or session; default: all on whom the network was neither trained nor chosen.
         engine: ``float``, or ``int8`` for the integer arithmetic of the deployed network.
-        rules: also score the old heuristic, after tuning it on people who are not scored.
+        rules: also score the rule baseline, after tuning it on people who are not scored.
         out: folder for the JSON, two CSV and the HTML page; None: nothing is written.
 
     Raises:
@@ -121,8 +121,8 @@ def protocol(
     else:
         numbers = virtual_numbers(people, first, bundle.provenance)
         sittings = virtual_sittings(numbers, seed, repetitions, bundle.layout)
-        heuristic, tuned = virtual_rules(seed, bundle.layout, bundle.gestures) if rules else (None, NOTES["no_rules"])
-        made = scoring.run(sittings, asked, heuristic, progress, len(numbers))
+        baseline, tuned = virtual_rules(seed, bundle.layout, bundle.gestures) if rules else (None, NOTES["no_rules"])
+        made = scoring.run(sittings, asked, baseline, progress, len(numbers))
         whom = f"{people} virtual, number {numbers[0]} to {numbers[-1]} of the population of seed {seed}"
         made |= {
             "heading": "The paper's real-time protocol, SIMULATED",
@@ -156,12 +156,12 @@ def _recorded(
         )
     people = recorded_people(dataset, subjects, bundle.provenance)
     sittings, left = recorded_sittings(dataset, people, bundle.gestures)
-    heuristic, tuned = recorded_rules(dataset, bundle.gestures, people) if rules else (None, NOTES["no_rules"])
-    made = scoring.run(sittings, asked, heuristic, progress, len(sittings))
+    baseline, tuned = recorded_rules(dataset, bundle.gestures, people) if rules else (None, NOTES["no_rules"])
+    made = scoring.run(sittings, asked, baseline, progress, len(sittings))
     virtual = dataset.head.simulated
-    what = "recorded sessions of a simulation" if virtual else "recorded sessions"
+    source = "recorded sessions of a simulation" if virtual else "recorded sessions"
     return made | {
-        "heading": f"The paper's real-time protocol on {what}: {dataset.head.name}",
+        "heading": f"The paper's real-time protocol on {source}: {dataset.head.name}",
         "simulated": virtual,
         "codes": people,
         "left": left,
@@ -216,7 +216,7 @@ def _with_notes(made: dict[str, Any], bundle: Bundle, engine: str) -> dict[str, 
         ["Event settings", "fitted" if settings.fitted else "defaults, not fitted"],
     ]
     if ruled:
-        about.append(["Old rules", tuned])
+        about.append(["Rule baseline", tuned])
     return made | {"said": notes, "about": about, "engine": engine}
 
 

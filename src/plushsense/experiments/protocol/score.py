@@ -76,7 +76,7 @@ QUICK_S = 0.2
 
 JUDGED = ("right", "family", "affect", "wrong", "unnamed")
 
-Heuristic = Callable[[Frames], Sequence[GestureEvent]]
+RuleBaseline = Callable[[Frames], Sequence[GestureEvent]]
 
 
 def group_of(gesture: Gesture) -> str:
@@ -94,11 +94,11 @@ class SystemOutput:
 
 
 def system_outputs(
-    frames: Frames, model: Bundle | IntegerModel, heuristic: Heuristic | None = None
+    frames: Frames, model: Bundle | IntegerModel, baseline: RuleBaseline | None = None
 ) -> dict[str, SystemOutput]:
     """Return the output of each system on a stream, by the keys of `SYSTEMS`.
 
-    Network and gate use the model's own settings; without a gate there is no hybrid. ``heuristic`` is the rule
+    Network and gate use the model's own settings; without a gate there is no hybrid. ``baseline`` is the rule
     baseline; None leaves it out.
     """
     trace = trace_of(frames, model)
@@ -108,7 +108,7 @@ def system_outputs(
         spec = DecideSpec.from_dict(model.decision)
         step_s = model.arch.step * model.layout.period_us / 1e6
         rules, weight = spec.rules(step_s), smoothing_weight(spec.smoothing_s, step_s)
-    outputs = {} if heuristic is None else {"rules": SystemOutput(tuple(heuristic(frames)))}
+    outputs = {} if baseline is None else {"rules": SystemOutput(tuple(baseline(frames)))}
     ways = {"cnn": replace(rules, gate=GateSettings())}
     if rules.gate.rules:
         ways["hybrid"] = rules
@@ -134,9 +134,9 @@ class _EventSpan:
 def _event_spans(events: Sequence[GestureEvent]) -> list[_EventSpan]:
     spans: dict[int, _EventSpan] = {}
     for event in events:
-        if event.what == "begun":
+        if event.kind == "begun":
             spans[event.number] = _EventSpan(event.affect, event.source, event.t_s, event.gesture, event.t_s)
-        elif event.what == "named":
+        elif event.kind == "named":
             spans[event.number].gesture, spans[event.number].named_s = event.gesture, event.t_s
             spans[event.number].affect = event.affect
         else:
@@ -281,7 +281,7 @@ def _judged(made: Gesture, called: Gesture | None) -> str:
 def run(
     sittings: Iterable[Sitting],
     model: Bundle | IntegerModel,
-    heuristic: Heuristic | None = None,
+    baseline: RuleBaseline | None = None,
     progress: Progress | None = None,
     of: int = 0,
 ) -> dict[str, Any]:
@@ -300,7 +300,7 @@ def run(
     people: list[str] = []
     for done, sitting in enumerate(sittings, 1):
         people.append(sitting.who)
-        for system, output in system_outputs(sitting.frames, model, heuristic).items():
+        for system, output in system_outputs(sitting.frames, model, baseline).items():
             made, stray = score(sitting, system, output, gestures)
             outcomes += made
             between.setdefault(system, []).append(stray)

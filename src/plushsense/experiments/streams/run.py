@@ -84,7 +84,7 @@ class TrainStreams:
         if not self.gate:
             return Fitted(networks)
         fitted = fit_gate(dataset, next(iter(networks.values())).gestures, fold.train)
-        return Fitted(networks, fitted.plan, {"gate": fitted.report, "plan": asdict(fitted.plan)})
+        return Fitted(networks, fitted.settings, {"gate": fitted.report, "plan": asdict(fitted.settings)})
 
     def _network(self, recipe: Recipe, dataset: Dataset, fold: PeopleFold, progress: EpochReport) -> Bundle:
         path = self.folder / f"{job_id({**recipe.key(), 'data': dataset.hash, 'fold': vars(fold)})}.plush"

@@ -265,7 +265,7 @@ def schedules(sweep: SweepResults) -> Figure:
     # The axis shows the epochs, with a line for each batch; if only the batch varies, the axis shows the batch.
     along, lines = (lengths, sizes) if len(lengths) > 1 else (sizes, lengths)
     keys = ("epochs", "batch_asked") if len(lengths) > 1 else ("batch_asked", "epochs")
-    what, each = ("Epochs", "batch") if len(lengths) > 1 else ("Batch", "epochs")
+    axis, each = ("Epochs", "batch") if len(lengths) > 1 else ("Batch", "epochs")
     figure = _figure(sweep, 9.2, 4.0, "Effect of epochs and batch: means over the networks, bars ± 1 sd")
     for axes, measure, label, scale in zip(
         figure.subplots(1, 2),
@@ -294,7 +294,7 @@ def schedules(sweep: SweepResults) -> Figure:
             )
         axes.set_xticks(range(len(along)), [str(value) for value in along])
         axes.set_xlim(-0.5, len(along) - 0.5)
-        axes.set_xlabel(what, fontsize=9)
+        axes.set_xlabel(axis, fontsize=9)
         axes.set_ylabel(score_label(sweep, label), fontsize=9)
         axes.tick_params(labelsize=8)
         axes.grid(axis="y", color="#dddddd", linewidth=0.5)

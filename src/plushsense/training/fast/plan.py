@@ -17,7 +17,7 @@ Way = Literal["pointwise", "direct", "spectral"]
 # Windows computed at a time: large enough for full matrix products, small enough for the caches.
 CHUNK = 64
 
-# At most so many bytes of spectra are kept for the backward pass; the others are computed again.
+# Largest size of the spectra that are kept for the backward pass; the others are computed again.
 SPECTRA_BYTES = 1 << 30
 
 _FLOAT_BYTES = 4

@@ -89,15 +89,15 @@ def read_clip(folder: Path) -> Clip | None:
     seconds: float | None = None
     for event in read_events(folder):
         details = event.details
-        if event.what == "close" and isinstance(details.get("seconds"), int | float):
+        if event.kind == "close" and isinstance(details.get("seconds"), int | float):
             seconds = float(details["seconds"])
-        if event.what == "take":
+        if event.kind == "take":
             file, count = str(details.get("file")), details.get("rows")
             first = _first_row(folder / file)
             last = first + (count if isinstance(count, int) else 0)
             labels[file] = Label(file, str(details.get("gesture")), first, last)
             added = []
-        elif event.what == "added" and details.get("dataset") not in added:
+        elif event.kind == "added" and details.get("dataset") not in added:
             added.append(str(details.get("dataset")))
     stream = folder / STREAM_NAME
     rows = stream.read_bytes().count(b"\n") if stream.is_file() else 0
@@ -397,7 +397,7 @@ def _count_losses(take: RecordingTake, layout: Layout) -> None:
         if last is not None:
             step_ms = frame.device_ms - last.device_ms
             if step_ms < 0 or step_ms > layout.gap_ms:
-                reason = "the toy's clock began anew" if step_ms < 0 else "nothing came"
+                reason = "the toy's clock restarted" if step_ms < 0 else "nothing came"
                 take.gaps.append(gap_entry(at, last, frame, max(step_ms, frame.host_ms - last.host_ms, 0), reason))
         last = frame
 

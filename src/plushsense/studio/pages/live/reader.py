@@ -352,7 +352,7 @@ class LiveReader:
             self.now = now
 
     def _take_event(self, event: GestureEvent, zero: float) -> None:
-        if event.what == "begun":
+        if event.kind == "begun":
             self._spans_begun += 1
             self._changes += 1
             span = EventSpan(
@@ -363,7 +363,7 @@ class LiveReader:
             self._spans.append(span)
             self.now = replace(self.now, event=span)
         elif self.now.event is not None:
-            end_s = zero + event.since_s if event.what == "ended" else None
+            end_s = zero + event.since_s if event.kind == "ended" else None
             self._change_event(affect=event.affect, gesture=event.gesture, end_s=end_s)
 
     def _change_event(self, **changed: Any) -> None:

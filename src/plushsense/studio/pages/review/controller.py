@@ -388,8 +388,8 @@ class ReviewController:
                 if last is None:
                     self.page.say(self.words("review.nothing_to_undo"))
                     return
-                what = self.words(f"review.did_{last.action}")
-                self.page.say(self.words("review.undone", what=what, id=last.recording))
+                action = self.words(f"review.did_{last.action}")
+                self.page.say(self.words("review.undone", what=action, id=last.recording))
                 if self.view == ONE and last.recording in self.review.infos:
                     await self.go(last.recording)
 
@@ -419,8 +419,8 @@ class ReviewController:
         prepared = self.review.prepared
         text = prepared.message
         if not text and prepared.progress is not None:
-            what, done, total = prepared.progress
-            text = self.words(f"review.making_{what}", done=done, of=total)
+            stage, done, total = prepared.progress
+            text = self.words(f"review.making_{stage}", done=done, of=total)
         self.making.set_text(text)
         self.making.set_visibility(bool(text))
 

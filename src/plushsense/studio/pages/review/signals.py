@@ -321,11 +321,11 @@ class ReviewPreparation:
                     self.progress, self._thread = None, None
             self.changed.notify()
 
-    def _steps(self, what: str, before: int = 0, total: int = 0) -> Callable[[int, int], None]:
+    def _steps(self, stage: str, before: int = 0, total: int = 0) -> Callable[[int, int], None]:
         def step(done: int, of: int) -> None:
             if self._closed:
                 raise _Closed
-            self.progress = (what, before + done, total or of)
+            self.progress = (stage, before + done, total or of)
             time.sleep(_LONG_PAUSE_S if time.monotonic() - self._used_s < _BUSY_S else _PAUSE_S)
             if time.monotonic() - self._notified_s > _NOTIFY_S:
                 self._notified_s = time.monotonic()

@@ -191,7 +191,7 @@ LOSS, ACCURACY, BEST = "loss", "accuracy", "best"
 class ProgressChart(NamedTuple):
     """Data of one progress plot: ``x`` and a line of y values for each of ``names``, where None is a gap."""
 
-    what: str
+    metric: str
     names: tuple[str, ...]
     x: list[float]
     lines: list[list[float | None]]
@@ -211,23 +211,23 @@ def _of_one(reports: Sequence[dict[str, Any]]) -> list[ProgressChart]:
     x = [float(epoch) for epoch in sorted(rows)]
     return [
         ProgressChart(
-            what,
+            metric,
             ("training", "held_back"),
             x,
-            [[rows[int(e)].get(f"{part}_{what}") for e in x] for part in ("train", "validation")],
+            [[rows[int(e)].get(f"{part}_{metric}") for e in x] for part in ("train", "validation")],
         )
-        for what in (LOSS, ACCURACY)
+        for metric in (LOSS, ACCURACY)
     ]
 
 
-def _by_fold(reports: Sequence[dict[str, Any]], what: str, key: str) -> ProgressChart:
+def _by_fold(reports: Sequence[dict[str, Any]], metric: str, key: str) -> ProgressChart:
     folds: dict[str, dict[int, float | None]] = {}
     for r in reports:
         if r.get("epoch") and r.get(key) is not None:
             folds.setdefault(r["fold"], {})[r["epoch"]] = r[key]
     epochs = sorted({epoch for rows in folds.values() for epoch in rows})
     return ProgressChart(
-        what, tuple(folds), [float(e) for e in epochs], [[rows.get(e) for e in epochs] for rows in folds.values()]
+        metric, tuple(folds), [float(e) for e in epochs], [[rows.get(e) for e in epochs] for rows in folds.values()]
     )
 
 
@@ -378,13 +378,13 @@ class _Card:
 
     def _plot(self, chart: ProgressChart) -> None:
         w = self._words
-        title = w(f"train.{chart.what}") if chart.what != BEST else w("train.best")
-        unit = {LOSS: "", ACCURACY: " (0–1)", BEST: " (0–1)"}[chart.what]
-        x = w("train.trainings") if chart.what == BEST else w("train.epoch")
+        title = w(f"train.{chart.metric}") if chart.metric != BEST else w("train.best")
+        unit = {LOSS: "", ACCURACY: " (0–1)", BEST: " (0–1)"}[chart.metric]
+        x = w("train.trainings") if chart.metric == BEST else w("train.epoch")
         drawn = self._lines(chart)
         plot = Plot(f"{title}: {self._job.title}", drawn, x=x, y=title + unit, height=220)
-        tag(plot, f"curve-{chart.what}").begin(chart.x, chart.lines)
-        self._plots.append((chart.what, plot, chart.names))
+        tag(plot, f"curve-{chart.metric}").begin(chart.x, chart.lines)
+        self._plots.append((chart.metric, plot, chart.names))
 
     def _lines(self, chart: ProgressChart) -> list[dict[str, Any]]:
         words = {name: self._words(f"train.lines.{name}") for name in ("training", "held_back", "accuracy", "macro_f1")}
@@ -408,13 +408,13 @@ class _Card:
             text = _progress_text(w, at)
             if self._text.text != text:
                 self._text.set_text(text)
-            charts = {chart.what: chart for chart in progress_charts(job)}
-            for i, (what, plot, names) in enumerate(self._plots):
-                chart = charts[what]
+            charts = {chart.metric: chart for chart in progress_charts(job)}
+            for i, (metric, plot, names) in enumerate(self._plots):
+                chart = charts[metric]
                 # The series change when a new fold adds a line, and after the first epochs, which are drawn as dots.
                 form = (*chart.names, str(len(chart.x) < 3))
                 plot.show(chart.x, chart.lines, series=self._lines(chart) if form != names else None)
-                self._plots[i] = (what, plot, form)
+                self._plots[i] = (metric, plot, form)
         if len(job.warnings) != self._warned:
             self._warned = len(job.warnings)
             self._warnings.clear()

@@ -104,16 +104,16 @@ class ResultsSection:
         self._draw()
 
     async def _clicked(self, event: Any) -> None:
-        what, _, which = str(event.args).partition(":")
-        if what == "sort" and which in _SORTS:
+        action, _, which = str(event.args).partition(":")
+        if action == "sort" and which in _SORTS:
             self._down = not self._down if which == self._sort else which in _DOWN
             self._sort = which
             self._draw()
             _refocus(f"sort:{which}")
-        elif what == "open":
+        elif action == "open":
             await self.open(which)
             _refocus(str(event.args))
-        elif what == "all":
+        elif action == "all":
             self._all = True
             self._draw()
 
@@ -248,11 +248,11 @@ def comparable_groups(rows: Sequence[ResultRow], kind: Callable[[str], str]) -> 
 _CLICKS = '(e) => { const b = e.target.closest("[data-do]"); if (b) emit(b.dataset.do); }'
 
 
-def _refocus(what: str) -> None:
+def _refocus(action: str) -> None:
     """Move the keyboard focus back to a button after its table was rebuilt."""
     ui.run_javascript(
         f"setTimeout(() => [...document.querySelectorAll('[data-do]')]"
-        f".find((b) => b.dataset.do === {json.dumps(what)})?.focus(), 60)"
+        f".find((b) => b.dataset.do === {json.dumps(action)})?.focus(), 60)"
     )
 
 
