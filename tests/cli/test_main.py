@@ -47,6 +47,7 @@ def test_every_verb_has_help(verb: str, capsys: pytest.CaptureFixture[str]) -> N
     [
         ["--help"],
         ["arch", "14d1", "--filters", "8"],
+        ["search", "no-such-folder"],
         *([v, "--help"] for v in ("info", "sweep", "search", "baselines")),
     ],
 )

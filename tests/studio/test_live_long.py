@@ -17,11 +17,11 @@ import pytest
 
 import studio as bench
 from plushsense.core.gestures import load_gestures
+from plushsense.deploy.quantize import classifier_of
 from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.live.loop import run_live
 from plushsense.models.bundle import Bundle
-from plushsense.workflow.export import classifier_of
 from support.browsing import marked
 
 Fixture = Callable[..., Any]

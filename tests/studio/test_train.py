@@ -30,8 +30,15 @@ def fill(page: Page, name: str, text: str) -> None:
 
 
 def choose(page: Page, name: str, text: str) -> None:
-    page.locator(f'[data-test="{name}"]').locator("xpath=ancestor-or-self::label").click()
-    page.get_by_role("option", name=text).first.click()
+    option = page.get_by_role("option", name=text).first
+    for _ in range(100):
+        # A list closes when the form is drawn again meanwhile.
+        if not page.get_by_role("listbox").count():
+            page.locator(f'[data-test="{name}"]').locator("xpath=ancestor-or-self::label").click()
+        if option.is_visible():
+            break
+        page.wait_for_timeout(100)
+    option.click()
 
 
 def kind(page: Page, name: str) -> None:

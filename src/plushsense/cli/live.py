@@ -24,13 +24,13 @@ STATES = {
 
 
 def run(args: argparse.Namespace) -> int:
+    from plushsense.deploy.quantize import classifier_of
     from plushsense.devices.opening import open_device
     from plushsense.live.loop import run_live
     from plushsense.live.reactions import Reactor, load_reactions
     from plushsense.models.bundle import Bundle
     from plushsense.runtime.classifier import BothEngines
     from plushsense.runtime.decisions import DecideSpec
-    from plushsense.workflow.export import classifier_of
 
     bundle = Bundle.load(args.model)
     reactor = Reactor(load_reactions(args.reactions, bundle.gestures)) if args.reactions else None

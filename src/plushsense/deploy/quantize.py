@@ -21,6 +21,7 @@ from plushsense.core.errors import ArchError, BundleError
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import Network, affine
+from plushsense.runtime.classifier import BothEngines, IntegerClassifier, StreamClassifier, StreamReader
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.fixed import (
     PROBABILITY_BITS,
@@ -247,6 +248,18 @@ def integer_model(bundle: Bundle, decide: DecideSpec | None = None) -> IntegerMo
     step_s = bundle.arch.step * bundle.layout.period_us / 1e6
     weight = smoothing_weight(spec.smoothing_s, step_s)
     return IntegerModel(integer_network(bundle), bundle.layout, bundle.gestures, weight, spec.rules(step_s))
+
+
+def classifier_of(bundle: Bundle, decide: DecideSpec | None, engine: str) -> StreamReader:
+    """Build the stream classifier of a bundle for the engine ``float``, ``int8`` or ``both``.
+
+    Raises:
+        BundleError: for ``int8`` and ``both``, if the network cannot be deployed.
+    """
+    if engine == "float":
+        return StreamClassifier(bundle, decide)
+    model = integer_model(bundle, decide)
+    return IntegerClassifier(model) if engine == "int8" else BothEngines(model, StreamClassifier(bundle, decide))
 
 
 def integer_probabilities(network: IntegerNetwork, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Calibrate a bundle on its training data, export it, and build its stream classifier."""
+"""Calibrate a bundle on its training data, and export it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,6 @@ from plushsense.models.bundle import Bundle
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
 from plushsense.workflow.preparation import WHOLE_PEOPLE, Warn, silent, windows_for
-
-if TYPE_CHECKING:
-    from plushsense.runtime.classifier import StreamReader
-    from plushsense.runtime.decisions import DecideSpec
-
 
 _TRIED = 512  # maximum of windows on which a conversion is compared with the network
 
@@ -142,18 +137,3 @@ def export(
     for name in also:
         check_format(name)
     return emit(model, given, Path(out), extras=[converted, package])
-
-
-def classifier_of(bundle: Bundle, decide: DecideSpec | None, engine: str) -> StreamReader:
-    """Build the stream classifier of a bundle for one of the `ENGINES`.
-
-    Raises:
-        BundleError: for ``int8`` and ``both``, if the network cannot be deployed.
-    """
-    from plushsense.deploy.quantize import integer_model
-    from plushsense.runtime.classifier import BothEngines, IntegerClassifier, StreamClassifier
-
-    if engine == "float":
-        return StreamClassifier(bundle, decide)
-    model = integer_model(bundle, decide)
-    return IntegerClassifier(model) if engine == "int8" else BothEngines(model, StreamClassifier(bundle, decide))

@@ -43,7 +43,6 @@ from plushsense.jobs.pool import Job
 from plushsense.jobs.progress import BestScore, JobInfo, JobProgress, JobsReporter, JobStep
 from plushsense.models.arch import Arch, slashed
 from plushsense.scoring.metrics import pareto_front
-from plushsense.training.engine import FitState
 from plushsense.trials.estimate import plan_seconds
 from plushsense.trials.grid import GridSpec
 from plushsense.trials.plan import (
@@ -373,6 +372,9 @@ class _Trainer:
         task = replace(job.task, stateful=not last)
         result = {} if earlier is None else self._results[earlier]
         if "random" in result:
+            # Imported here, because PyTorch is needed for training only.
+            from plushsense.training.engine import FitState
+
             task = replace(task, start=FitState.from_arrays(result), spent_s=float(result["seconds"]))
         return Job(job.id, task)
 

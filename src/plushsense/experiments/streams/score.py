@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -133,7 +133,7 @@ class Settings:
         grids = {}
         for name in self.systems:
             system = SYSTEMS[name]
-            tried_first = [str(spec) for spec in system.grid(gestures)]
+            tried_first = [asdict(spec) for spec in system.grid(gestures)]
             grids[name] = [system.network, system.rounds, system.gate_to, tried_first]
         return {"systems": grids, "targets": self.targets, "late_s": self.late_s, "weights": vars(self.weights)}
 

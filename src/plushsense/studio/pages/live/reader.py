@@ -13,6 +13,7 @@ from typing import Any
 
 from plushsense.core.errors import ConfigError, DatasetError, PlushSenseError
 from plushsense.dataset.importing.sources import is_simulation
+from plushsense.deploy.quantize import classifier_of
 from plushsense.devices.opening import open_device, parse_url
 from plushsense.live.loop import LiveRun
 from plushsense.live.loop import run_live as run_on
@@ -24,7 +25,6 @@ from plushsense.runtime.classifier import Decision, GestureEvent
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
-from plushsense.workflow.export import classifier_of
 
 
 @dataclass(frozen=True)
