@@ -30,8 +30,15 @@ settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True
 settings.load_profile("ci" if os.environ.get("PLUSHSENSE_REQUIRE") else "desk")
 
 
-# Folders and fixtures of tests that take seconds; `make test-quick` leaves them out.
+# Folders, files and fixtures of tests that take seconds; `make test-quick` leaves them out.
 SLOW_FOLDERS = {"bench", "cli", "deploy", "experiments", "studio", "workflow"}
+SLOW_FILES = {
+    "dataset/importing/test_importers_fuzz.py",
+    "devices/test_wire_fuzz.py",
+    "jobs/test_cluster.py",
+    "runtime/test_faults.py",
+    "tuning/test_gate.py",
+}
 LONGEST = {"test_train.py", "test_live_long.py"}
 SLOW_FIXTURES = {"real_data", "c_compiler", "target_here", "two_nodes", "lsl_possible", "publish_tools", "pty_possible"}
 
@@ -43,17 +50,21 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Do not import tests of a folder that `make test-quick` leaves out."""
-    left_out = collection_path.parent == REPO / "tests" and collection_path.name in SLOW_FOLDERS
-    return True if left_out and config.option.markexpr == "not slow" else None
+    """Do not import tests that `make test-quick` leaves out."""
+    left_out = config.option.markexpr == "not slow" and _in_slow_place(collection_path)
+    return True if left_out else None
+
+
+def _in_slow_place(path: Path) -> bool:
+    place = path.relative_to(REPO / "tests").as_posix() if path.is_relative_to(REPO / "tests") else ""
+    return place.split("/")[0] in SLOW_FOLDERS or place in SLOW_FILES
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that `make test-quick` leaves out; begin with the longest and with others that wait a lot."""
     items.sort(key=lambda item: (item.path.parent.name != "studio", item.path.name not in LONGEST))
     for item in items:
-        folder = item.path.relative_to(REPO / "tests").parts[0]
-        if folder in SLOW_FOLDERS or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
+        if _in_slow_place(item.path) or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
 
 
