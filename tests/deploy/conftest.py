@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import pickle
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
+from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from numpy.typing import NDArray
 
 from plushsense.dataset.importing.importers import import_recordings
@@ -18,11 +22,11 @@ from plushsense.deploy.golden import answers_of
 from plushsense.deploy.package import package
 from plushsense.deploy.proof.scenarios import Scenario, scenarios_of
 from plushsense.deploy.quantize import integer_model
-from plushsense.deploy.targets import Program, build
 from plushsense.runtime.image import IntegerModel
 from plushsense.windows.features import Scaler
 from support.c_toy import C_FOLDER, TOY_C, compiled
 from support.exports import LAYOUTS, bundle_of, exported
+from support.kept_objects import keeping_objects
 from support.requirements import missing
 from support.sharing import built_once
 
@@ -44,40 +48,45 @@ def needs() -> Callable[..., None]:
 @pytest.fixture(scope="session")
 def c_library(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """The library as a PC compiles it: several multiplications at once."""
-    return compiled(c_compiler, tmp_path_factory.mktemp("fast"))
+    return compiled(c_compiler, tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
 def plain_c_library(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """The library as small cores without such instructions compile it."""
-    return compiled(c_compiler, tmp_path_factory.mktemp("plain"), "-DPLUSH_PLAIN")
+    return compiled(c_compiler, tmp_path_factory, "-DPLUSH_PLAIN")
 
 
 @pytest.fixture(scope="session")
 def sanitized(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Programs that read a file of cases under the address and undefined-behaviour sanitizers."""
-    folder = tmp_path_factory.mktemp("sanitized")
+    folder = built_once(tmp_path_factory, "sanitized", lambda draft: _sanitize(c_compiler, draft))
+    return sorted(folder.glob("program*"))
+
+
+def _sanitize(c_compiler: str, folder: Path) -> None:
     # Where sums and differences wrap on purpose: modulo 2^32 they come out right. Anywhere else it is a fault.
     wrapping = ("square", "surplus", "four_sums", "advance", "dense", "interpolate", "read_inputs")
     (folder / "wrapping").write_text("".join(f"fun:{name}\n" for name in wrapping))
-    programs = []
-    for cc, flags in (
-        (c_compiler, ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]),
-        (c_compiler, ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-DPLUSH_PLAIN"]),
-        # Traps, because the runtime of clang's sanitizers is a package of its own.
+    for n, (cc, flags) in enumerate(
         (
-            "clang",
-            [
-                "-fsanitize=undefined,implicit-conversion,unsigned-integer-overflow",
-                "-fsanitize-trap=all",
-                "-DPLUSH_PLAIN",
-                f"-fsanitize-ignorelist={folder / 'wrapping'}",
-            ],
-        ),
+            (c_compiler, ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]),
+            (c_compiler, ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-DPLUSH_PLAIN"]),
+            # Traps, because the runtime of clang's sanitizers is a package of its own.
+            (
+                "clang",
+                [
+                    "-fsanitize=undefined,implicit-conversion,unsigned-integer-overflow",
+                    "-fsanitize-trap=all",
+                    "-DPLUSH_PLAIN",
+                    f"-fsanitize-ignorelist={folder / 'wrapping'}",
+                ],
+            ),
+        )
     ):
         if shutil.which(cc) is None:
             continue
-        out = folder / f"{cc}{len(programs)}"
+        out = folder / f"program-{n}-{cc}"
         subprocess.run(
             [
                 cc,
@@ -93,14 +102,13 @@ def sanitized(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list
             ],
             check=True,
         )
-        programs.append(out)
-    return programs
 
 
 @pytest.fixture(scope="session")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small export, not to be changed."""
-    return exported(tmp_path_factory.mktemp("small") / "out", bundle_of("plush-15"))
+    made = built_once(tmp_path_factory, "small", lambda draft: exported(draft / "out", bundle_of("plush-15")))
+    return made / "out"
 
 
 @pytest.fixture
@@ -141,46 +149,49 @@ def packages(tmp_path_factory: pytest.TempPathFactory, needs: Callable[..., None
     for layout in LAYOUTS:
         bundle = bundle_of(layout, window=60)
         model = integer_model(bundle)
-        out = tmp_path_factory.mktemp("packages") / layout
-        emit(model, bundle, out, extras=[package])
-        found[layout] = out, model
+        write = partial(emit, model, bundle, extras=[package])
+        made = built_once(tmp_path_factory, f"packages-{layout}", lambda draft, write=write: write(draft / "out"))
+        found[layout] = made / "out", model
     return found
 
 
 @pytest.fixture(scope="session", autouse=True)
 def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Compile once for all tests what is the same, flags included: object files are named by a hash of it."""
-    objects = built_once(tmp_path_factory, "objects", lambda draft: None)
-
-    def keeping(*args: Any, **options: Any) -> Program:
-        return build(*args, **{**options, "object_folder": objects})
-
-    with pytest.MonkeyPatch.context() as patch:
-        for module in ("profile", "proof.verify"):
-            patch.setattr(f"plushsense.deploy.{module}.build", keeping)
+    with keeping_objects(tmp_path_factory):
         yield
 
 
 @pytest.fixture(scope="session", autouse=True)
-def made_once() -> Iterator[None]:
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Make the scenarios of a model, and its answers to frames, once for all tests: they follow from these alone."""
-    made: dict[tuple[object, ...], list[Scenario]] = {}
-    answered: dict[tuple[object, ...], NDArray[np.int32]] = {}
+    folder = built_once(tmp_path_factory, "answers", lambda draft: None)
+    known: dict[str, Any] = {}
+
+    def once(make: Callable[[], Any], *inputs: object) -> Any:
+        key = sha256(pickle.dumps(inputs)).hexdigest()
+        if key not in known:
+            file = folder / key
+            with FileLock(f"{file}.lock"):
+                if not file.exists():
+                    draft = file.with_suffix(".draft")
+                    draft.write_bytes(pickle.dumps(make()))
+                    draft.replace(file)
+            known[key] = pickle.loads(file.read_bytes())
+        return known[key]
 
     def answers_once(model: IntegerModel, frames: NDArray[np.int64]) -> NDArray[np.int32]:
-        key = (model.to_bytes(), repr(model.gestures), frames.tobytes())
-        if key not in answered:
-            answered[key] = answers_of(model, frames)
-        return answered[key].copy()
+        inputs = model.to_bytes(), repr(model.gestures), frames.tobytes()
+        answers: NDArray[np.int32] = once(lambda: answers_of(model, frames), *inputs)
+        return answers.copy()
 
-    def once(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[Scenario]:
-        key = (model.to_bytes(), repr(model.gestures), scaler.offset.tobytes(), scaler.scale.tobytes(), repeat)
-        if key not in made:
-            made[key] = scenarios_of(model, scaler, repeat)
-        return made[key]
+    def scenarios_once(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[Scenario]:
+        inputs = model.to_bytes(), repr(model.gestures), scaler.offset.tobytes(), scaler.scale.tobytes(), repeat
+        scenarios: list[Scenario] = once(lambda: scenarios_of(model, scaler, repeat), *inputs)
+        return scenarios
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("plushsense.deploy.proof.vectors.scenarios_of", once)
+        patch.setattr("plushsense.deploy.proof.vectors.scenarios_of", scenarios_once)
         for module in ("golden", "proof.vectors"):
             patch.setattr(f"plushsense.deploy.{module}.answers_of", answers_once)
         yield

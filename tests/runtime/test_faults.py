@@ -74,16 +74,24 @@ def test_without_trouble_the_touches_are_known(bundle: Bundle) -> None:
         assert of_gate == ["begun", "named", "ended"]
 
 
+@pytest.fixture(scope="module")
+def untroubled(bundle: Bundle) -> dict[str, list[tuple[Any, ...]]]:
+    """What begins without trouble, for each engine."""
+    clean = toy_frames(TOUCHES)
+    return {engine: begun(lived(reader_of(bundle, SAFE, engine), stream(clean))) for engine in ("float", "int8")}
+
+
 @pytest.mark.parametrize("engine", ["float", "int8"])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("when", ["from the start", "in a stroke", "in a blow", "while idle"])
-def test_a_sensor_that_fails(bundle: Bundle, engine: str, kind: str, when: str) -> None:
+def test_a_sensor_that_fails(
+    bundle: Bundle, untroubled: dict[str, list[tuple[Any, ...]]], engine: str, kind: str, when: str
+) -> None:
     for phase in range(5):  # of the fault in a step
         first = {"from the start": 0, "in a stroke": 300, "in a blow": 700, "while idle": 550}[when]
         first += phase if first else 0
         last = 930 + phase
-        clean = toy_frames(TOUCHES)
-        values = clean.copy()
+        values = toy_frames(TOUCHES)
         spoil(values, kind, first, last)
         found = lived(reader_of(bundle, SAFE, engine), stream(values))
         faults = [d for d in found if d.state == "sensor fault"]
@@ -91,9 +99,8 @@ def test_a_sensor_that_fails(bundle: Bundle, engine: str, kind: str, when: str) 
         onset, recovered = first / 100, last / 100
         assert onset + 0.35 <= faults[0].t_s <= onset + 0.55
         # Before it, all as ever; from then until all is well again, nothing begins.
-        before = begun(lived(reader_of(bundle, SAFE, engine), stream(clean)))
         times = [entry for entry in begun(found) if entry[0] < recovered + 0.3]
-        assert times == [entry for entry in before if entry[0] < onset]
+        assert times == [entry for entry in untroubled[engine] if entry[0] < onset]
         ends = [e for d in found for e in d.events if e.kind == "ended" and onset <= e.t_s <= faults[0].t_s + 1e-9]
         assert len(ends) == (when in ("in a stroke", "in a blow")), "what was going on ended"
         # It recovers by itself: 0.3 s of good frames, the span again, and then the next blow is felt.

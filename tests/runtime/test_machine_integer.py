@@ -36,7 +36,7 @@ TROUBLED = calibrate(make_bundle())
 
 @pytest.fixture(scope="session")
 def library(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    return compiled(c_compiler, tmp_path_factory.mktemp("c"))
+    return compiled(c_compiler, tmp_path_factory)
 
 
 def of_the_c(library: Any, model: IntegerModel, frames: list[Frame]) -> np.ndarray:

@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 import plushsense.deploy
 from plushsense.deploy.golden import ANSWER, HEAD
 from plushsense.runtime.image import IntegerModel
+from support.sharing import built_once
 
 C_FOLDER = Path(plushsense.deploy.__file__).parent / "c"
 TOY_C = Path(__file__).parents[1] / "deploy" / "toy.c"
@@ -75,13 +77,14 @@ def seat(library: Any, model: IntegerModel, **how: int) -> Seat:
     return Seat(library, model.to_bytes(), len(model.layout.channels), model.network.arch.classes, **how)
 
 
-def compiled(cc: str, folder: Path, *flags: str) -> Any:
-    """The library and ``deploy/toy.c`` as a shared library."""
-    path = folder / "toy.so"
-    subprocess.run(
-        [cc, "-std=c99", "-O2", "-shared", "-fPIC", *flags, f"-I{C_FOLDER}", str(TOY_C), "-o", str(path)], check=True
-    )
-    library = ctypes.CDLL(str(path))
+def compiled(cc: str, factory: pytest.TempPathFactory, *flags: str) -> Any:
+    """The library and ``deploy/toy.c`` as a shared library, compiled once for all workers."""
+
+    def compile_into(draft: Path) -> None:
+        words = [cc, "-std=c99", "-O2", "-shared", "-fPIC", *flags, f"-I{C_FOLDER}", str(TOY_C)]
+        subprocess.run([*words, "-o", str(draft / "toy.so")], check=True)
+
+    library = ctypes.CDLL(str(built_once(factory, f"toy{''.join(flags)}", compile_into) / "toy.so"))
     library.seat_new.restype = ctypes.c_void_p
     for name in ("seat_name", "seat_title"):
         getattr(library, name).restype = ctypes.c_char_p

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
-import tempfile
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -27,18 +27,35 @@ def run(*words: object) -> None:
     assert done.returncode == 0, done.stderr
 
 
-_OBJECTS = tempfile.TemporaryDirectory(prefix="plushsense-objects-")
+OBJECTS = Path()  # the folder of object files, which `keeping_objects` sets
 
 
 @cache
 def compiled(source: Path, *words: object) -> Path:
-    """Return the object file of a source. Nothing is compiled twice that is the same after the preprocessor."""
+    """Return the object file of a source. Nothing is compiled twice whose texts, own headers included, are the same."""
     command = [str(w) for w in words]
-    text = subprocess.run([*command, "-E", "-P", str(source)], capture_output=True, check=True).stdout
-    flags = [w for w in command if not w.startswith(("-I", "-D"))]
-    built = Path(_OBJECTS.name) / f"{sha256(repr(flags).encode() + text).hexdigest()}.o"
+    folders = [source.parent, *(Path(w[2:]) for w in command if w.startswith("-I"))]
+    headers = [file for folder in folders for file in sorted(folder.rglob("*.h"))]
+    texts, seen = [source.read_bytes()], set[str]()
+    for text in texts:
+        included = re.findall(rb'#\s*include\s*[<"]([^>"]+)', text)
+        names = {Path(name.decode()).name for name in included} - seen
+        seen |= names
+        texts += [file.read_bytes() for file in headers if file.name in names]
+
+    def matters(word: str) -> bool:
+        # A definition matters where its name is.
+        name = word[2:].split("=")[0].encode()
+        return not word.startswith("-I") and (not word.startswith("-D") or any(name in text for text in texts))
+
+    key = sha256(repr([w for w in command if matters(w)]).encode())
+    for text in texts:
+        key.update(sha256(text).digest())
+    built = OBJECTS / f"{key.hexdigest()}.o"
     if not built.exists():
-        run(*words, "-c", source, "-o", built)
+        draft = built.with_suffix(f".{os.getpid()}")
+        run(*words, "-c", source, "-o", draft)
+        draft.replace(built)
     return built
 
 

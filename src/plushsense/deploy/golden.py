@@ -76,6 +76,7 @@ class FrameGenerator:
         self.mean, self.spread = measured(layout, scaler)
         self.rows: list[list[int]] = []
         self.now = 1000
+        self._period_ms = layout.period_us / 1000
         self._fraction = 0.0
         self._walk = np.zeros(len(self.mean))
         self._blow = np.zeros(len(self.mean))
@@ -83,7 +84,7 @@ class FrameGenerator:
 
     def pace(self) -> int:
         """Return the milliseconds to the next frame, one period on average."""
-        self._fraction += self.layout.period_us / 1000
+        self._fraction += self._period_ms
         whole = int(self._fraction)
         self._fraction -= whole
         return whole
@@ -112,6 +113,7 @@ class FrameGenerator:
         ``stuck`` maps channels to constant values.
         """
         rng, c = self.rng, len(self.mean)
+        low, high = self.low.astype(np.float64), self.high.astype(np.float64)
         for k in range(n):
             self._walk = 0.98 * self._walk + 0.2 * rng.normal(size=c)
             self._blow *= 0.6
@@ -119,12 +121,13 @@ class FrameGenerator:
                 self._blow = rng.normal(size=c) * 12
             rhythm = np.sin(len(self.rows) * (0.05 + 0.02 * (k // 97 % 9)) + self._phase) * (k // 61 % 3)
             signal = self.mean + self.spread * (self._walk + self._blow + rhythm + 0.1 * rng.normal(size=c))
-            values = np.clip(np.rint(signal), self.low, self.high).astype(np.int64)
-            spoilt = np.flatnonzero(rng.random(c) < garbage)
+            values = np.minimum(np.maximum(np.rint(signal), low), high).astype(np.int64)
+            drawn = rng.random(c)
             if garbage_channel is not None:
-                spoilt = np.array([garbage_channel])
-            for channel in spoilt:
-                values[channel] = self._garbage(int(channel))
+                values[garbage_channel] = self._garbage(garbage_channel)
+            elif garbage:
+                for channel in np.flatnonzero(drawn < garbage).tolist():
+                    values[channel] = self._garbage(channel)
             for stuck_channel, value in (stuck or {}).items():
                 values[stuck_channel] = value
             if rng.random() >= lost:

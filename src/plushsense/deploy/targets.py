@@ -155,10 +155,21 @@ def build(
     parts = [(source, source_flags) for source in sources]
     parts += [(RUNTIME / name, runtime_flags) for name in machine.runtime]
     with tempfile.TemporaryDirectory(prefix="plushsense-", dir=out_dir) as work:
+        listing = Path(work) / "blobs.S"
+        if blobs:
+            paths = {name: str(Path(path).resolve()) for name, path in blobs.items()}
+            listing.write_text(fill_text("plushsense.deploy", "c/runtime/blobs.S.j2", blobs=paths))
+            # -w, because macros in it may be empty.
+            parts.append((listing, ["-w"]))
         objects = []
         for n, (source, options) in enumerate(parts):
             compiling = [compiler, *machine.flags, *options]
-            name = _object_name(source, compiling, include) if object_folder else f"{n}-{source.stem}.o"
+            if not object_folder:
+                name = f"{n}-{source.stem}.o"
+            elif blobs and source is listing:
+                name = _blobs_name(blobs, compiling)
+            else:
+                name = _object_name(source, compiling, include)
             objects.append((object_folder or out_dir) / name)
             if object_folder and objects[-1].exists():
                 continue
@@ -169,14 +180,9 @@ def build(
             for file in sorted(Path(work).glob(f"{made.stem}.*"), reverse=True):
                 file.replace(objects[-1].with_name(file.name))
         inputs = [str(file) for file in objects]
-        if blobs:
-            paths = {name: str(Path(path).resolve()) for name, path in blobs.items()}
-            inputs.append("blobs.S")
-            (Path(work) / inputs[-1]).write_text(fill_text("plushsense.deploy", "c/runtime/blobs.S.j2", blobs=paths))
         file = out_dir / f"program-{target}{'.exe' if sys.platform == 'win32' and not machine.run else ''}"
         collect = ["-Wl,--gc-sections"] if machine.run else []
-        # -w, because macros in blobs.S may be empty.
-        command = [compiler, *machine.flags, optimise, *flags, "-w", *collect, *inputs, "-o", str(file), *machine.link]
+        command = [compiler, *machine.flags, optimise, *flags, *collect, *inputs, "-o", str(file), *machine.link]
         _compile(command, Path(work), "the program")
     return Program(machine, file, tuple(objects[: len(sources)]))
 
@@ -192,6 +198,12 @@ def _object_name(source: Path, command: Sequence[str], include: Iterable[Path]) 
         seen |= names
         texts += [file.read_bytes() for file in files if file.name in names]
     return f"{key.hexdigest()}.o"
+
+
+def _blobs_name(blobs: Mapping[str, Path], command: Sequence[str]) -> str:
+    """Return a file name for the object file of blobs: a hash of compiler, flags, symbols and contents."""
+    contents = [(symbol, sha256(Path(path).read_bytes()).hexdigest()) for symbol, path in blobs.items()]
+    return f"{sha256(repr((command, contents)).encode()).hexdigest()}.o"
 
 
 def tool(target: str, name: str) -> str:

@@ -7,6 +7,7 @@ two, also for negative numbers, so that no result depends on how a language roun
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -85,10 +86,17 @@ class InputScale(_Table):
 
     def apply(self, x: ArrayLike) -> Bytes:
         """Scale raw inputs (..., C) to the network's inputs (..., C) uint8."""
-        limit = (1 << (15 + self.before)) - 1
-        d = np.clip(np.asarray(x, dtype=np.int64) - self.offset, -limit, limit)
-        out: Bytes = np.clip(((d >> self.before) * self.multiplier + self.bias) >> self.after, 0, 255).astype(np.uint8)
+        low, high = self._limits
+        # Not np.clip(), which takes several times as long for the few numbers of a step.
+        d = np.minimum(np.maximum(np.asarray(x, dtype=np.int64) - self.offset, low), high)
+        scaled = ((d >> self.before) * self.multiplier + self.bias) >> self.after
+        out: Bytes = np.minimum(np.maximum(scaled, 0), 255).astype(np.uint8)
         return out
+
+    @cached_property
+    def _limits(self) -> tuple[Ints, Ints]:
+        limit = (1 << (15 + self.before)) - 1
+        return -limit, limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +110,11 @@ class _SumScale(_Table):
     RANGES = {"before": (0, 30), "multiplier": (0, (1 << 15) - 1), "after": (0, 30)}  # noqa: RUF012, RUF100
 
     def _scaled(self, t: Ints) -> Ints:
-        return np.asarray((t * self.multiplier + ((1 << self.after) >> 1)) >> self.after)
+        return np.asarray((t * self.multiplier + self._half) >> self.after)
+
+    @cached_property
+    def _half(self) -> Ints:
+        return np.asarray((1 << self.after) >> 1)
 
 
 class Requantize(_SumScale):
@@ -126,8 +138,8 @@ class LogitScale(_SumScale):
 
     def apply(self, sums: Ints) -> Ints:
         """Scale sums (..., K) of 32 bits to logits (..., K)."""
-        t = np.clip(sums >> self.before, -32768, 32767)
-        return np.clip(self._scaled(t), -LOGIT_LIMIT, LOGIT_LIMIT)
+        t = np.minimum(np.maximum(sums >> self.before, -32768), 32767)
+        return np.minimum(np.maximum(self._scaled(t), -LOGIT_LIMIT), LOGIT_LIMIT)
 
 
 def split_ratio(ratio: float, highest: float, most_after: int = 30, most_before: int = 30) -> tuple[int, int, int]:

@@ -98,6 +98,7 @@ class FrameReader:
     def __init__(self, layout: Layout, health: HealthSettings) -> None:
         self.layout = layout
         self._inputs = SampleInputs(layout)
+        self._gap_us, self._period_us = layout.gap_ms * 1000, layout.period_us
         self.health = Health(health, layout)
         self.reset()
 
@@ -120,12 +121,12 @@ class FrameReader:
         if not self._begun:
             self._begun, self.zero_us = True, device_us
         gap_us = device_us - self.zero_us - self.time_us
-        if gap_us < 0 or gap_us > self.layout.gap_ms * 1000:
+        if gap_us < 0 or gap_us > self._gap_us:
             if not health.fault:
                 yield Break(self.time_us, "no signal")
             health.clear()
         if gap_us < 0:
-            self.zero_us += gap_us - self.layout.period_us
+            self.zero_us += gap_us - self._period_us
         self.time_us = device_us - self.zero_us
         change = health.push(int(device_ms), values)
         if change:
@@ -136,7 +137,7 @@ class FrameReader:
             return
         samples = clock.rows(device_ms, values)
         if samples:
-            suspect, period = health.suspect, self.layout.period_us
+            suspect, period = health.suspect, self._period_us
             time_us = (clock.now_us or 0) - (len(samples) - 1) * period - self.zero_us
             for n, sample in enumerate(samples):
                 yield Sample(time_us + n * period, self._inputs(sample), suspect)

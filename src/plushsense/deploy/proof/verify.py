@@ -307,11 +307,13 @@ class _Runner:
     def __init__(self, export: Export, work: Path) -> None:
         self.export, self.work, self.objects = export, work, work / "objects"
         self.objects.mkdir()
+        self.memory_bytes = 0  # that the models of all streams need: one harness for all of them
         self.code = export.code(work / "code")
 
     def write_cases(self, stream: Stream) -> Cases:
         """Write a stream to a file as the harness reads it."""
         path = self._new_folder() / "cases.bin"
+        self.memory_bytes = max(self.memory_bytes, *(v.memory_bytes for v in stream))
         path.write_bytes(b"".join(v.to_bytes() for v in stream))
         return stream, path
 
@@ -379,7 +381,7 @@ class _Runner:
         defines = {
             "PLUSH_HARNESS_CHANNELS": stream[0].frames.shape[1] - 1,
             "PLUSH_HARNESS_CLASSES": len(labels),
-            "PLUSH_HARNESS_MEMORY_BYTES": max(v.memory_bytes for v in stream),
+            "PLUSH_HARNESS_MEMORY_BYTES": self.memory_bytes,
             **({"PLUSH_HARNESS_IMAGE": 1} if setting.image else {}),
             **({"PLUSH_HARNESS_BOTH": 1} if both else {}),
         }
