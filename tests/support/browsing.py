@@ -210,8 +210,9 @@ def is_own(url: str) -> bool:
 
 def axe(page: Page) -> list[str]:
     """Serious and critical findings of axe-core, a line each."""
-    # Evaluated, not added as a script: the page's own policy stands.
-    page.evaluate(AXE.read_text(encoding="utf-8"))
+    # Evaluated, not added as a script: the page's own policy stands. Once a page, as that takes as long as looking.
+    if not page.evaluate("() => 'axe' in window"):
+        page.evaluate(AXE.read_text(encoding="utf-8"))
     found: dict[str, Any] = page.evaluate("() => axe.run(document, {resultTypes: ['violations']})")
     return [
         f"{v['id']} ({v['impact']}): {v['help']}: {node['html'][:160]}"
