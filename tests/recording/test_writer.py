@@ -1,6 +1,8 @@
 import errno
 import json
 import os
+import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,15 @@ from plushsense.core.recorder_csv import read_recording, read_stream
 from plushsense.devices.base import Frame
 from plushsense.devices.wire import LineParser
 from plushsense.recording.session_files import SessionEvent, read_events
-from plushsense.recording.writer import AppendedFile, LogFile, StreamFile, save_take, to_frames
+from plushsense.recording.writer import (
+    FLUSH_S,
+    AppendedFile,
+    BackgroundWriter,
+    LogFile,
+    StreamFile,
+    save_take,
+    to_frames,
+)
 
 ACCEL = load_layout("accel-3")
 
@@ -121,3 +131,28 @@ def test_events_are_appended(tmp_path: Path) -> None:
         log.write([])
         log.close()
     assert [(e.kind, e.at_ms) for e in read_events(tmp_path)] == [("note", 0), ("pause", 0), ("note", 1), ("pause", 1)]
+
+
+def test_rows_of_a_fast_toy_are_waited_for_by_the_half_second_of_the_toy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a simulated toy that runs faster than real time, a crash loses no more than the last second of the toy."""
+    stream, log = StreamFile(tmp_path / "s.csv", ACCEL), LogFile(tmp_path)
+    write, failed = stream.write, list[Exception]()
+
+    def slowly(rows: Sequence[Frame]) -> None:
+        time.sleep(0.05)
+        write(rows)
+
+    monkeypatch.setattr(stream, "write", slowly)
+    writer = BackgroundWriter(stream, log, synchronous=True, on_fail=failed.append)
+    rows = frames(300)
+    for at in range(0, 300, 10):
+        writer.add_frames(rows[at : at + 10], 10.0 * (at + 10))
+        writer.wait_written()
+        on_disk = (tmp_path / "s.csv").read_bytes().count(b"\n")
+        assert at + 10 - on_disk <= 100.0 * FLUSH_S
+    writer.close()
+    log.close()
+    assert (tmp_path / "s.csv").read_bytes().count(b"\n") == 300
+    assert failed == []

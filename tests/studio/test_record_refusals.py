@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -54,6 +55,13 @@ def fill(page: Any, code: str, toy: str = "") -> None:
     marked(page, "code").fill(code)
     marked(page, "other_toy").fill(toy)
     marked(page, "begin").click()
+
+
+def reconnected(page: Any) -> int:
+    """How often the toy came back, as the page counts it."""
+    found = re.search(r"reconnected (\d+)", marked(page, "counters").inner_text())
+    assert found is not None
+    return int(found[1])
 
 
 def test_a_session_that_cannot_begin(
@@ -138,6 +146,7 @@ def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, tmp
     with tcp_toy() as url:
         server, browser = studio("--device", url), look()
         page = begun(browser.open(server.url + "/record"), server.url, "S01")
+        before = reconnected(page)
         page.keyboard.press("Space")
         showing(page, "recording.0.")
     marked(page, "state").get_by_text("THE TOY IS AWAY").wait_for()
@@ -152,7 +161,8 @@ def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, tmp
         page.keyboard.press("Space")
         showing(page, "idle.1.1.")
         take(page, 1, 0.8)
-        assert "reconnected 1" in marked(page, "counters").inner_text()
+        # A machine that stands still for a while may have lost it more than once.
+        assert reconnected(page) > before
     gaps = [len(b["gaps"]) for b in files(home)]
     assert gaps == [1, 0]
     marked(page, "end").click()

@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import ConfigError, DeviceError
+from plushsense.devices import base
+from plushsense.devices.opening import DeviceListing, list_devices
 from plushsense.studio.app import toys as room
 from plushsense.studio.app.toys import PERSONS, Toys
 from plushsense.studio.app.workspace import Workspace
@@ -48,16 +50,26 @@ def server() -> Iterator[Callable[[bytes], str]]:
         one.close()
 
 
-def test_looking_does_not_wait_and_rings(toys: Toys) -> None:
-    began = time.monotonic()
+def test_looking_does_not_wait_and_rings(toys: Toys, monkeypatch: pytest.MonkeyPatch) -> None:
+    looks, may_look = list[float](), threading.Event()
+
+    def later(scan_s: float) -> DeviceListing:
+        looks.append(scan_s)
+        assert may_look.wait(30)
+        return list_devices(scan_s)
+
+    monkeypatch.setattr(room, "list_devices", later)
+    # Both return although nothing may be found yet, and the second joins the first.
     toys.search(0.2)
     toys.search(0.2)
-    assert time.monotonic() - began < 0.2
+    assert toys.searching and not toys.searched
+    may_look.set()
     end = time.monotonic() + 30
     while toys.searching or not toys.searched:
         assert time.monotonic() < end
         time.sleep(0.02)
     assert [d.kind for d in toys.listing.devices][-1] == "virtual"
+    assert looks == [0.2]
 
 
 def test_a_person_of_the_virtual_toy(toys: Toys) -> None:
@@ -93,7 +105,28 @@ def test_a_toy_named_at_start_may_lie_anywhere(toys: Toys) -> None:
     assert toys.choose(" virtual://?layout=plush-14 ") == "virtual://?layout=plush-14"
 
 
-def test_the_virtual_toy_passes(toys: Toys) -> None:
+class Clock:
+    """A clock that only sleeping moves, in place of the module `time`: a machine that stands still changes no rate."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    perf_counter = monotonic
+
+    def time_ns(self) -> int:
+        return round(1e9 * self.now_s)
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+
+
+def test_the_virtual_toy_passes(toys: Toys, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock()
+    for module in (room, base):
+        monkeypatch.setattr(module, "time", clock)
     done = toys.test()
     assert done.fits and done.on_time
     assert done.layout == "plush-15"

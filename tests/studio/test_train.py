@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import shutil
 from collections import Counter
@@ -252,6 +253,9 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     studio: Fixture, look: Fixture, shots: Fixture, home: Path
 ) -> None:
     (home / "tiny.toml").write_text(_GRID, encoding="utf-8")
+    # As many threads as there are cores: its networks are trained in the process of the job, not in processes of their
+    # own, which would each load PyTorch again for each rung.
+    (home / "little.toml").write_text(_GRID.replace("[grid]", f"[grid]\nthreads = {os.cpu_count()}"), encoding="utf-8")
     (home / "wrong.toml").write_text('[grid]\nepochs = [0]\narchitectures = ["14x"]\n', encoding="utf-8")
     browser = look()
     page = browser.open(f"{studio(home=home).url}/train")
@@ -292,14 +296,14 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
 
     # A search among them, within a limit.
     kind(page, "Find a small network")
-    choose(page, "grid", "tiny.toml")
+    choose(page, "grid", "little.toml")
     choose(page, "split", "15 % of the windows")
     fill(page, "max_parameters", "1400")
     marked(page, "estimate").click()
     marked(page, "plan-text").get_by_text("networks compared after 1, 2 epochs, 1 beyond").wait_for(timeout=_LONG_MS)
     marked(page, "start").click()
     page.locator('[data-test="result"]', has_text="Best: ").wait_for(timeout=_LONG_MS)
-    (found,) = (home / "datasets" / "virtual" / "evaluations").glob("search-tiny-*")
+    (found,) = (home / "datasets" / "virtual" / "evaluations").glob("search-little-*")
     best = json.loads((found / "search.json").read_text(encoding="utf-8"))["winner"]
     assert best["parameters"] <= 1400
     text = page.locator('[data-test="result"]', has_text="Best: ").inner_text()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import json
 import multiprocessing
 import os
@@ -41,6 +42,7 @@ _PROGRAMS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-
 _START_S = 60.0
 _WAIT_MS = 60_000
 _SETTLE_MS = 200
+_POLL_MS = 25
 DESK, TABLET = (1280, 800), (820, 1180)
 
 
@@ -169,6 +171,8 @@ class Look:
         page.set_viewport_size({"width": self.size[0], "height": self.size[1]})
         page.emulate_media(color_scheme="dark" if self.dark else "light", reduced_motion="reduce")
         page.set_default_timeout(_WAIT_MS)
+        # By default a wait looks at every frame, which keeps the browser drawing frames.
+        setattr(page, "wait_for_function", functools.partial(page.wait_for_function, polling=_POLL_MS))  # noqa: B010
         page.on("console", lambda m: self.complaints.append(m.text) if m.type == "error" else None)
         page.on("pageerror", lambda e: self.complaints.append(str(e)))
         page.goto(url)
@@ -206,8 +210,9 @@ def is_own(url: str) -> bool:
 
 def axe(page: Page) -> list[str]:
     """Serious and critical findings of axe-core, a line each."""
-    # Evaluated, not added as a script: the page's own policy stands.
-    page.evaluate(AXE.read_text(encoding="utf-8"))
+    # Evaluated, not added as a script: the page's own policy stands. Once a page, as that takes as long as looking.
+    if not page.evaluate("() => 'axe' in window"):
+        page.evaluate(AXE.read_text(encoding="utf-8"))
     found: dict[str, Any] = page.evaluate("() => axe.run(document, {resultTypes: ['violations']})")
     return [
         f"{v['id']} ({v['impact']}): {v['help']}: {node['html'][:160]}"

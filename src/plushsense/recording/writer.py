@@ -140,8 +140,8 @@ class BackgroundWriter:
 
     Args:
         stream, log: open files; the writer closes the stream.
-        synchronous: write every row at once, and let `wait_written` block until then; for a simulated toy that runs
-            faster than real time, of which a crash could otherwise lose more than the last second.
+        synchronous: let `wait_written` block until rows that are due are on disk; for a simulated toy that runs faster
+            than real time, of which a crash could otherwise lose more than the last second.
         on_fail: called once, in a thread of the writer, when something cannot be written; nothing more is written.
         on_wait: called in a thread of the writer when a write or a job is repeated because no file
             descriptor was free.
@@ -183,7 +183,8 @@ class BackgroundWriter:
             self._rows.extend(frames)
             self._added += len(frames)
             self._toy_ms = toy_ms
-            self._changed.notify_all()
+            if self._due():
+                self._changed.notify_all()
 
     def submit(self, job: SessionEvent | Job) -> None:
         """Queue an event for the log, or a job that runs after the rows added so far are written; the order is kept.
@@ -195,10 +196,12 @@ class BackgroundWriter:
             self._changed.notify_all()
 
     def wait_written(self) -> None:
-        """Wait until all rows are on disk if ``synchronous``; else return at once."""
+        """Wait until all rows are on disk if ``synchronous`` and they are due; else return at once."""
         if self._synchronous:
             with self._changed:
-                while self._written < self._added and not (self._failed or self._closing):
+                # Rows that are not due may wait for more, because each flush costs more than formatting many rows.
+                until = self._added if self._due() else 0
+                while self._written < until and not (self._failed or self._closing):
                     self._changed.wait(_POLL_S)
 
     def close(self) -> None:
@@ -246,7 +249,7 @@ class BackgroundWriter:
             return False
         job_waits = any(after > self._written for after, _ in self._jobs)
         is_late = time.monotonic() - self._since_s >= FLUSH_S or self._toy_ms - self._since_ms >= 1000.0 * FLUSH_S
-        return is_late or job_waits or self._synchronous or self._closing
+        return is_late or job_waits or self._closing
 
     def _write_stream(self) -> None:
         while True:

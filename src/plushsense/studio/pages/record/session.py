@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -18,6 +19,8 @@ from plushsense.studio.pages.record.controller import ActiveSession, RecordContr
 from plushsense.studio.widgets.elements import Plot, own_picture, picture
 
 _WINDOW_S = 10.0
+# Figures that change faster cannot be read.
+_FIGURES_S = 0.5
 # Approximate maximum number of points to send to a plot at once.
 _MAX_POINTS = 12
 _SIGNAL_STYLES = {
@@ -61,6 +64,7 @@ class SignalPanel:
         rate = self._device.layout.rate_hz * max(1.0, session.request.speed)
         self._place = max(0, self._device.buffer.count - int(_WINDOW_S * rate))
         self._drawn_signal = ""
+        self._figures_s = -math.inf
 
     def _build(self, speed: float) -> list[tuple[Plot, list[int]]]:
         words, kinds = self._page.words, dict[str, list[int]]()
@@ -91,7 +95,11 @@ class SignalPanel:
     def draw(self, s: RecorderStatus) -> None:
         """Display the current signal quality."""
         words = self._page.words
-        if self._drawn_signal != s.signal:
+        now_s, changed = time.monotonic(), self._drawn_signal != s.signal
+        if not changed and now_s - self._figures_s < _FIGURES_S:
+            return
+        self._figures_s = now_s
+        if changed:
             self._drawn_signal = s.signal
             sign, colour = _SIGNAL_STYLES[s.signal]
             self._quality.text = f"{sign} {words(f'record.signal_{s.signal}')}"
@@ -412,10 +420,12 @@ class _View:
         if self._progress.text != (text := ", ".join(counts)):
             self._progress.text = text
             self._bar.props(f'max="{s.steps}" value="{s.done + s.skipped}"')
-        self._next.text = ""
+        text = ""
         if (following := s.next_step) is not None and s.state not in ("finished", "stopped"):
             gesture = words.gesture(following.gesture)
-            self._next.text = words("record.next", gesture=gesture, n=following.repetition, m=s.repetitions)
+            text = words("record.next", gesture=gesture, n=following.repetition, m=s.repetitions)
+        # Every change of an element renders the whole page again, also one that is taken back.
+        self._next.text = text
         if self._gesture != s.step.gesture:
             self._gesture = s.step.gesture
             self._name.content = words.gesture(s.step.gesture)
