@@ -40,6 +40,7 @@ def choose(page: Page, name: str, text: str) -> None:
             break
         page.wait_for_timeout(100)
     option.click()
+    page.locator(".q-menu").wait_for(state="detached")
 
 
 def kind(page: Page, name: str) -> None:
