@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -74,7 +75,9 @@ def test_a_session_from_its_beginning_to_its_end(controller: RecordController, t
     loop.call_soon_threadsafe(loop.stop)
     hearing.join(10)
     loop.close()
-    assert [p.label for p in toy.performed] == ["Back stroke 1", "Head stroke 1", "Hold strong", "Tail tap 1"]
+    # During a recording that takes longer on a busy machine, the person performs its gesture again.
+    labels = [label for label, _ in itertools.groupby(p.label for p in toy.performed)]
+    assert labels == ["Back stroke 1", "Head stroke 1", "Hold strong", "Tail tap 1"]
     assert [bool(s.file) for s in session.recorder.steps()] == [True] * 4
     # The tap sees what the recorder gets.
     assert session.device.buffer.count == pytest.approx(session.recorder.status().rows, abs=400)
