@@ -36,8 +36,14 @@ SLOW_FILES = {
     "dataset/importing/test_importers_fuzz.py",
     "devices/test_wire_fuzz.py",
     "jobs/test_cluster.py",
+    "jobs/test_pool.py",
+    "recording/test_engine.py",
+    "reports/test_quality.py",
+    "reports/test_trims.py",
     "runtime/test_faults.py",
+    "tuning/test_decisions.py",
     "tuning/test_gate.py",
+    "tuning/test_rule_baseline.py",
 }
 LONGEST = {"test_train.py", "test_live_long.py"}
 SLOW_FIXTURES = {"real_data", "c_compiler", "target_here", "two_nodes", "lsl_possible", "publish_tools", "pty_possible"}
