@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,12 +18,21 @@ DEVICE_MS = "device_ms"
 DELAY_MS = "delay_ms"
 HOST_MS = "host_ms"
 MAGNITUDE_FRACTION_BITS = 4
+GRAVITY_FRACTION_BITS = 4
+GRAVITY_STATE_BITS = 10  # fraction bits of the running mean itself
+GRAVITY_S = 1.28  # time constant of the running mean
+ACCELERATION = "acceleration"
 _INT32 = (-2147483648.0, 2147483647.0)
 
 
 def magnitude_limit(n: int) -> int:
     """Return the largest size, 2²⁷ / √n, of ``n`` components whose magnitude with fraction bits stays below 2³¹."""
     return math.isqrt((2 ** (62 - 2 * MAGNITUDE_FRACTION_BITS) - 1) // n)
+
+
+def gravity_limit() -> int:
+    """Return the largest size, 2¹⁹, of a component of gravity whose running mean and its changes fit 32 bits."""
+    return 1 << (29 - GRAVITY_STATE_BITS)
 
 
 @dataclass(frozen=True)
@@ -46,22 +55,29 @@ class Channel:
     def __post_init__(self) -> None:
         if self.step <= 0:
             raise LayoutError(f"Channel '{self.name}': step is {self.step}; it must be above 0.")
-        # By default, every 32-bit number of steps is valid.
+        # By default, every number of steps is valid that fits 32 bits, also as a distance from the offset.
+        zero = round(self.offset / self.step)
         if self.valid_min == _INT32[0]:
-            object.__setattr__(self, "valid_min", _INT32[0] * self.step)
+            object.__setattr__(self, "valid_min", (_INT32[0] + abs(zero)) * self.step)
         if self.valid_max == _INT32[1]:
-            object.__setattr__(self, "valid_max", _INT32[1] * self.step)
+            object.__setattr__(self, "valid_max", (_INT32[1] - abs(zero)) * self.step)
         low, high = self.valid_min / self.step, self.valid_max / self.step
-        if not _INT32[0] - 0.5 <= low <= high <= _INT32[1] + 0.5:
+        edge = _INT32[0] - 0.5 + max(zero, 0), _INT32[1] + 0.5 + min(zero, 0)
+        if not edge[0] <= low <= high <= edge[1]:
             raise LayoutError(
                 f"Channel '{self.name}': valid_min {self.valid_min:g} to valid_max {self.valid_max:g} in steps of "
-                f"{self.step:g} must rise and fit 32-bit integers: narrow the range or take a larger step."
+                f"{self.step:g} must rise and fit 32-bit integers, also after the offset {self.offset:g} is "
+                "subtracted: narrow the range or take a larger step."
             )
 
 
 @dataclass(frozen=True)
 class Derived:
-    """A channel computed from the channels ``of``; ``magnitude`` is √(Σ v²), an integer with 4 fraction bits."""
+    """A channel computed from the channels ``of``, an integer with 4 fraction bits.
+
+    The kind ``magnitude`` is √(Σ v²); ``gravity`` is the running mean of one axis of an accelerometer, whose direction
+    is that of gravity (`plushsense.windows.features.RunningMean`).
+    """
 
     name: str
     kind: str
@@ -146,18 +162,23 @@ class Layout:
                 self.index(name)
 
     def _problems_of(self, derived: Derived) -> Iterator[str]:
-        if derived.kind != "magnitude":
-            yield f"derived channel '{derived.name}' has the kind '{derived.kind}'; accepted is magnitude."
+        if derived.kind not in ("magnitude", "gravity"):
+            yield (
+                f"derived channel '{derived.name}' has the kind '{derived.kind}'; accepted are magnitude and gravity."
+            )
         if not derived.of:
             yield f"derived channel '{derived.name}' has no source: fill in of."
-        limit = magnitude_limit(len(derived.of))
+        if derived.kind == "gravity" and len(derived.of) != 1:
+            yield f"derived channel '{derived.name}' is the gravity along one axis, not {len(derived.of)}."
+        limit = gravity_limit() if derived.kind == "gravity" else magnitude_limit(len(derived.of))
         for name in derived.of:
             at = self.index(name)
-            if max(-self.valid_min_int[at], self.valid_max_int[at]) > limit:
+            low, high = (edge[at] - self.zero_int[at] for edge in (self.valid_min_int, self.valid_max_int))
+            if max(-low, high) > limit:
                 yield (
                     f"channel '{name}' feeds '{derived.name}' but is valid from {self.valid_min_int[at]} to "
-                    f"{self.valid_max_int[at]} steps: give it valid_min and valid_max within ±{limit} steps, so that "
-                    "the magnitude fits 32 bits."
+                    f"{self.valid_max_int[at]} steps: give it valid_min and valid_max within {limit} steps of its "
+                    f"offset, so that the {derived.kind} fits 32 bits."
                 )
 
     @property
@@ -194,6 +215,59 @@ class Layout:
     def valid_max_int(self) -> NDArray[np.int64]:
         """Largest valid value of each channel in integer steps, (C,)."""
         return np.array([min(_INT32[1], np.floor(c.valid_max / c.step)) for c in self.channels], dtype=np.int64)
+
+    @property
+    def zero_int(self) -> NDArray[np.int64]:
+        """Offset of each channel in integer steps, (C,): the reading that stands for zero."""
+        return np.array([round(c.offset / c.step) for c in self.channels], dtype=np.int64)
+
+    @property
+    def gravity_shift(self) -> int:
+        """Binary logarithm of the time constant of the running mean, in samples."""
+        return max(0, round(math.log2(GRAVITY_S * self.rate_hz)))
+
+    @property
+    def input_kinds(self) -> tuple[str, ...]:
+        """Kind of each input: that of its channel or of the first source of a magnitude, or ``gravity``."""
+        kinds = {c.name: c.kind for c in self.channels}
+        kinds |= {d.name: d.kind if d.kind == "gravity" else kinds[d.of[0]] for d in self.derived}
+        return tuple(kinds[name] for name in self.inputs)
+
+    @property
+    def input_vectors(self) -> tuple[tuple[int, ...], ...]:
+        """Indices of the inputs that are the axes of each vector; the last vector is gravity if it is an input."""
+        gravity = tuple(at for at, kind in enumerate(self.input_kinds) if kind == "gravity")
+        axes = [tuple(map(self.inputs.index, vector)) for vector in self.vectors if set(vector) <= set(self.inputs)]
+        return (*axes, gravity) if gravity else tuple(axes)
+
+    @property
+    def has_gravity(self) -> bool:
+        """Whether one of the vectors is an acceleration, so that a network may have a vector layer."""
+        kinds = {c.name: c.kind for c in self.channels}
+        return any(kinds[axis] == ACCELERATION for vector in self.vectors for axis in vector)
+
+    def for_vectors(self) -> Layout:
+        """Return the layout with the inputs of a network that begins with a vector layer (see `models.arch`).
+
+        These are the inputs that do not come from vectors, then the axes of all vectors, then the gravity along each
+        axis of the first acceleration.
+
+        Raises:
+            LayoutError: for a layout without an acceleration among its vectors.
+        """
+        if not self.has_gravity:
+            raise LayoutError(
+                f"Layout '{self.name}' names no accelerometer, which a vector layer needs: list its three axes in "
+                f"vectors, with the kind '{ACCELERATION}', or take a network without a vector layer."
+            )
+        axes = [axis for vector in self.vectors for axis in vector]
+        kinds = {c.name: c.kind for c in self.channels}
+        first = next(vector for vector in self.vectors if kinds[vector[0]] == ACCELERATION)
+        gravity = tuple(Derived(f"{axis}_gravity", "gravity", (axis,)) for axis in first)
+        parts = {d.name: set(d.of) for d in self.derived} | {name: {name} for name in self.names}
+        others = [name for name in self.inputs if not parts[name] <= set(axes)]
+        derived = tuple(d for d in self.derived if d.kind != "gravity") + gravity
+        return replace(self, derived=derived, inputs=(*others, *axes, *(d.name for d in gravity)))
 
     def index(self, name: str) -> int:
         """Return the index of a channel; for an unknown name raise LayoutError with the nearest known one."""

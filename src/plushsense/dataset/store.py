@@ -20,7 +20,7 @@ import io
 import json
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -290,6 +290,17 @@ class Dataset:
         self.head = head
         self.recordings = recordings
         self.streams = streams
+        self._stored_layout = head.layout
+
+    def with_inputs(self, layout: Layout) -> Dataset:
+        """Return this data set with the network inputs of ``layout``; itself if the measured channels differ."""
+        own = self.layout
+        if own.channels != layout.channels or (own.inputs, own.derived) == (layout.inputs, layout.derived):
+            return self
+        head = replace(self.head, layout=replace(own, inputs=layout.inputs, derived=layout.derived))
+        other = Dataset(self.path, head, self.recordings, self.streams, self.generation)
+        other._stored_layout = self._stored_layout
+        return other
 
     @property
     def layout(self) -> Layout:
@@ -350,7 +361,7 @@ class Dataset:
     @cached_property
     def hash(self) -> str:
         """SHA-256 of the layout, the streams and all used recordings: content, person, gesture, trimming."""
-        digest = hashlib.sha256(json.dumps(self.layout.to_dict(), sort_keys=True).encode())
+        digest = hashlib.sha256(json.dumps(self._stored_layout.to_dict(), sort_keys=True).encode())
         for r in sorted(self.used, key=lambda r: r.id):
             digest.update(
                 repr((r.id, r.subject, r.gesture, r.sha256, r.first_row, r.start, r.stop, r.stream_row)).encode()

@@ -210,8 +210,9 @@ class FrameGenerator:
     def _edges(self, inputs: InputScale) -> dict[int, Ints]:
         """Return, for each input channel, the values near its mean at which the 8-bit code changes."""
         names = self.layout.inputs
-        around = np.zeros((2 * _SEARCHED, len(names)), dtype=np.int64)
-        direct = {i: self.layout.index(n) for i, n in enumerate(names) if n in self.layout.names}
+        around = np.zeros((2 * _SEARCHED, len(inputs)), dtype=np.int64)
+        axes = {i for vector in self.layout.input_vectors for i in vector} if len(inputs) != len(names) else set()
+        direct = {i: self.layout.index(n) for i, n in enumerate(names) if n in self.layout.names and i not in axes}
         for i, channel in direct.items():
             around[:, i] = np.arange(-_SEARCHED, _SEARCHED) + round(float(self.mean[channel]))
         codes = inputs.apply(around)
@@ -235,13 +236,20 @@ def measured(layout: Layout, scaler: Scaler) -> tuple[NDArray[np.float64], NDArr
     c = len(layout.channels)
     mean, spread = np.zeros(c), np.full(c, 100.0)
     derived = {d.name: d.of for d in layout.derived}
-    for name, offset, scale in zip(layout.inputs, scaler.offset, scaler.scale, strict=True):
+    kinds = zip(layout.inputs, layout.input_kinds, scaler.offset, scaler.scale, strict=True)
+    for name, kind, offset, scale in kinds:
+        if kind == "gravity":
+            continue
         parts = derived.get(name, (name,))
         unit = len(parts) ** 0.5 * (1 << MAGNITUDE_FRACTION_BITS) if name in derived else 1.0
         for part in parts:
             mean[layout.index(part)] = offset / unit
             spread[layout.index(part)] = max(1.0, 1 / scale / unit)
-    return mean, spread
+    if "gravity" in layout.input_kinds:
+        # Vectors are scaled from zero: the toy stands upright.
+        for vector in layout.vectors:
+            mean[layout.index(vector[-1])] = spread[layout.index(vector[-1])]
+    return mean + layout.zero_int, spread
 
 
 FRAMES, ANSWERS = "frames.bin", "answers.bin"

@@ -362,7 +362,7 @@ class Profile:
         """Multiply-accumulates of a step by layer; the dense layer is computed once per step."""
         names = (f"layer {n}" for n in range(1, len(self.arch.layers) + 1))
         macs = {name: m * self.arch.step for name, m in zip(names, self.arch.macs_per_position, strict=True)}
-        return macs | {"dense": self.arch.classes * self.arch.filters[-1]}
+        return macs | {"dense": self.arch.classes * self.arch.features}
 
     @property
     def window_instructions(self) -> dict[str, int]:

@@ -11,14 +11,14 @@ windows on which int8 and float disagree from 4 % to 1.5 %.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ArchError, BundleError
-from plushsense.models.arch import Arch
+from plushsense.models.arch import NORM_EPSILON, Arch, VectorLayer
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import Network, affine
 from plushsense.runtime.classifier import BothEngines, IntegerClassifier, StreamClassifier, StreamReader
@@ -34,6 +34,7 @@ from plushsense.runtime.fixed import (
 )
 from plushsense.runtime.image import IntegerModel
 from plushsense.runtime.integer import IntegerDense, IntegerLayer, IntegerNetwork, deployable
+from plushsense.runtime.vectors import AXIS_LIMIT, MOST_AXIS_SHIFT, IntegerVectors, down_for
 from plushsense.windows.features import Scaler
 
 Floats = NDArray[np.float64]
@@ -53,18 +54,21 @@ _OUTSIDE = 1e-5
 class Ranges:
     """Value ranges of a network: scaled inputs ``low`` to ``high`` (C,), activations of each layer 0 to ``tops`` (F,).
 
-    Activations are before normalisation; ``means`` holds the means of the inputs (C,), then of each layer (F,).
+    Activations are before normalisation; ``means`` holds the means of the inputs (C,), then of each layer (F,). With a
+    vector layer, the inputs are its outputs; ``axes`` (V,) holds the largest scaled value of an axis of each vector.
     """
 
     low: Floats
     high: Floats
     tops: tuple[Floats, ...]
     means: tuple[Floats, ...]
+    axes: Floats = field(default_factory=lambda: np.empty(0))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the ranges as plain values for JSON."""
         lists = {name: [part.tolist() for part in getattr(self, name)] for name in ("tops", "means")}
-        return {"low": self.low.tolist(), "high": self.high.tolist(), **lists}
+        axes = {"axes": self.axes.tolist()} if len(self.axes) else {}
+        return {"low": self.low.tolist(), "high": self.high.tolist(), **lists, **axes}
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Ranges:
@@ -76,7 +80,7 @@ class Ranges:
         try:
             low, high = (np.asarray(table[name], dtype=np.float64) for name in ("low", "high"))
             tops, means = (tuple(np.asarray(t, dtype=np.float64) for t in table[name]) for name in ("tops", "means"))
-            return cls(low, high, tops, means)
+            return cls(low, high, tops, means, np.asarray(table.get("axes", ()), dtype=np.float64))
         except KeyError as missing:
             raise BundleError(
                 f"The calibration in the bundle lacks {missing} (it was made by an earlier PlushSense): train it "
@@ -87,23 +91,31 @@ class Ranges:
 
     def check(self, arch: Arch) -> None:
         """Raise BundleError if the ranges do not fit the network ``arch``."""
-        needed = [arch.channels, arch.channels, *arch.filters, arch.channels, *arch.filters]
-        parts = [self.low, self.high, *self.tops, *self.means]
+        inputs, filters = arch.inputs[0], arch.trunk.filters
+        needed = [inputs, inputs, *filters, inputs, *filters, 0 if arch.vector is None else arch.vector.vectors]
+        parts = [self.low, self.high, *self.tops, *self.means, self.axes]
         if [p.shape for p in parts] != [(n,) for n in needed] or not all(np.isfinite(p).all() for p in parts):
             raise BundleError(f"The calibration is not that of {arch.title}, or holds no numbers: train again.")
 
 
 def calibrate(network: Network, x: NDArray[np.floating[Any]]) -> Ranges:
     """Measure the ranges of scaled training windows (N, C, T) in every layer of the network."""
-    low, high = np.quantile(x, [_INPUTS_OUTSIDE, 1 - _INPUTS_OUTSIDE], axis=(0, 2))
-    activations: list[list[Floats]] = [[] for _ in network.arch.filters]
+    axes, first = np.empty(0), np.asarray(x)
+    if network.vectors is not None:
+        layer = network.vectors.layer
+        vectors = x[:, x.shape[1] - layer.axes : -3].reshape(len(x), layer.vectors, 3, -1)
+        axes = np.abs(vectors).max(axis=(0, 2, 3)).astype(np.float64)
+        parts = [network.convolved(x[at : at + _BATCH]) for at in range(0, len(x), _BATCH)]
+        first = np.concatenate(parts).transpose(0, 2, 1)
+    low, high = np.quantile(first, [_INPUTS_OUTSIDE, 1 - _INPUTS_OUTSIDE], axis=(0, 2))
+    activations: list[list[Floats]] = [[] for _ in network.blocks]
     for at in range(0, len(x), _BATCH):
         for values, z in zip(activations, network.rectified(x[at : at + _BATCH]), strict=True):
             values.append(z.reshape(-1, z.shape[2]))
     rows = [np.concatenate(values) for values in activations]
     tops = tuple(np.quantile(row, 1 - _OUTSIDE, axis=0) for row in rows)
-    inputs = np.asarray(x.mean(axis=(0, 2), dtype=np.float64))
-    return Ranges(low, high, tops, (inputs, *(row.mean(axis=0) for row in rows)))
+    inputs = np.asarray(first.mean(axis=(0, 2), dtype=np.float64))
+    return Ranges(low, high, tops, (inputs, *(row.mean(axis=0) for row in rows)), axes)
 
 
 def refuse_undeployable(arch: Arch) -> None:
@@ -157,7 +169,38 @@ def quantize(arch: Arch, weights: Mapping[str, NDArray[Any]], scaler: Scaler, ra
     w, b = weights["dense.weight"].astype(np.float64), weights["dense.bias"].astype(np.float64)
     whole, bias, size = _eight_bits(w * unit / arch.pooled, b + w @ start, _codes(mean, start, unit) * arch.pooled)
     dense = IntegerDense(whole, bias, LogitScale(*_split(size * 256, 1 << 14)))
-    return IntegerNetwork(arch, _input_scale(scaler, ranges.low, span / 255), tuple(layers), dense)
+    vectors = None
+    if arch.vector is not None:
+        vectors, scaler = _vectors(arch, arch.vector, weights, scaler, ranges.axes)
+    return IntegerNetwork(arch, _input_scale(scaler, ranges.low, span / 255), tuple(layers), dense, vectors)
+
+
+def _vectors(
+    arch: Arch, layer: VectorLayer, weights: Mapping[str, NDArray[Any]], scaler: Scaler, most: Floats
+) -> tuple[IntegerVectors, Scaler]:
+    """Quantize the vector layer; also return the scaling from its integers to its standardized outputs.
+
+    The shifts leave twice the range of the training windows; values beyond it are clamped.
+    """
+    others = arch.channels - layer.axes
+    w = weights["vector.weight"].astype(np.float64)
+    step = np.maximum(np.abs(w).max(axis=2) / 127, 1e-30)
+    whole = np.rint(w / step[:, :, None]).astype(np.int8)
+    down = down_for(whole)
+    units, shifts = [scaler.scale[:others]], list[int]()
+    for number in range(layer.vectors):
+        scale = float(scaler.scale[others + 3 * number])
+        room = np.log2(AXIS_LIMIT / max(2.0 * float(most[number]) / scale, 1.0))
+        shift = int(min(max(np.floor(room), -MOST_AXIS_SHIFT), MOST_AXIS_SHIFT))
+        unit = scale * 2.0**-shift
+        lengths = step[number] * unit * 2.0 ** down[number]
+        units += [lengths, lengths, np.sqrt(lengths * np.roll(lengths, -1)), np.array([unit])]
+        shifts.append(shift)
+    vectors = IntegerVectors(layer, np.array(shifts, dtype=np.int64), whole, down)
+    size = np.concatenate(units)
+    offset = np.concatenate([scaler.offset[:others], np.zeros(len(size) - others)])
+    gain = 1.0 / np.sqrt(weights["vector.var"].astype(np.float64) + NORM_EPSILON)
+    return vectors, Scaler(offset + weights["vector.mean"].astype(np.float64) / size, size * gain)
 
 
 def _codes(mean: Floats, start: Floats, unit: Floats) -> Floats:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BadInput, ConfigError, DatasetError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.core.layouts import Layout
 from plushsense.dataset.index import as_dataset, open_dataset
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.evaluation.crossval import fold_fingerprint, fold_windows, windows_fingerprint
@@ -46,7 +47,14 @@ from plushsense.tuning.decisions import (
 )
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, choose_classes, outside_streams, silent, windows_for
+from plushsense.workflow.preparation import (
+    Warn,
+    choose_classes,
+    network_inputs_of,
+    outside_streams,
+    silent,
+    windows_for,
+)
 from plushsense.workflow.reporting import journal_of
 
 if TYPE_CHECKING:
@@ -297,6 +305,7 @@ class _AnswerWork:
     arch: Arch
     spec: TrainSpec
     gestures: GestureSet
+    layout: Layout
     coverage: float
     known_share: float
 
@@ -304,7 +313,7 @@ class _AnswerWork:
         from plushsense.training.fit import fit
 
         fold, withheld = task
-        dataset = _opened(self.dataset)
+        dataset = _opened(self.dataset).with_inputs(self.layout)
         gestures = self.gestures.subset([g for g in self.gestures.labels if g != withheld])
         train, validation = (_without(shared.take(at), withheld) for at in (fold.train, fold.validation))
         arch = replace(self.arch, classes=len(gestures))
@@ -369,8 +378,7 @@ def abstaining(
         ConfigError: for a split of windows or recordings; DatasetError: for a data set without streams.
         BadInput: when the test or the validation people have no recordings in streams.
     """
-    dataset = as_dataset(dataset)
-    config = config or from_settings(**settings)
+    dataset, config = network_inputs_of(as_dataset(dataset), config or from_settings(**settings))
     parsed = parse_split(split)
     if not parsed.apart:
         raise ConfigError(
@@ -406,7 +414,7 @@ def abstaining(
     reporter = JobsReporter({job.id: JobInfo(job.task[0].name, 1.0) for job in jobs}, progress=progress)
     results = run_jobs(
         jobs,
-        _AnswerWork(str(dataset.path), arch, config.training, gestures, coverage, known_share),
+        _AnswerWork(str(dataset.path), arch, config.training, gestures, dataset.layout, coverage, known_share),
         shared=windows,
         workers=config.evaluation.processes,
         journal=journal_of(dataset, "abstaining"),

@@ -30,7 +30,7 @@ from plushsense.scoring import metrics
 from plushsense.scoring.splits import Fold, parse_split, purge
 from plushsense.windows.cut import WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, choose_classes, silent, windows_for
+from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, silent, windows_for
 
 Predictor = Callable[[WindowSet], NDArray[np.floating[Any]]]
 """Returns the probabilities (N, K) of windows."""
@@ -299,6 +299,7 @@ def adapt(
     with tempfile.TemporaryDirectory(prefix="plushsense-") as place:
         dataset = _dataset(recordings, given, Path(place))
         person = _person(dataset, subject)
+        dataset = dataset.with_inputs(given.layout)
         _same_layout(given, dataset)
         _warn_of_training(given, person, warn)
         own, left_out = _recordings_of(dataset, person, given, warn)
@@ -424,8 +425,7 @@ def evaluate_adapting(
     Returns:
         What `score_adaptation` returns, and ``split``, ``simulated``, ``spec``.
     """
-    dataset = as_dataset(dataset)
-    config = config or from_settings(**settings)
+    dataset, config = network_inputs_of(as_dataset(dataset), config or from_settings(**settings))
     spec = spec or PersonalSpec()
     if use < spec.least or random < 0:
         raise ConfigError(f"--use {use}, --choices {random}: accepted are {spec.least} and more, 0 and more.")

@@ -2,13 +2,15 @@
 
 Layers are joined by ``_``; each is a kernel length, and ``d`` with a dilation (paper, section 3.6.2). A layer is
 Conv1d → ReLU → normalisation; the mean over time and one dense layer follow the last one.
+
+A first token ``v`` with a kernel length, as in ``v14_19d2_19d4``, is a vector layer (see `VectorLayer`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Literal, NoReturn, cast, get_args
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, NamedTuple, NoReturn, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +22,20 @@ MAX_LAYERS = 4
 MAX_NUMBER = 4096  # of a kernel, a dilation, a filter count: limits memory; far above any useful value
 
 
-def parse_symbol(spec: str) -> tuple[tuple[int, int], ...]:
-    """Return the (kernel, dilation) pairs of a symbol.
+class Symbol(NamedTuple):
+    """A parsed symbol: the kernel length of the vector layer, if there is one, and (kernel, dilation) of the others."""
+
+    vector: int | None
+    layers: tuple[tuple[int, int], ...]
+
+    @property
+    def filter_counts(self) -> int:
+        """Number of filter counts that the network needs."""
+        return len(self.layers) + (self.vector is not None)
+
+
+def parse_symbol(spec: str) -> Symbol:
+    """Return the layers of a symbol.
 
     Raises:
         ArchError: with the symbol and a caret under the first invalid character.
@@ -29,7 +43,12 @@ def parse_symbol(spec: str) -> tuple[tuple[int, int], ...]:
     if not spec:
         fail("nothing is given: write kernel lengths joined by '_', as in 14d1_39d2_41d4", spec, 0)
     layers: list[tuple[int, int]] = []
-    at = 0
+    vector, at = None, 0
+    if spec.startswith("v"):
+        vector, at = _number(spec, 1, "the kernel length of the vector layer")
+        if spec[at : at + 1] != "_":
+            fail("a vector layer has no dilation, and at least one more layer after '_'", spec, at)
+        at += 1
     while True:
         if len(layers) == MAX_LAYERS:
             fail(f"more than {MAX_LAYERS} layers: take some away", spec, at)
@@ -39,7 +58,7 @@ def parse_symbol(spec: str) -> tuple[tuple[int, int], ...]:
             dilation, at = _number(spec, at + 1, f"the dilation of layer {len(layers) + 1}")
         layers.append((kernel, dilation))
         if at == len(spec):
-            return tuple(layers)
+            return Symbol(vector, tuple(layers))
         if spec[at] != "_":
             known = "'_' or the end" if "d" in spec[max(spec.rfind("_", 0, at), 0) : at] else "'d', '_' or the end"
             fail(f"unknown token {spec[at]!r}: accepted here are {known}", spec, at)
@@ -103,6 +122,7 @@ NORMS: tuple[str, ...] = get_args(Norm)
 NORM_EPSILON = 1e-5
 DEFAULT_SYMBOL = "14d1_19d2_19d4"
 DEFAULT_FILTERS = (8, 12, 16)
+VECTOR_SYMBOL = "v14_19d2_19d4"
 
 PAPER_FILTERS: tuple[tuple[int, ...], ...] = (
     (4, 6, 8, 8),
@@ -147,6 +167,49 @@ class ConvLayer:
 
 
 @dataclass(frozen=True)
+class VectorLayer:
+    """First layer for the axes of vectors, such as those of an accelerometer, that turn with the toy.
+
+    The last inputs of the network are the axes (x, y, z) of each of the ``vectors``, then gravity. ``filters`` kernels
+    of ``kernel`` taps are the same for all axes of a vector, so that each gives a vector d (Vector Neurons, Deng et al.
+    2021, 10.1109/ICCV48922.2021.01198). With the unit vector u of gravity, the outputs do not depend on how the toy is
+    held:
+
+    - v = u · d, the vertical part,
+    - n = |d − v u|, the length of the horizontal part h,
+    - c = ±√|u · (h × h')|, the sense of rotation from h to h', that of the next kernel (after the last, the first),
+    - |a|, the length of the vector itself at the newest sample.
+
+    The outputs are the other inputs at the newest sample, then for each vector all v, all n, all c and |a|; they are
+    then standardized, with running means and variances and no gain.
+    """
+
+    kernel: int
+    filters: int
+    vectors: int
+
+    @property
+    def reach(self) -> int:
+        """Number of samples before the current one that the layer reads."""
+        return self.kernel - 1
+
+    @property
+    def axes(self) -> int:
+        """Number of inputs that are axes, including those of gravity."""
+        return 3 * self.vectors + 3
+
+    @property
+    def invariants(self) -> int:
+        """Number of outputs for each vector."""
+        return 3 * self.filters + 1
+
+    @property
+    def macs(self) -> int:
+        """Multiply-accumulates of the kernels at one position."""
+        return 3 * self.vectors * self.filters * self.kernel
+
+
+@dataclass(frozen=True)
 class Arch:
     """The structure of a network, without its weights.
 
@@ -163,6 +226,7 @@ class Arch:
     window: int = 250
     step: int = 5
     pool: int | None = None
+    vector: VectorLayer | None = None
 
     def __post_init__(self) -> None:
         if not self.layers or len(self.layers) > MAX_LAYERS:
@@ -174,6 +238,8 @@ class Arch:
         check_known(self.padding, PADDINGS, "padding", ArchError)
         check_known(self.norm, NORMS, "norm", ArchError)
         _in_range("channels", self.channels, 1, MAX_NUMBER)
+        if self.vector is not None:
+            self._check_vector(self.vector)
         _in_range("classes", self.classes, 2, MAX_NUMBER)
         _in_range("window", self.window, 2, 1_000_000)
         _in_range("step", self.step, 1, self.window, " (the window)")
@@ -195,6 +261,18 @@ class Arch:
                     f"give {below} or {below + self.step}."
                 )
 
+    def _check_vector(self, vector: VectorLayer) -> None:
+        _in_range("the kernel of the vector layer", vector.kernel, 1, MAX_NUMBER)
+        _in_range("the filter count of the vector layer", vector.filters, 2, 64)
+        _in_range("the number of vectors", vector.vectors, 1, 8)
+        if self.padding != "stream":
+            raise ArchError(f"A vector layer needs the padding 'stream', not '{self.padding}': change the padding.")
+        if self.channels < vector.axes:
+            raise ArchError(
+                f"A vector layer for {vector.vectors} vectors reads {vector.axes} axes, with those of gravity, but "
+                f"there are {self.channels} channels: give the inputs of a layout with vectors."
+            )
+
     @classmethod
     def parse(
         cls,
@@ -208,8 +286,11 @@ class Arch:
         window: int = 250,
         step: int = 5,
         pool: int | None = None,
+        vectors: int = 1,
     ) -> Arch:
         """Build a network from its symbol and its filter counts (``(8, 12)`` or ``"8,12"``; extra ones are ignored).
+
+        ``vectors`` is their number, besides gravity, for a symbol with a vector layer.
 
         Raises:
             ArchError: for an invalid symbol (with a caret under the character) or setting.
@@ -220,23 +301,29 @@ class Arch:
             if isinstance(filters, str)
             else tuple(int(f) if isinstance(f, np.integer) else f for f in filters)
         )
-        if len(counts) < len(shape):
+        if len(counts) < shape.filter_counts:
             given = ",".join(str(f) for f in counts) or "nothing"
-            example = ",".join(str(f) for f in PAPER_FILTERS[1][: len(shape)])
+            example = ",".join(str(f) for f in (*PAPER_FILTERS[1], 16)[: shape.filter_counts])
             fail(
-                f"{len(shape)} layers but only {len(counts)} filter counts ({given}): "
+                f"{shape.filter_counts} layers but only {len(counts)} filter counts ({given}): "
                 f"give one count a layer, for example {example}",
                 spec,
                 sum(len(part) + 1 for part in spec.split("_")[: len(counts)]),
             )
-        layers = tuple(ConvLayer(k, d, f) for (k, d), f in zip(shape, counts, strict=False))
-        return cls(layers, channels, classes, cast(Padding, padding), cast(Norm, norm), window, step, pool)
+        vector = None
+        if shape.vector is not None:
+            vector, counts = VectorLayer(shape.vector, counts[0], vectors), counts[1:]
+        layers = tuple(ConvLayer(k, d, f) for (k, d), f in zip(shape.layers, counts, strict=False))
+        return cls(layers, channels, classes, cast(Padding, padding), cast(Norm, norm), window, step, pool, vector)
 
     @property
     def symbol(self) -> str:
         """The symbol as the paper writes it: with dilations if any of them is not 1."""
         dilated = any(layer.dilation > 1 for layer in self.layers)
-        return "_".join(f"{layer.kernel}d{layer.dilation}" if dilated else f"{layer.kernel}" for layer in self.layers)
+        first = [] if self.vector is None else [f"v{self.vector.kernel}"]
+        return "_".join(
+            first + [f"{layer.kernel}d{layer.dilation}" if dilated else f"{layer.kernel}" for layer in self.layers]
+        )
 
     @property
     def title(self) -> str:
@@ -245,24 +332,41 @@ class Arch:
 
     @property
     def filters(self) -> tuple[int, ...]:
-        """Filter count of each layer."""
-        return tuple(layer.filters for layer in self.layers)
+        """Filter count of each layer, beginning with the vector layer if there is one."""
+        first = [] if self.vector is None else [self.vector.filters]
+        return (*first, *(layer.filters for layer in self.layers))
 
     @property
     def inputs(self) -> tuple[int, ...]:
-        """Number of input channels of each layer."""
-        return (self.channels, *self.filters[:-1])
+        """Number of input channels of each convolution layer."""
+        first = self.channels
+        if self.vector is not None:
+            first += self.vector.vectors * self.vector.invariants - self.vector.axes
+        return (first, *(layer.filters for layer in self.layers[:-1]))
+
+    @property
+    def features(self) -> int:
+        """Number of inputs of the dense layer."""
+        return self.layers[-1].filters
+
+    @property
+    def trunk(self) -> Arch:
+        """The network after its vector layer; the network itself if it has none."""
+        return self if self.vector is None else replace(self, channels=self.inputs[0], vector=None)
 
     @property
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of each tensor of the network by name; a dict of weights has exactly these keys."""
         shapes: dict[str, tuple[int, ...]] = {}
+        if self.vector is not None:
+            shapes["vector.weight"] = (self.vector.vectors, self.vector.filters, self.vector.kernel)
+            shapes["vector.mean"] = shapes["vector.var"] = (self.inputs[0],)
         for i, (layer, read) in enumerate(zip(self.layers, self.inputs, strict=True)):
             shapes[f"conv{i}.weight"] = (layer.filters, read, layer.kernel)
             shapes[f"conv{i}.bias"] = (layer.filters,)
             for name in ("gain", "shift", "mean", "var") if self.norm == "batch" else ("gain", "shift"):
                 shapes[f"norm{i}.{name}"] = (layer.filters,)
-        shapes["dense.weight"] = (self.classes, self.filters[-1])
+        shapes["dense.weight"] = (self.classes, self.features)
         shapes["dense.bias"] = (self.classes,)
         return shapes
 
@@ -275,7 +379,8 @@ class Arch:
     @property
     def receptive_field(self) -> int:
         """Number of samples that one position of the last layer depends on."""
-        return 1 + sum(layer.reach for layer in self.layers)
+        first = 0 if self.vector is None else self.vector.reach
+        return 1 + first + sum(layer.reach for layer in self.layers)
 
     @property
     def pooled(self) -> int:
@@ -289,10 +394,10 @@ class Arch:
 
     @property
     def positions(self) -> tuple[int, ...]:
-        """Number of positions that each layer computes for one decision from ``span`` samples."""
+        """Number of positions that each convolution layer computes for one decision from ``span`` samples."""
         if self.padding != "stream":
             return (self.window,) * len(self.layers)
-        after, left = [], self.span
+        after, left = [], self.trunk.span
         for layer in self.layers:
             left -= layer.reach
             after.append(left)
@@ -300,18 +405,20 @@ class Arch:
 
     @property
     def macs_per_position(self) -> tuple[int, ...]:
-        """Multiply-accumulates of each layer at one position (convolutions only, as the paper counts)."""
+        """Multiply-accumulates of each convolution layer at one position (without others, as the paper counts)."""
         return tuple(k.kernel * read * k.filters for k, read in zip(self.layers, self.inputs, strict=True))
 
     @property
     def macs_per_sample(self) -> int:
         """Multiply-accumulates for one new sample when the network runs sample by sample."""
-        return sum(self.macs_per_position)
+        first = 0 if self.vector is None else self.vector.macs
+        return first + sum(self.macs_per_position)
 
     @property
     def macs_per_window(self) -> int:
         """Multiply-accumulates of one decision from a whole window (``stream``: from ``span`` samples)."""
-        return sum(m * n for m, n in zip(self.macs_per_position, self.positions, strict=True))
+        first = 0 if self.vector is None else self.vector.macs * self.trunk.span
+        return first + sum(m * n for m, n in zip(self.macs_per_position, self.positions, strict=True))
 
     @property
     def macs_per_step(self) -> int:
@@ -323,14 +430,16 @@ class Arch:
         """Bytes of state that the network keeps between samples with 8-bit activations.
 
         ``stream``: a ring buffer of reach + 1 samples before each layer, and pool / step block sums of 16 bits for
-        each feature. Otherwise a ring buffer of the window, from which all activations are computed again.
+        each feature; before a vector layer, a ring buffer of its axes with 16 bits. Otherwise a ring buffer of the
+        window, from which all activations are computed again.
         `plushsense.runtime.image.memory_bytes` gives all memory of a toy: also padding of the buffers to a multiple of
         4, the clock, sums and probabilities.
         """
         if self.pool is None:
             return self.window * self.channels
         rings = sum((layer.reach + 1) * read for layer, read in zip(self.layers, self.inputs, strict=True))
-        return rings + 2 * self.filters[-1] * (self.pool // self.step)
+        axes = 0 if self.vector is None else 2 * 3 * self.vector.vectors * self.vector.kernel
+        return axes + rings + 2 * self.features * (self.pool // self.step)
 
     @property
     def table3(self) -> str | None:
@@ -344,13 +453,14 @@ class Arch:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON; the layers as their symbol."""
-        others = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "layers"}
-        return {"symbol": self.symbol, "filters": list(self.filters), **others}
+        others = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("layers", "vector")}
+        vectors = {} if self.vector is None else {"vectors": self.vector.vectors}
+        return {"symbol": self.symbol, "filters": list(self.filters), **others, **vectors}
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Arch:
         """Build the network that ``to_dict`` described; raise ArchError for a missing, unknown or invalid key."""
-        known = ("symbol", "filters", "channels", "classes", "padding", "norm", "window", "step", "pool")
+        known = ("symbol", "filters", "channels", "classes", "padding", "norm", "window", "step", "pool", "vectors")
         refuse_unknown(table, known, "an architecture", ArchError)
         missing = [key for key in known[:2] if key not in table]
         if missing:

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import need
-from plushsense.models.arch import NORM_EPSILON, Arch
+from plushsense.models.arch import NORM_EPSILON, Arch, VectorLayer
 from plushsense.models.reference import check_weights, check_windows
+from plushsense.models.vectors import LENGTH_EPSILON, TURN_EPSILON
 
 try:
     import torch
@@ -26,6 +27,8 @@ except ModuleNotFoundError:
     raise
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+MOMENTUM = 0.1  # of running means and variances
 
 
 def _mirrored(x: Tensor, left: int) -> Tensor:
@@ -61,7 +64,51 @@ class _Block(nn.Module):
         if self.norm == "layer":
             rows = F.layer_norm(z.permute(0, 2, 3, 1), (z.shape[1],), self.gain, self.shift, NORM_EPSILON)
             return rows.permute(0, 3, 1, 2)
-        return F.batch_norm(z, self.mean, self.var, self.gain, self.shift, self.training, 0.1, NORM_EPSILON)
+        return F.batch_norm(z, self.mean, self.var, self.gain, self.shift, self.training, MOMENTUM, NORM_EPSILON)
+
+
+class VectorNet(nn.Module):
+    """The vector layer of `plushsense.models.arch.VectorLayer`: inputs (N, C, T) → outputs (N, M, T')."""
+
+    def __init__(self, layer: VectorLayer, arch: Arch) -> None:
+        super().__init__()
+        self.layer, self._others = layer, arch.channels - layer.axes
+        shape = layer.vectors, layer.filters, layer.kernel
+        # About half of the usual variance: lengths add three axes.
+        self.weight = nn.Parameter(torch.randn(shape) * (0.5 / layer.kernel) ** 0.5)
+        self.mean: Tensor
+        self.var: Tensor
+        self.register_buffer("mean", torch.zeros(arch.inputs[0]))
+        self.register_buffer("var", torch.ones(arch.inputs[0]))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Compute the outputs; in training mode, standardize them by the batch and update the running statistics."""
+        n, _, t = x.shape
+        newest = x[:, :, self.layer.reach :]
+        gravity = newest[:, -3:]
+        up = (gravity * (gravity.square().sum(1, keepdim=True) + LENGTH_EPSILON).rsqrt())[:, :, None]
+        parts = [newest[:, : self._others]]
+        for number, weight in enumerate(self.weight):
+            first = self._others + 3 * number
+            axes = x[:, first : first + 3]
+            d = F.conv1d(axes.reshape(3 * n, 1, t), weight[:, None]).view(n, 3, len(weight), -1)
+            vertical = (d * up).sum(1)
+            h = d - vertical[:, None] * up
+            length = (h.square().sum(1) + LENGTH_EPSILON).sqrt()
+            turn = (torch.linalg.cross(h, h.roll(-1, 2), dim=1) * up).sum(1)
+            parts += [vertical, length, turn * (turn.square() + TURN_EPSILON).pow(-0.25)]
+            newest_axes = newest[:, first : first + 3]
+            parts.append((newest_axes.square().sum(1, keepdim=True) + LENGTH_EPSILON).sqrt())
+        z = torch.cat(parts, dim=1)
+        return F.batch_norm(z, self.mean, self.var, None, None, self.training, MOMENTUM, NORM_EPSILON)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the tensors by their names in a weights dict."""
+        return {f"vector.{name}": getattr(self, name) for name in ("weight", "mean", "var")}
+
+    def export_weights(self) -> dict[str, NDArray[np.float32]]:
+        """Return a copy of the weights as float32 arrays."""
+        return {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.tensors().items()}
 
 
 class Net(nn.Module):
@@ -73,13 +120,17 @@ class Net(nn.Module):
     def __init__(self, arch: Arch) -> None:
         super().__init__()
         self.arch = arch
+        self.vectors = None if arch.vector is None else VectorNet(arch.vector, arch)
         self.blocks = nn.ModuleList(_Block(arch, i) for i in range(len(arch.layers)))
-        self.dense = nn.Linear(arch.filters[-1], arch.classes)
+        self.dense = nn.Linear(arch.features, arch.classes)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return logits (N, K); only the last ``arch.span`` samples of each window are used."""
         check_windows(self.arch, tuple(x.shape))
-        z = x[:, :, x.shape[2] - self.arch.span :].unsqueeze(2).contiguous(memory_format=torch.channels_last)
+        z = x[:, :, x.shape[2] - self.arch.span :]
+        if self.vectors is not None:
+            z = self.vectors(z)
+        z = z.unsqueeze(2).contiguous(memory_format=torch.channels_last)
         for block in self.blocks:
             z = block(z)
         return cast(Tensor, self.dense(z.mean(dim=(2, 3))))
@@ -87,6 +138,8 @@ class Net(nn.Module):
     def _tensors(self) -> dict[str, Tensor]:
         """Return the tensors by their names in a weights dict; here a ``conv{i}.weight`` is (F, C, 1, K)."""
         named: dict[str, Tensor] = {"dense.weight": self.dense.weight, "dense.bias": self.dense.bias}
+        if self.vectors is not None:
+            named |= self.vectors.tensors()
         for i, module in enumerate(self.blocks):
             block = cast(_Block, module)
             named |= {f"conv{i}.weight": block.conv.weight, f"conv{i}.bias": cast(Tensor, block.conv.bias)}

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plushsense.core.errors import BadInput, BundleError
-from plushsense.models.arch import NORM_EPSILON, Arch, ConvLayer, reflected
+from plushsense.models.arch import NORM_EPSILON, Arch, ConvLayer, VectorLayer, reflected
+from plushsense.models.vectors import VectorStage
 
 Floats = NDArray[np.float64]
 
@@ -201,6 +202,7 @@ class Network:
     def __init__(self, arch: Arch, weights: Weights) -> None:
         check_weights(arch, weights)
         self.arch = arch
+        self.vectors = None if arch.vector is None else VectorStage(arch.vector, arch, weights)
         self.blocks = tuple(_Block.of(arch, i, weights) for i in range(len(arch.layers)))
         self._dense = weights["dense.weight"].T.astype(np.float64)
         self._bias = weights["dense.bias"].astype(np.float64)
@@ -220,17 +222,22 @@ class Network:
             BadInput: as in `forward`.
         """
         check_windows(self.arch, x.shape)
-        z: Floats = np.ascontiguousarray(x[:, :, x.shape[2] - self.arch.span :].transpose(0, 2, 1), dtype=np.float64)
+        z = self.convolved(x[:, :, x.shape[2] - self.arch.span :])
         for block in self.blocks:
             z = _through(z, block, self.arch)
         return np.asarray(z.mean(axis=1))
+
+    def convolved(self, x: NDArray[np.floating[Any]]) -> Floats:
+        """Return the inputs of the first convolution (N, T', C') for scaled windows (N, C, T)."""
+        z: Floats = np.ascontiguousarray(x.transpose(0, 2, 1), dtype=np.float64)
+        return z if self.vectors is None else self.vectors(taps_of(z, tap_layer(self.vectors.layer)))
 
     def rectified(self, x: NDArray[np.floating[Any]]) -> list[Floats]:
         """Return the ReLU outputs (N, T', F) of each layer, before normalisation, for scaled windows (N, C, T).
 
         Only for networks with the padding ``stream`` and batch normalisation.
         """
-        z: Floats = np.ascontiguousarray(x.transpose(0, 2, 1), dtype=np.float64)
+        z = self.convolved(x)
         seen = []
         for block in self.blocks:
             taps = taps_of(z, block.layer)
@@ -333,9 +340,13 @@ class _Streaming(_FloatStepper):
     """Stepper for the padding ``stream``, in which every layer output is computed once."""
 
     def _clear(self) -> None:
-        self._rings, self._pool = stream_state(self.arch)
+        self._rings, self._pool = stream_state(self.arch.trunk)
+        self._axes = axes_ring(self.arch)
 
     def _advance(self, chunk: Floats) -> Floats:
+        if self._axes is not None and self.network.vectors is not None:
+            taps = self._axes.feed(chunk)
+            chunk = self.network.vectors(taps.reshape(len(taps), self._axes.layer.kernel, self.arch.channels))
         for ring, block in zip(self._rings, self.network.blocks, strict=True):
             taps = ring.feed(chunk)
             if not len(taps):
@@ -357,10 +368,20 @@ class _Recomputing(_FloatStepper):
         return self.network.forward(due.transpose(0, 2, 1)) if len(due) else np.empty((0, self.arch.classes))
 
 
+def tap_layer(layer: VectorLayer) -> ConvLayer:
+    """Return a convolution layer that reads the same samples as a vector layer."""
+    return ConvLayer(layer.kernel, 1, layer.filters)
+
+
+def axes_ring(arch: Arch) -> SampleRing | None:
+    """Return the buffer before the vector layer of a network; None if it has none."""
+    return None if arch.vector is None else SampleRing(tap_layer(arch.vector), arch.channels)
+
+
 def stream_state(arch: Arch) -> tuple[list[SampleRing], Pool]:
     """Return the state of a ``stream`` network between samples: a buffer before each layer, and the pooling."""
     rings = [SampleRing(layer, read) for layer, read in zip(arch.layers, arch.inputs, strict=True)]
-    return rings, Pool(arch.step, arch.pooled // arch.step, arch.filters[-1])
+    return rings, Pool(arch.step, arch.pooled // arch.step, arch.features)
 
 
 def random_weights(arch: Arch, seed: int) -> dict[str, NDArray[np.float32]]:
@@ -376,6 +397,14 @@ def random_weights(arch: Arch, seed: int) -> dict[str, NDArray[np.float32]]:
 
     x = np.cumsum(rng.normal(size=(6, arch.span, arch.channels)), axis=1)
     x = (x - x.mean(axis=(0, 1))) / x.std(axis=(0, 1)) + 0.3 * rng.normal(size=x.shape)
+    if arch.vector is not None:
+        put("vector.weight", rng.normal(size=arch.weight_shapes["vector.weight"]) / np.sqrt(arch.vector.kernel))
+        put("vector.mean", np.zeros(arch.inputs[0]))
+        put("vector.var", np.ones(arch.inputs[0]))
+        seen = VectorStage(arch.vector, arch, weights).invariants(taps_of(x, tap_layer(arch.vector)))
+        put("vector.mean", seen.mean(axis=(0, 1)))
+        put("vector.var", seen.var(axis=(0, 1)))
+        x = VectorStage(arch.vector, arch, weights)(taps_of(x, tap_layer(arch.vector)))
     for i, (layer, read) in enumerate(zip(arch.layers, arch.inputs, strict=True)):
         f, taps = layer.filters, layer.kernel * read
         put(f"conv{i}.weight", rng.normal(size=(f, read, layer.kernel)) * np.sqrt(2.0 / taps))
@@ -390,6 +419,6 @@ def random_weights(arch: Arch, seed: int) -> dict[str, NDArray[np.float32]]:
             put(f"norm{i}.mean", rows.mean(axis=0) * np.exp(0.1 * rng.normal(size=f)))
             put(f"norm{i}.var", (rows.var(axis=0) + 1e-3) * np.exp(0.2 * rng.normal(size=f)))
         x = _through(x, _Block.of(arch, i, weights), arch)
-    put("dense.weight", 2.0 * rng.normal(size=(arch.classes, arch.filters[-1])) / np.sqrt(arch.filters[-1]))
+    put("dense.weight", 2.0 * rng.normal(size=(arch.classes, arch.features)) / np.sqrt(arch.features))
     put("dense.bias", 0.3 * rng.normal(size=arch.classes))
     return weights

@@ -5,9 +5,12 @@ of everything after the head. The following sections come in this order:
 
 - u8 layers, u8 measured channels, u8 inputs, u8 classes, u16 step, u16 pooled steps, u32 span (samples), u32 period and
   u32 gap in clock units, u32 clock units per millisecond, u16 smoothing weight, u16 layout checksum (`layout_check`)
-- for each measured channel: i32 lowest and i32 highest valid value
-- for each input: u8 kind (0 channel, 1 magnitude), u8 n, n × u8 measured channels, then i32 offset, i32 bias,
-  u16 multiplier, u8 before, u8 after
+- for each measured channel: i32 lowest and i32 highest valid value, i32 zero
+- for each input: u8 kind (0 channel, 1 magnitude, 2 gravity), u8 n, u8 shift of the running mean (else 0), n × u8
+  measured channels
+- vector layer: u8 vectors, u8 filters, u16 taps (all 0 without one); then for each vector: u8 shift + 16, and for each
+  filter: u8 down, taps × u8 weight + 128
+- for each input, or with a vector layer each of its outputs: i32 offset, i32 bias, u16 multiplier, u8 before, u8 after
 - for each layer: u16 kernel, u16 dilation, u16 input channels, u16 filters; for each filter: i32 bias, u16 multiplier,
   u8 before, u8 after; then the weights + 128 as u8, in blocks of 4 filters × 4 channels, ordered by group of 4 filters,
   tap, and group of 4 channels (both padded to a multiple of 4)
@@ -44,12 +47,15 @@ from plushsense.runtime.events import AFFECT_CODES, NO_GESTURE
 from plushsense.runtime.fixed import PROBABILITY_BITS, LogitScale, Requantize
 from plushsense.runtime.gate import JERK
 from plushsense.runtime.integer import IntegerNetwork
+from plushsense.runtime.vectors import MOST_AXIS_SHIFT, IntegerVectors
 
 MAGIC = b"PLSH"
-IMAGE_VERSION = 2  # since 2 with the settings of events, gate and health
+IMAGE_VERSION = 3  # since 2 with the settings of events, gate and health, since 3 with zeros and the vector layer
 HEAD_BYTES = 16
 IDLE_BIT = 4
 GROUP = 4  # number of filters, and of channels, in a block of weights
+MOST_TAPS = 255  # of a vector layer
+_INPUT_KINDS = ("channel", "magnitude", "gravity")
 MOST_CLOCK_UNITS = 1 << 22  # limit for gap and period of the clock: interpolation then needs at most 32 bits
 
 
@@ -89,6 +95,11 @@ class IntegerModel:
                     f"Layer {n} of {arch.title} remembers {layer.reach + 1} samples: in the toy there may be at most "
                     "65535, so take a shorter kernel or a smaller dilation."
                 )
+        if arch.vector is not None and arch.vector.kernel > MOST_TAPS:
+            raise BundleError(
+                f"The vector layer of {arch.title} has kernels of {arch.vector.kernel} taps: in the toy there may be "
+                f"at most {MOST_TAPS}."
+            )
         if arch.pooled // arch.step >= 1 << 16:
             raise BundleError(
                 f"{arch.title} pools {arch.pooled // arch.step} steps: in the toy there may be at most 65535, so take "
@@ -151,16 +162,23 @@ class IntegerModel:
                 ),
             )
         ]
-        for name, low, high in zip(layout.names, layout.valid_min_int, layout.valid_max_int, strict=True):
-            sections.append((f"channel '{name}': valid from {low} to {high}", struct.pack("<ii", low, high)))
-        derived = {d.name: tuple(layout.index(part) for part in d.of) for d in layout.derived}
+        edges = zip(layout.names, layout.valid_min_int, layout.valid_max_int, layout.zero_int, strict=True)
+        for name, low, high, zero in edges:
+            title = f"channel '{name}': valid from {low} to {high}, zero at {zero}"
+            sections.append((title, struct.pack("<iii", low, high, zero)))
+        derived = {d.name: d for d in layout.derived}
+        for name in layout.inputs:
+            kind = derived[name].kind if name in derived else "channel"
+            parts = [layout.index(part) for part in (derived[name].of if name in derived else (name,))]
+            shift = layout.gravity_shift if kind == "gravity" else 0
+            source = bytes([_INPUT_KINDS.index(kind), len(parts), shift, *parts])
+            sections.append((f"input '{name}': {kind}, measured channels", source))
+        sections += _vectors(self.network.vectors)
         scale = self.network.inputs
-        for i, name in enumerate(layout.inputs):
-            parts = derived.get(name) or (layout.index(name),)
+        for i in range(len(scale)):
             row = (int(getattr(scale, n)[i]) for n in ("offset", "bias", "multiplier", "before", "after"))
-            source = bytes([name in derived, len(parts), *parts])
-            sections.append((f"input '{name}': where from; offset, bias, multiplier, shifts", source))
-            sections.append(("", struct.pack("<iiHBB", *row)))
+            title = f"channel {i + 1} of the network: offset, bias, multiplier, shifts"
+            sections.append((title, struct.pack("<iiHBB", *row)))
         for n, (layer, read, part) in enumerate(zip(arch.layers, arch.inputs, self.network.layers, strict=True), 1):
             shape = struct.pack("<HHHH", layer.kernel, layer.dilation, read, layer.filters)
             sizes = f"kernel {layer.kernel}, dilation {layer.dilation}, reads {read} channels, {layer.filters} filters"
@@ -187,6 +205,21 @@ class IntegerModel:
         """Return the bytes of the image."""
         body = b"".join(piece for _, piece in self.sections())
         return image_head(body) + body
+
+
+def _vectors(vectors: IntegerVectors | None) -> list[tuple[str, bytes]]:
+    """Return the sections of the vector layer."""
+    if vectors is None:
+        return [("no vector layer", bytes(4))]
+    layer = vectors.layer
+    sections = [("vector layer: vectors, filters, taps", struct.pack("<BBH", *vectors.weights.shape))]
+    for number, shift in enumerate(vectors.shift.tolist()):
+        sections.append((f"vector {number + 1}: shift of its axes", bytes([shift + MOST_AXIS_SHIFT])))
+        for k in range(layer.filters):
+            weights = (vectors.weights[number, k].astype(np.int16) + 128).astype(np.uint8)
+            title = f"vector {number + 1}: shift and weights of filter {k + 1}"
+            sections.append((title, bytes([int(vectors.down[number, k])]) + weights.tobytes()))
+    return sections
 
 
 def _rules(rules: Rules) -> list[tuple[str, bytes]]:
@@ -228,15 +261,20 @@ def image_head(body: bytes) -> bytes:
 def memory_bytes(model: IntegerModel) -> int:
     """Return the bytes that a toy needs besides its ``plush_toy`` struct; equal to ``plush_memory_bytes`` in C."""
     arch, channels = model.network.arch, len(model.layout.channels)
-    features = arch.filters[-1]
+    features = arch.features
+    gate = model.rules.gate
     pieces = [4 * channels] * 3  # held, before, the sample being made
+    pieces.append(0 if gate.rules else 4 * arch.channels)  # inputs
+    pieces.append(4 * model.layout.input_kinds.count("gravity"))  # running means
+    if arch.vector is not None:
+        pieces += [6 * arch.vector.vectors * arch.vector.kernel, 12 * arch.vector.filters]  # axes, horizontal parts
     for layer, read in zip(arch.layers, arch.inputs, strict=True):
         pieces.append((layer.reach + 1) * _filled(read))
         pieces.append(4 * (layer.dilation if layer.kernel > 1 else 1))  # sums under the taps
     pieces.append(2 * features * (arch.pooled // arch.step))
     pieces += [4 * features, 4 * arch.classes, 4 * arch.classes + 4]  # sums, logits, smoothed probabilities and known
     pieces += [channels, features]  # which channels are valid, the newest features
-    health, gate = model.rules.health, model.rules.gate
+    health = model.rules.health
     if health.low or health.still_ms:
         pieces.append(4 * channels)  # the frame before
     if gate.rules:

@@ -16,8 +16,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from plushsense.core.errors import BadInput, BundleError
 from plushsense.models.arch import Arch
-from plushsense.models.reference import Floats, Stepper, check_windows, stream_state, taps_of
+from plushsense.models.reference import (
+    Floats,
+    Stepper,
+    axes_ring,
+    check_windows,
+    stream_state,
+    tap_layer,
+    taps_of,
+)
 from plushsense.runtime.fixed import Bytes, InputScale, Ints, LogitScale, Requantize
+from plushsense.runtime.vectors import IntegerVectors
 
 _SUM_LIMIT = (1 << 31) - 1
 
@@ -76,6 +85,7 @@ class IntegerNetwork:
     inputs: InputScale
     layers: tuple[IntegerLayer, ...]
     dense: IntegerDense
+    vectors: IntegerVectors | None = None
 
     def __post_init__(self) -> None:
         arch = self.arch
@@ -87,7 +97,9 @@ class IntegerNetwork:
         shapes = arch.weight_shapes
         needed = [shapes[f"conv{i}.weight"] for i in range(len(arch.layers))] + [shapes["dense.weight"]]
         parts: list[IntegerLayer | IntegerDense] = [*self.layers, self.dense]
-        if len(self.inputs) != arch.channels or len(parts) != len(needed):
+        if (self.vectors and self.vectors.layer) != arch.vector:
+            raise BundleError(f"The integer network has another vector layer than {arch.title}.")
+        if len(self.inputs) != arch.inputs[0] or len(parts) != len(needed):
             raise BundleError(
                 f"The integer network is not {arch.title}: it has {len(self.inputs)} inputs and "
                 f"{len(self.layers)} layers."
@@ -124,18 +136,26 @@ class IntegerNetwork:
         return np.concatenate([self._logits(x[at : at + 64]) for at in range(0, len(x), 64)] or [self._none()])
 
     def _logits(self, x: NDArray[Any]) -> Ints:
-        z = self.inputs.apply(x[:, :, x.shape[2] - self.arch.span :].transpose(0, 2, 1)).astype(np.float64)
+        z = self._first(x[:, :, x.shape[2] - self.arch.span :]).astype(np.float64)
         for layer, part in zip(self.arch.layers, self.layers, strict=True):
             taps = taps_of(z, layer)
             z = np.stack([part.apply(each.reshape(len(each), -1)) for each in taps])
         return self.dense.apply(z.sum(axis=1))
+
+    def _first(self, x: NDArray[Any]) -> Bytes:
+        """Return the inputs of the first convolution (N, T', C') of raw windows (N, C, T)."""
+        x = x.transpose(0, 2, 1)
+        if self.vectors is None:
+            return self.inputs.apply(x)
+        taps = taps_of(x.astype(np.float64), tap_layer(self.vectors.layer))
+        return np.stack([self.inputs.apply(self.vectors.apply(each)) for each in taps])
 
     def _none(self) -> Ints:
         return np.empty((0, self.arch.classes), dtype=np.int64)
 
     def activations(self, x: ArrayLike) -> list[Bytes]:
         """Return the inputs of each layer and the output of the last, [(N, T', C')] uint8, of windows (N, C, T)."""
-        outputs = [self.inputs.apply(_whole(x).transpose(0, 2, 1))]
+        outputs = [self._first(_whole(x))]
         for layer, part in zip(self.arch.layers, self.layers, strict=True):
             taps = taps_of(outputs[-1].astype(np.float64), layer)
             outputs.append(np.stack([part.apply(each.reshape(len(each), -1)) for each in taps]).astype(np.uint8))
@@ -164,12 +184,17 @@ class IntegerStepper(Stepper):
         super().__init__(network.arch)
 
     def _clear(self) -> None:
-        self._rings, self._pool = stream_state(self.arch)
+        self._rings, self._pool = stream_state(self.arch.trunk)
+        self._axes = axes_ring(self.arch)
 
     def _values(self, samples: ArrayLike) -> NDArray[Any]:
         return _whole(samples)
 
     def _advance(self, chunk: NDArray[Any]) -> Ints:
+        vectors = self.network.vectors
+        if self._axes is not None and vectors is not None:
+            taps = self._axes.feed(chunk.astype(np.float64))
+            chunk = vectors.apply(taps.reshape(len(taps), vectors.layer.kernel, self.arch.channels))
         z = self.network.inputs.apply(chunk).astype(np.float64)
         for ring, part in zip(self._rings, self.network.layers, strict=True):
             taps = ring.feed(z)

@@ -105,6 +105,7 @@ class FrameReader:
     def reset(self) -> None:
         """Begin a new stream at time 0 and set all counts to 0."""
         self.clock = SampleClock(self.layout)
+        self._inputs.reset()
         self.health.reset()
         self._begun = False
         self.zero_us = self.time_us = 0
@@ -131,11 +132,14 @@ class FrameReader:
         change = health.push(int(device_ms), values)
         if change:
             clock.forget()
+            self._inputs.reset()
         if change == "fault":
             yield Break(self.time_us, "sensor fault")
         if health.fault:
             return
         samples = clock.rows(device_ms, values)
+        if clock.restarted:
+            self._inputs.reset()
         if samples:
             suspect, period = health.suspect, self._period_us
             time_us = (clock.now_us or 0) - (len(samples) - 1) * period - self.zero_us

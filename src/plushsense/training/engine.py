@@ -90,6 +90,9 @@ class FitState:
 # Windows at a time without gradients.
 _EVAL_BATCH = 512
 
+# Values that a vector layer keeps for its gradient, for each of its outputs.
+_VECTOR_VALUES = 8
+
 
 class Windows:
     """Scaled windows (N, C, T) on the device, in the memory layout of the engine."""
@@ -113,7 +116,10 @@ def step_bytes(arch: Arch, spec: TrainSpec) -> int | None:
 
     ``spec.device`` is not "auto" (see `plushsense.training.fit.resolve_device`).
     """
-    return plan_net(arch, spec.batch).bytes if is_fast(arch, torch.device(spec.device)) else None
+    if not is_fast(arch, torch.device(spec.device)):
+        return None
+    vectors = 0 if arch.vector is None else _VECTOR_VALUES * arch.inputs[0] * arch.span * spec.batch * 4
+    return plan_net(arch.trunk, spec.batch).bytes + vectors
 
 
 class Plain:
@@ -155,43 +161,61 @@ class Plain:
 
 
 class Fast:
-    """Training with ``training/fast``; methods as in `Plain`."""
+    """Training with ``training/fast``, and PyTorch's gradients for a vector layer; methods as in `Plain`."""
 
     def __init__(self, net: Net, batch: int, threads: int) -> None:
         self._net = FastNet(net, batch, threads)
+        self._vectors = net.vectors
 
     @property
     def parameters(self) -> Sequence[Tensor]:
-        return self._net.parameters
+        return [*([] if self._vectors is None else self._vectors.parameters()), *self._net.parameters]
 
     def step(
         self, x: Windows, batch: Tensor, y: Tensor, augment: Transform | None, random: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        if augment is None:
+        windows = None
+        if augment is not None:
+            windows = augment(x.whole[batch], random)
+        if self._vectors is not None:
+            self._vectors.train()
+            with torch.enable_grad():
+                windows = self._vectors(x.whole[batch] if windows is None else windows)
+        if windows is None:
             source = x.time_first
             assert source is not None
 
             def fill(out: Tensor, start: int, end: int) -> None:
                 torch.index_select(source, 1, batch[start:end], out=out)
         else:
-            augmented = augment(x.whole[batch], random)
+            ready = windows.detach().permute(2, 0, 1)
 
             def fill(out: Tensor, start: int, end: int) -> None:
-                out.copy_(augmented[start:end].permute(2, 0, 1))
+                out.copy_(ready[:, start:end])
 
-        return self._net.step(fill, y)
+        loss, logits, gradient = self._net.step(fill, y)
+        if self._vectors is not None and windows is not None and gradient is not None:
+            self._vectors.zero_grad(set_to_none=True)
+            windows.backward(gradient.permute(1, 2, 0))
+        return loss, logits
 
     def logits(self, x: Windows) -> Tensor:
-        source = x.time_first
+        source, vectors = x.time_first, self._vectors
         assert source is not None
+        if vectors is not None:
+            vectors.eval()
 
         def fill(out: Tensor, start: int, end: int) -> None:
-            out.copy_(source[:, start:end])
+            if vectors is None:
+                out.copy_(source[:, start:end])
+            else:
+                with torch.no_grad():
+                    out.copy_(vectors(x.whole[start:end]).permute(2, 0, 1))
 
         return self._net.logits(fill, len(x))
 
     def export_weights(self) -> dict[str, NDArray[np.float32]]:
-        return self._net.export_weights()
+        return self._net.export_weights() | ({} if self._vectors is None else self._vectors.export_weights())
 
     def close(self) -> None:
         self._net.close()

@@ -24,7 +24,7 @@ from plushsense.training.spec import TrainSpec
 from plushsense.trials.plan import PASSES, Plan, Task
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.config import RunConfig
-from plushsense.workflow.preparation import Warn, classes_for, divide, silent, windows_for
+from plushsense.workflow.preparation import Warn, classes_for, divide, network_inputs_of, silent, windows_for
 
 _BATCHES, _EPOCHS = 3, 3
 
@@ -33,7 +33,7 @@ def preview_training(
     dataset: Dataset | str | os.PathLike[str], config: RunConfig, *, warn: Warn = silent
 ) -> dict[str, Any]:
     """Return what `api.train` would train on and its cost; see `preview_evaluation` for the keys."""
-    dataset = as_dataset(dataset)
+    dataset, config = network_inputs_of(as_dataset(dataset), config)
     gestures = classes_for(dataset, config.evaluation.classes, config.windows.context, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     windows = windows_for(dataset, network, config.windows, gestures, warn, config.anywhere)
@@ -55,7 +55,7 @@ def preview_evaluation(
         ``split``, ``leaky``, ``context``, ``simulated``, ``dataset``, ``folds``, ``people``, ``classes``, ``windows``,
         ``epochs`` (at most), ``parameters``, ``macs`` of all trainings, ``seconds`` (estimated).
     """
-    dataset = as_dataset(dataset)
+    dataset, config = network_inputs_of(as_dataset(dataset), config)
     gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     score = fit_on = windows_for(dataset, network, config.scored_on, gestures, warn)

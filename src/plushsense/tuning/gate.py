@@ -350,16 +350,15 @@ def signals_of(layout: Layout, spec: GateSpec) -> list[Signal]:
 
     These are level and jerk of each input, the jerk at one lag, and the jerk of all inputs of a kind at every lag.
     """
-    kinds = {c.name: c.kind for c in layout.channels}
-    kinds |= {d.name: kinds[d.of[0]] for d in layout.derived}
     groups: dict[str, list[int]] = {}
-    for at, name in enumerate(layout.inputs):
-        groups.setdefault(kinds[name], []).append(at)
+    watchable = [at for at, kind in enumerate(layout.input_kinds) if kind != "gravity"]
+    for at in watchable:
+        groups.setdefault(layout.input_kinds[at], []).append(at)
     lags = sorted({min(MOST_LAG, layout.samples(s)) for s in spec.lags_s})
     slow, slower = (max(1, min(15, round(math.log2(s * layout.rate_hz)))) for s in (spec.baseline_s, spec.noise_s))
     several = [tuple(group) for group in groups.values()]
-    watched: list[tuple[int, tuple[int, ...], int]] = [(LEVEL, (at,), 1) for at in range(layout.n_inputs)]
-    watched += [(JERK, (at,), lags[len(lags) // 2]) for at in range(layout.n_inputs)]
+    watched: list[tuple[int, tuple[int, ...], int]] = [(LEVEL, (at,), 1) for at in watchable]
+    watched += [(JERK, (at,), lags[len(lags) // 2]) for at in watchable]
     watched += [(JERK, group, lag) for group in several for lag in lags if (JERK, group, lag) not in watched]
     return [Signal(kind, group, lag, 0, slow, slower) for kind, group, lag in watched]
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import GestureSet
-from plushsense.core.layouts import Layout
+from plushsense.core.layouts import ACCELERATION, Layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.store import Dataset
 from plushsense.devices.base import Frame
@@ -168,10 +168,9 @@ def sensors_of(layout: Layout) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
     Proximity and the sum of all electrodes do not count as electrodes.
     """
-    kinds = {c.name: c.kind for c in layout.channels}
-    kinds |= {d.name: kinds[d.of[0]] for d in layout.derived}
-    touch = [i for i, n in enumerate(layout.inputs) if kinds[n] == "capacitive" and n != "cap_all"]
-    return tuple(touch), tuple(i for i, n in enumerate(layout.inputs) if kinds[n] == "acceleration")
+    kinds = layout.input_kinds
+    touch = [i for i, n in enumerate(layout.inputs) if kinds[i] == "capacitive" and n != "cap_all"]
+    return tuple(touch), tuple(i for i, kind in enumerate(kinds) if kind == ACCELERATION)
 
 
 class RuleBaselineReader:

@@ -138,16 +138,20 @@ def from_recording(segments: list[Segment], dataset: Dataset, window: int, step:
     return cuts
 
 
-def _from_stream(
-    segments: list[Segment], first: int, last: int, window: int, reach: int, step: int, dataset: Dataset
-) -> list[WindowCut]:
+# A segment with the inputs (T, F) of a network.
+_Read = tuple[Segment, NDArray[np.int64]]
+
+
+def _from_stream(segments: list[_Read], first: int, last: int, window: int, reach: int, step: int) -> list[WindowCut]:
     """Cut windows of ``reach`` samples that end in rows ``first`` to ``last`` of a stream.
 
     A window that would begin before its segment is not cut; then no later one of that segment is. If a gap or a clock
     reset divides the recording, parts before the last one give windows only if they are at least ``window`` long.
     """
     cuts: list[WindowCut] = []
-    for segment in (s for s in segments if s.first_row < last and first < s.last_row):
+    for segment, x in segments:
+        if segment.first_row >= last or first >= segment.last_row:
+            continue
         begin = int(np.searchsorted(segment.row_of, first, side="left"))
         end = int(np.searchsorted(segment.row_of, last, side="left"))
         ends = [begin + s + window for s in range(0, end - begin - window + 1, step)]
@@ -155,11 +159,9 @@ def _from_stream(
             ends = [end]
         if not ends or ends[0] < reach:
             continue
-        x = network_inputs(segment.data[ends[0] - reach : ends[-1]], dataset.layout)
         for e in ends:
-            stop = e - (ends[0] - reach)
             rows = (int(segment.row_of[e - reach]), int(segment.row_of[e - 1]) + 1)
-            cuts.append(WindowCut(x[stop - reach : stop], "inside" if e - reach >= begin else "stream", rows))
+            cuts.append(WindowCut(x[e - reach : e], "inside" if e - reach >= begin else "stream", rows))
     return cuts
 
 
@@ -191,16 +193,19 @@ def cut_windows(
     recordings, left_out = drop_long_recordings([r for r in dataset.used if r.gesture in gestures.labels], spec)
     recordings.sort(key=lambda r: (r.stream, r.id))
     cuts: list[tuple[RecordingInfo, WindowCut]] = []
-    stream_id, segments = "", list[Segment]()
+    stream_id, segments = "", list[_Read]()
     for done, recording in enumerate(recordings):
         own: list[WindowCut] = []
         if spec.context == "stream" and recording.stream_row >= 0:
             if recording.stream != stream_id:
                 stream_id = recording.stream
-                segments = resample(dataset.read_stream(stream_id), layout)
+                segments = [
+                    (segment, network_inputs(segment.data, layout))
+                    for segment in resample(dataset.read_stream(stream_id), layout)
+                ]
             first = recording.stream_row + recording.start
             last = first + recording.stop - recording.start
-            own = _from_stream(segments, first, last, window, reach, step, dataset)
+            own = _from_stream(segments, first, last, window, reach, step)
         if not own:
             own = from_recording(resample(dataset.read(recording), layout), dataset, reach, step)
         if not own:
@@ -261,11 +266,7 @@ def assemble(cuts: list[tuple[RecordingInfo, WindowCut]], gestures: GestureSet, 
         recording_rows=np.array(rows, dtype=np.int64),
         rate_hz=dataset.layout.rate_hz,
         inputs=dataset.layout.inputs,
-        vectors=tuple(
-            tuple(dataset.layout.inputs.index(axis) for axis in vector)
-            for vector in dataset.layout.vectors
-            if set(vector) <= set(dataset.layout.inputs)
-        ),
+        vectors=dataset.layout.input_vectors,
     )
     return windows.take(by_recording)
 

@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput
-from plushsense.core.layouts import MAGNITUDE_FRACTION_BITS, Layout, magnitude_limit
+from plushsense.core.layouts import (
+    GRAVITY_FRACTION_BITS,
+    GRAVITY_STATE_BITS,
+    MAGNITUDE_FRACTION_BITS,
+    Layout,
+    magnitude_limit,
+)
 
 
 def magnitude(parts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -37,15 +43,49 @@ def magnitude(parts: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray(root, dtype=np.int64)
 
 
+class RunningMean:
+    """The running mean of one channel, in integers: the component of gravity along one axis of an accelerometer.
+
+    The state has `GRAVITY_STATE_BITS` fraction bits and changes by ``((x << bits) - state) >> shift`` with each sample;
+    the shift is that of the layout, but at the first samples the binary logarithm of their number, rounded down, so
+    that the mean is soon of the right size. A new segment starts it again. Turns of the toy are followed within about
+    two time constants; shaking averages out; in free fall the mean shrinks but keeps its direction.
+    """
+
+    def __init__(self, shift: int) -> None:
+        self._most = shift
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all samples."""
+        self._samples, self._state = 0, 0
+
+    def push(self, x: int) -> int:
+        """Add a sample; return the mean with `GRAVITY_FRACTION_BITS` fraction bits, rounded down."""
+        if self._samples < 1 << self._most:
+            self._samples += 1
+        self._state += ((x << GRAVITY_STATE_BITS) - self._state) >> (self._samples.bit_length() - 1)
+        return self._state >> (GRAVITY_STATE_BITS - GRAVITY_FRACTION_BITS)
+
+
 def network_inputs(values: NDArray[np.int64], layout: Layout) -> NDArray[np.int64]:
-    """Return the unscaled inputs of a network (T, F) from the measured channels (T, C), in integers."""
+    """Return the unscaled inputs of a network (T, F) from the measured channels (T, C) of a whole segment, in integers.
+
+    The offset of each channel is subtracted first.
+    """
     derived = {d.name: d for d in layout.derived}
+    values = values - layout.zero_int
     columns = []
     for name in layout.inputs:
-        if name in derived:
-            columns.append(magnitude(values[:, [layout.index(part) for part in derived[name].of]]))
-        else:
+        if name not in derived:
             columns.append(values[:, layout.index(name)])
+            continue
+        parts = values[:, [layout.index(part) for part in derived[name].of]]
+        if derived[name].kind == "gravity":
+            push = RunningMean(layout.gravity_shift).push
+            columns.append(np.array([push(x) for x in parts[:, 0].tolist()], dtype=np.int64))
+        else:
+            columns.append(magnitude(parts))
     return np.stack(columns, axis=1)
 
 
@@ -53,16 +93,30 @@ class SampleInputs:
     """The computation of `network_inputs` for single samples, in plain integers, which is faster for a live stream."""
 
     def __init__(self, layout: Layout) -> None:
-        derived = {d.name: tuple(layout.index(part) for part in d.of) for d in layout.derived}
-        self._plan = [derived.get(n) or layout.index(n) for n in layout.inputs]
+        derived = {d.name: d for d in layout.derived}
+        self._zeros = layout.zero_int.tolist()
+        self._means = {n: RunningMean(layout.gravity_shift) for n, d in derived.items() if d.kind == "gravity"}
+        self._sources = [
+            (tuple(map(layout.index, derived[n].of)) if n in derived else layout.index(n), self._means.get(n))
+            for n in layout.inputs
+        ]
+
+    def reset(self) -> None:
+        """Start again, as at a new segment."""
+        for mean in self._means.values():
+            mean.reset()
 
     def __call__(self, sample: Sequence[int] | NDArray[np.int64]) -> list[int]:
         """Return the F inputs of one sample (C,)."""
-        values = sample if type(sample) is list else [int(v) for v in sample]
+        values = [int(v) - zero for v, zero in zip(sample, self._zeros, strict=True)]
         shift = 2 * MAGNITUDE_FRACTION_BITS
         return [
-            values[part] if isinstance(part, int) else math.isqrt(sum([values[i] ** 2 for i in part]) << shift)
-            for part in self._plan
+            values[part]
+            if isinstance(part, int)
+            else mean.push(values[part[0]])
+            if mean is not None
+            else math.isqrt(sum([values[i] ** 2 for i in part]) << shift)
+            for part, mean in self._sources
         ]
 
 
@@ -74,12 +128,18 @@ class Scaler:
     scale: NDArray[np.float64]
 
     @classmethod
-    def fit(cls, x: NDArray[np.integer[Any]]) -> Scaler:
-        """Fit zero mean and unit variance to training windows (N, F, T); a constant channel gets the scale 1."""
+    def fit(cls, x: NDArray[np.integer[Any]], vectors: Sequence[Sequence[int]] = ()) -> Scaler:
+        """Fit zero mean and unit variance to training windows (N, F, T); a constant channel gets the scale 1.
+
+        The axes of each of the ``vectors`` keep their zero, and have one common scale: unit mean square.
+        """
         mean = np.asarray(np.mean(x, axis=(0, 2), dtype=np.float64))
         spread = np.empty_like(mean)
         for channel in range(x.shape[1]):
             spread[channel] = np.std(x[:, channel, :], dtype=np.float64)
+        for axes in map(list, vectors):
+            spread[axes] = np.sqrt(np.mean(spread[axes] ** 2 + mean[axes] ** 2))
+            mean[axes] = 0.0
         return cls(mean, np.where(spread > 0, 1.0 / np.where(spread > 0, spread, 1.0), 1.0))
 
     def apply(self, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:

@@ -47,6 +47,7 @@ from plushsense.workflow.preparation import (
     Warn,
     classes_for,
     divide,
+    network_inputs_of,
     outside_streams,
     silent,
     windows_for,
@@ -192,8 +193,8 @@ def train(
         progress: called with (epoch, maximum of epochs, the epoch's row), first for the epochs before an interruption.
         warn: called with a sentence for everything that is left out, and if 8-bit arithmetic changes many predictions.
     """
-    dataset = as_dataset(dataset)
-    config = config or from_settings(arch=arch, filters=filters, **settings)
+    given = config or from_settings(arch=arch, filters=filters, **settings)
+    dataset, config = network_inputs_of(as_dataset(dataset), given)
     if quantize_aware < 0:
         raise ConfigError(f"quantize_aware is {quantize_aware}: accepted are 0 (off) and more epochs.")
     gestures = classes_for(dataset, config.evaluation.classes, config.windows.context, warn)
@@ -339,8 +340,8 @@ def evaluate(
         int8: also score each fold's network in 8 bits on the same windows, as ``int8`` of the result. Folds that were
             stored without it are trained again.
     """
-    dataset = as_dataset(dataset)
-    config = config or from_settings(arch=arch, filters=filters, **settings)
+    given = config or from_settings(arch=arch, filters=filters, **settings)
+    dataset, config = network_inputs_of(as_dataset(dataset), given)
     if split is not None:
         config = replace(config, evaluation=replace(config.evaluation, split=split))
     parse_split(config.evaluation.split)

@@ -21,7 +21,7 @@ from typing import Any
 from plushsense.core.errors import ConfigError, check_known
 from plushsense.core.layouts import Layout
 from plushsense.core.toml import check_table, read_toml, refuse_unknown
-from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, Arch, parse_filters
+from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, VECTOR_SYMBOL, Arch, parse_filters
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import CONTEXT, PADDING, TrainSpec, preset
@@ -33,9 +33,13 @@ SHARED, ALL = "shared", "all"
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """Settings of the network, times in seconds. ``padding`` None: the preset's; ``pool_s`` None: the whole window."""
+    """Settings of the network, times in seconds.
 
-    arch: str = DEFAULT_SYMBOL
+    ``arch`` None: the default for the layout and the preset; ``padding`` None: the preset's; ``pool_s`` None: the whole
+    window.
+    """
+
+    arch: str | None = None
     filters: tuple[int, ...] = DEFAULT_FILTERS
     padding: str | None = None
     norm: str = "batch"
@@ -48,9 +52,9 @@ class ModelSpec:
                 raise ConfigError(f"{name} is {seconds}: accepted is above 0 and up to 60 seconds.")
 
     def build(self, layout: Layout, classes: int, window_s: float, padding: str) -> Arch:
-        """Build the network for a toy's layout and a number of classes."""
+        """Build the network for the inputs of a layout and a number of classes."""
         return Arch.parse(
-            self.arch,
+            self.arch or DEFAULT_SYMBOL,
             self.filters,
             channels=layout.n_inputs,
             classes=classes,
@@ -59,6 +63,7 @@ class ModelSpec:
             window=layout.samples(window_s),
             step=layout.samples(self.step_s),
             pool=None if self.pool_s is None else layout.samples(self.pool_s),
+            vectors=len(layout.vectors),
         )
 
 
@@ -118,6 +123,16 @@ class RunConfig:
     def padding(self) -> str:
         """The padding of ``model``, or if that is None, of the preset."""
         return self.model.padding or PADDING[self.preset]
+
+    def for_layout(self, layout: Layout) -> RunConfig:
+        """Return the settings with the default network for a layout, if none is given.
+
+        With the preset ``people`` and a layout that has an accelerometer, that is a network with a vector layer.
+        """
+        if self.model.arch is not None:
+            return self
+        turns = self.preset == "people" and self.padding == "stream" and layout.has_gravity
+        return replace(self, model=replace(self.model, arch=VECTOR_SYMBOL if turns else DEFAULT_SYMBOL))
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, as a bundle stores them."""

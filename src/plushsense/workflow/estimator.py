@@ -177,11 +177,7 @@ def windows_of(
         recording_rows=rows,
         rate_hz=layout.rate_hz,
         inputs=layout.inputs,
-        vectors=tuple(
-            tuple(layout.inputs.index(axis) for axis in vector)
-            for vector in layout.vectors
-            if set(vector) <= set(layout.inputs)
-        ),
+        vectors=layout.input_vectors,
     )
 
 

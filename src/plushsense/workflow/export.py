@@ -53,7 +53,7 @@ def training_windows(
         BundleError: if the training windows are missing, or cannot be distinguished from the validation windows.
     """
     refuse_undeployable(bundle.arch)
-    dataset = as_dataset(dataset)
+    dataset = as_dataset(dataset).with_inputs(bundle.layout)
     origin = bundle.provenance
     if isinstance(origin.get("subjects"), int):
         raise BundleError(

@@ -12,7 +12,7 @@ from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.evaluation.crossval import fold_windows
-from plushsense.models.arch import Arch
+from plushsense.models.arch import Arch, parse_symbol
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
 from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere
 from plushsense.windows.cut import ANYWHERE, WindowSet, WindowSpec, cut_windows, shared_gestures
@@ -23,6 +23,14 @@ Warn = Callable[[str], None]
 
 def silent(_: str) -> None:
     """Ignore a warning."""
+
+
+def network_inputs_of(dataset: Dataset, config: RunConfig) -> tuple[Dataset, RunConfig]:
+    """Return the data set with the inputs that the network of ``config`` reads, and the settings with that network."""
+    config = config.for_layout(dataset.layout)
+    if config.model.arch is not None and parse_symbol(config.model.arch).vector is not None:
+        dataset = dataset.with_inputs(dataset.layout.for_vectors())
+    return dataset, config
 
 
 def choose_classes(dataset: Dataset, choice: str | Sequence[str], warn: Warn = silent) -> GestureSet:

@@ -15,6 +15,8 @@
 #define GROUP 4u            /* filters computed together, channels read together */
 #define HEAD_BYTES 16u
 #define SCALE_BYTES 8u      /* bias, multiplier and two shifts of one filter */
+#define RANGE_BYTES 12u     /* lowest and highest valid value of a channel, and its zero */
+#define INPUT_BYTES 12u     /* offset, bias, multiplier and two shifts of one channel of the network */
 #define LOGIT_LIMIT 16384
 #define WEIGHT_ZERO 128u    /* weights are stored with this added: some cores cannot load a signed byte */
 
@@ -35,6 +37,21 @@
 #define MOST_MULTIPLIER 32767u
 #define MOST_INPUT_BIAS (INT32_C(1) << 30)
 #define MOST_HEALTH_MS 60000u
+#define MOST_VECTORS 8u
+#define MOST_KERNELS 64u
+#define MOST_TAPS 255u
+#define MOST_AXIS_SHIFT 16u
+#define MOST_MEAN_SHIFT 15u
+#define MOST_GRAVITY (UINT32_C(1) << 19) /* so that a running mean and its changes fit 32 bits */
+
+/* How an input comes from the measured channels. */
+enum { CHANNEL = 0, MAGNITUDE = 1, GRAVITY = 2 };
+
+/* Running means have 10 fraction bits, and are given with 4. Unit vectors have 14. */
+#define MEAN_BITS 10u
+#define MEAN_SHOWN_BITS 4u
+#define UNIT_BITS 14u
+#define AXIS_LIMIT 32767
 
 /* What stands where in the plan of events, each of 16 bits. */
 enum {
@@ -95,6 +112,11 @@ static uint32_t le32(const uint8_t *p)
 static int32_t as_signed(uint32_t bits)
 {
     return bits <= INT32_MAX ? (int32_t)bits : -(int32_t)(UINT32_MAX - bits) - 1;
+}
+
+static uint32_t bits_of(int32_t v)
+{
+    return (uint32_t)v;
 }
 
 /* Floor division by 2^n, also of negative numbers. */
@@ -171,6 +193,29 @@ static uint32_t square_root(uint64_t v)
         }
     }
     return (uint32_t)root;
+}
+
+/* The square root, rounded down. */
+static uint32_t short_root(uint32_t v)
+{
+    uint32_t root = 0, bit = UINT32_C(1) << 30;
+
+    while (bit > v)
+        bit >>= 2;
+    for (; bit != 0; bit >>= 2) {
+        if (v >= root + bit) {
+            v -= root + bit;
+            root = (root >> 1) + bit;
+        } else {
+            root >>= 1;
+        }
+    }
+    return root;
+}
+
+static uint32_t distance_of(int32_t one, int32_t other)
+{
+    return one >= other ? (uint32_t)one - (uint32_t)other : (uint32_t)other - (uint32_t)one;
 }
 
 /* ---- The model ------------------------------------------------------------------------------------------------- */
@@ -251,6 +296,7 @@ static const uint8_t *next_scales(source *from, uint32_t n)
 static int read_head(plush_toy *toy, source *from)
 {
     const uint8_t *p = next_bytes(from, 28);
+    uint32_t i;
 
     if (p == NULL)
         return 0;
@@ -266,14 +312,32 @@ static int read_head(plush_toy *toy, source *from)
     toy->units_per_ms = le32(p + 20);
     toy->smoothing = (uint16_t)le16(p + 24);
     toy->layout = (uint16_t)le16(p + 26);
-    toy->ranges = next_bytes(from, 8u * toy->channels);
+    toy->ranges = next_bytes(from, RANGE_BYTES * toy->channels);
     if (toy->layers == 0 || toy->layers > PLUSH_MAX_LAYERS || toy->channels == 0 || toy->inputs == 0 ||
         toy->classes == 0 || toy->step == 0 || toy->step > MOST_STEP || toy->blocks == 0 || toy->period == 0 ||
         toy->period > MOST_UNITS || toy->gap == 0 || toy->gap > MOST_UNITS || toy->units_per_ms == 0 ||
         toy->smoothing == 0 || toy->smoothing > PLUSH_ONE || toy->ranges == NULL)
         return 0;
     toy->narrow = (UINT32_MAX - toy->gap) / (2 * toy->gap);
+    for (i = 0; i < toy->channels; i++) {
+        const uint8_t *range = toy->ranges + RANGE_BYTES * i;
+        int32_t low = as_signed(le32(range)), high = as_signed(le32(range + 4)), zero = as_signed(le32(range + 8));
+
+        if ((low < zero && distance_of(low, zero) > UINT32_C(1) << 31) ||
+            (high > zero && distance_of(high, zero) > (uint32_t)INT32_MAX))
+            return 0;
+    }
     return 1;
+}
+
+/* Whether a running mean of this channel fits 32 bits. */
+static int mean_fits(const plush_toy *toy, uint32_t channel)
+{
+    const uint8_t *range = toy->ranges + RANGE_BYTES * channel;
+    int32_t zero = as_signed(le32(range + 8));
+
+    return distance_of(as_signed(le32(range)), zero) <= MOST_GRAVITY &&
+           distance_of(as_signed(le32(range + 4)), zero) <= MOST_GRAVITY;
 }
 
 static int read_input_plan(plush_toy *toy, source *from)
@@ -281,18 +345,78 @@ static int read_input_plan(plush_toy *toy, source *from)
     uint32_t i, n;
 
     toy->input_plan = from->at;
+    toy->means = 0;
     for (i = 0; i < toy->inputs; i++) {
-        const uint8_t *head = next_bytes(from, 2);
+        const uint8_t *head = next_bytes(from, 3);
         const uint8_t *parts = head == NULL ? NULL : next_bytes(from, head[1]);
-        const uint8_t *scale = parts == NULL ? NULL : next_bytes(from, 12);
-        int32_t bias;
 
-        if (scale == NULL || head[0] > 1 || head[1] == 0 || (head[0] == 0 && head[1] != 1))
+        if (parts == NULL || head[0] > GRAVITY || head[1] == 0 || (head[0] != MAGNITUDE && head[1] != 1) ||
+            head[2] > (head[0] == GRAVITY ? MOST_MEAN_SHIFT : 0u))
             return 0;
         for (n = 0; n < head[1]; n++)
             if (parts[n] >= toy->channels)
                 return 0;
-        bias = as_signed(le32(scale + 4));
+        if (head[0] == GRAVITY) {
+            if (!mean_fits(toy, parts[0]))
+                return 0;
+            toy->means++;
+        }
+    }
+    return 1;
+}
+
+/* One kernel of a vector layer; its sums are sure to fit. */
+static int read_kernel(const plush_toy *toy, source *from)
+{
+    const uint8_t *p = next_bytes(from, 1u + toy->vector_taps);
+    uint32_t sum = 0, n;
+
+    if (p == NULL || p[0] > MOST_SHIFT)
+        return 0;
+    for (n = 1; n <= toy->vector_taps; n++)
+        sum += p[n] >= WEIGHT_ZERO ? p[n] - WEIGHT_ZERO : WEIGHT_ZERO - p[n];
+    return p[0] + UNIT_BITS > 31 || sum * (uint32_t)AXIS_LIMIT <= UINT32_C(1) << (p[0] + UNIT_BITS);
+}
+
+/* The vector layer, if there is one, and the scales of what the first layer reads. */
+static int read_vectors(plush_toy *toy, source *from)
+{
+    const uint8_t *p = next_bytes(from, 4), *scale;
+    uint32_t v, k, i;
+
+    if (p == NULL)
+        return 0;
+    toy->vectors = p[0];
+    toy->vector_kernels = p[1];
+    toy->vector_taps = (uint8_t)p[2];
+    toy->vector_plan = from->at;
+    toy->features = toy->inputs;
+    if (toy->vectors == 0) {
+        if (p[1] != 0 || p[2] != 0 || p[3] != 0)
+            return 0;
+    } else {
+        uint32_t axes = 3u * toy->vectors + 3u;
+
+        if (toy->vectors > MOST_VECTORS || p[1] < 2 || p[1] > MOST_KERNELS || p[2] == 0 || p[3] != 0 ||
+            toy->inputs < axes)
+            return 0;
+        toy->features = (uint16_t)(toy->inputs - axes + toy->vectors * (3u * toy->vector_kernels + 1u));
+        for (v = 0; v < toy->vectors; v++) {
+            const uint8_t *shift = next_bytes(from, 1);
+
+            if (shift == NULL || *shift > 2 * MOST_AXIS_SHIFT)
+                return 0;
+            for (k = 0; k < toy->vector_kernels; k++)
+                if (!read_kernel(toy, from))
+                    return 0;
+        }
+    }
+    toy->input_scales = scale = next_bytes(from, INPUT_BYTES * toy->features);
+    if (scale == NULL)
+        return 0;
+    for (i = 0; i < toy->features; i++, scale += INPUT_BYTES) {
+        int32_t bias = as_signed(le32(scale + 4));
+
         if (bias < -MOST_INPUT_BIAS || bias >= MOST_INPUT_BIAS || le16(scale + 8) > MOST_MULTIPLIER ||
             scale[10] > MOST_INPUT_SHIFT || scale[11] > MOST_SHIFT)
             return 0;
@@ -449,10 +573,9 @@ static int read_model(plush_toy *toy, const uint8_t *model)
 
     from.at = model + HEAD_BYTES;
     from.left = le32(model + 8) - HEAD_BYTES;
-    if (!read_head(toy, &from) || !read_input_plan(toy, &from))
+    if (!read_head(toy, &from) || !read_input_plan(toy, &from) || !read_vectors(toy, &from))
         return 0;
-    toy->features = toy->inputs;
-    span = (uint32_t)toy->step * toy->blocks;
+    span = (uint32_t)toy->step * toy->blocks + (toy->vectors != 0 ? toy->vector_taps - 1u : 0u);
     for (i = 0; i < toy->layers; i++) {
         if (!read_layer(&toy->layer[i], toy->features, &from))
             return 0;
@@ -491,6 +614,10 @@ static uint32_t share_out(plush_toy *toy, uint8_t *memory)
     toy->held = (int32_t *)take(memory, &used, 4u * toy->channels);
     toy->before = (int32_t *)take(memory, &used, 4u * toy->channels);
     toy->sample = (int32_t *)take(memory, &used, 4u * toy->channels);
+    toy->raw = (int32_t *)take(memory, &used, has_gate(toy) ? 0 : 4u * toy->inputs);
+    toy->mean = (int32_t *)take(memory, &used, 4u * toy->means);
+    toy->axes = (int16_t *)take(memory, &used, UINT32_C(6) * toy->vectors * toy->vector_taps);
+    toy->across = (int32_t *)take(memory, &used, UINT32_C(12) * toy->vector_kernels);
     for (i = 0; i < toy->layers; i++) {
         plush_layer *layer = &toy->layer[i];
 
@@ -1226,7 +1353,7 @@ static void forget_health(plush_toy *toy)
 /* Whether a value that came is wrong: out of its range, or stuck beyond what touches reach. */
 static int is_wrong(const plush_toy *toy, uint32_t channel, int32_t value)
 {
-    if (!lies_in(toy->ranges + 8 * channel, value))
+    if (!lies_in(toy->ranges + RANGE_BYTES * channel, value))
         return 1;
     return toy->limits != NULL && toy->compared && value == toy->last[channel] &&
            !lies_in(toy->limits + 8 * channel, value);
@@ -1274,39 +1401,210 @@ static int examine(plush_toy *toy, uint32_t ms, const int32_t *values)
 
 /* ---- Samples and frames ---------------------------------------------------------------------------------------- */
 
+/* A channel of the even sample, from its zero. */
+static int32_t from_zero(const plush_toy *toy, uint32_t channel)
+{
+    return as_signed((uint32_t)toy->sample[channel] - le32(toy->ranges + RANGE_BYTES * channel + 8));
+}
+
+static int32_t magnitude(const plush_toy *toy, const uint8_t *parts, uint32_t n)
+{
+    uint64_t sum = 0;
+
+    for (; n > 0; n--)
+        sum += square(from_zero(toy, *parts++));
+    return as_signed(square_root(sum << 8)); /* with 4 fraction bits */
+}
+
+/* A running mean after one more value. At first it follows as fast as its few samples allow. */
+static int32_t follow_mean(const plush_toy *toy, int32_t *mean, int32_t x, uint32_t shift)
+{
+    *mean += shift_down(x * (INT32_C(1) << MEAN_BITS) - *mean, shift < toy->mean_shift ? shift : toy->mean_shift);
+    return shift_down(*mean, MEAN_BITS - MEAN_SHOWN_BITS);
+}
+
+/* One more sample, up to 2^15; `mean_shift` is the binary logarithm of their number. */
+static void count_means(plush_toy *toy)
+{
+    if (toy->mean_samples >> MOST_MEAN_SHIFT != 0)
+        return;
+    toy->mean_samples++;
+    if (toy->mean_samples >> (toy->mean_shift + 1u) != 0)
+        toy->mean_shift++;
+}
+
+/* What a channel of the network becomes in 8 bits. */
+static uint8_t to_code(int32_t x, const uint8_t *scale)
+{
+    int32_t offset = as_signed(le32(scale)), limit = (int32_t)(UINT32_MAX >> (17 - scale[10]));
+    uint32_t distance = distance_of(x, offset);
+
+    if (distance > (uint32_t)limit)
+        distance = (uint32_t)limit;
+    x = shift_down(x >= offset ? (int32_t)distance : -(int32_t)distance, scale[10]);
+    return (uint8_t)within(shift_down(x * (int32_t)le16(scale + 8) + as_signed(le32(scale + 4)), scale[11]), 0, 255);
+}
+
+/* The unit vector with the direction of gravity; zeros where there is none. */
+static void direction(const int32_t *gravity, int32_t *up)
+{
+    uint32_t size[3], top = 0, length, i;
+
+    for (i = 0; i < 3; i++) {
+        size[i] = distance_of(gravity[i], 0);
+        top |= size[i];
+    }
+    for (i = 0; i < 3; i++)
+        up[i] = 0;
+    if (top == 0)
+        return;
+    for (; top >> (UNIT_BITS + 1) != 0; top >>= 1)
+        for (i = 0; i < 3; i++)
+            size[i] >>= 1;
+    for (; top >> UNIT_BITS == 0; top <<= 1)
+        for (i = 0; i < 3; i++)
+            size[i] <<= 1;
+    length = short_root(size[0] * size[0] + size[1] * size[1] + size[2] * size[2]);
+    for (i = 0; i < 3; i++) {
+        up[i] = (int32_t)((size[i] << UNIT_BITS) / length);
+        if (gravity[i] < 0)
+            up[i] = -up[i];
+    }
+}
+
+static int32_t dot(const int32_t *one, const int32_t *other)
+{
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2];
+}
+
+/* Floor of a * unit / 2^14, where the product may need more than 32 bits. */
+static int32_t times_unit(int32_t a, int32_t unit)
+{
+    int32_t high = shift_down(a, UNIT_BITS), low = a - high * (INT32_C(1) << UNIT_BITS);
+
+    return high * unit + shift_down(low * unit, UNIT_BITS);
+}
+
+/* The newest row of axes, each of 16 bits. */
+static void put_axes(plush_toy *toy, const int32_t *axes)
+{
+    const uint8_t *p = toy->vector_plan;
+    uint32_t width = 3u * toy->vectors, v, i;
+    int16_t *row;
+
+    toy->vector_newest = (uint8_t)(toy->vector_newest + 1u < toy->vector_taps ? toy->vector_newest + 1u : 0u);
+    row = toy->axes + toy->vector_newest * width;
+    for (v = 0; v < toy->vectors; v++, p += 1u + toy->vector_kernels * (1u + toy->vector_taps)) {
+        int32_t up = *p >= MOST_AXIS_SHIFT, shift = up ? *p - (int32_t)MOST_AXIS_SHIFT : (int32_t)MOST_AXIS_SHIFT - *p;
+        int32_t limit = up ? AXIS_LIMIT >> shift : AXIS_LIMIT * (INT32_C(1) << shift);
+
+        for (i = 0; i < 3; i++) {
+            int32_t x = within(*axes++, -limit, limit);
+
+            *row++ = (int16_t)(up ? x * (INT32_C(1) << shift) : shift_down(x, (uint32_t)shift));
+        }
+    }
+}
+
+/* The sums of one kernel over the taps of three axes, from the oldest; `axes` are those of the first row. */
+PLUSH_APART
+static void convolve(const plush_toy *toy, const int16_t *axes, const uint8_t *weights, uint32_t sum[3])
+{
+    uint32_t width = 3u * toy->vectors, taps = toy->vector_taps, s0 = 0, s1 = 0, s2 = 0;
+    const int16_t *end = axes + taps * width, *a = axes + toy->vector_newest * width;
+
+    for (; taps > 0; taps--) {
+        uint32_t w = *weights++;
+
+        a += width;
+        if (a == end)
+            a = axes;
+        s0 += w * bits_of(a[0]);
+        s1 += w * bits_of(a[1]);
+        s2 += w * bits_of(a[2]);
+    }
+    sum[0] = s0;
+    sum[1] = s1;
+    sum[2] = s2;
+}
+
+/* What does not turn with the toy, of one vector; `plan` are its kernels. Returns the next vector's. */
+static const uint8_t *invariants(plush_toy *toy, const int16_t *axes, const uint8_t *plan, const int32_t *up,
+                                 uint8_t *row, const uint8_t *scale)
+{
+    uint32_t kernels = toy->vector_kernels, width = 3u * toy->vectors, total[3] = {0, 0, 0}, squares = 0, k, i, n;
+    const int16_t *newest = axes + toy->vector_newest * width;
+
+    for (n = 0; n < toy->vector_taps; n++)
+        for (i = 0; i < 3; i++)
+            total[i] += bits_of(axes[n * width + i]);
+    for (k = 0; k < kernels; k++, plan += 1u + toy->vector_taps) {
+        int32_t *h = toy->across + 3 * k, d[3], v;
+        uint32_t sum[3];
+
+        convolve(toy, axes, plan + 1, sum);
+        for (i = 0; i < 3; i++)
+            d[i] = shift_down(as_signed(sum[i] - WEIGHT_ZERO * total[i]), *plan);
+        v = shift_down(dot(d, up), UNIT_BITS);
+        for (i = 0; i < 3; i++)
+            h[i] = d[i] - shift_down(v * up[i], UNIT_BITS);
+        row[k] = to_code(v, scale + INPUT_BYTES * k);
+        row[kernels + k] = to_code((int32_t)short_root((uint32_t)dot(h, h)), scale + INPUT_BYTES * (kernels + k));
+    }
+    for (k = 0; k < kernels; k++) {
+        const int32_t *h = toy->across + 3 * k, *next = toy->across + (k + 1u < kernels ? 3 * (k + 1u) : 0);
+        int32_t turn = times_unit(h[1] * next[2] - h[2] * next[1], up[0]) +
+                       times_unit(h[2] * next[0] - h[0] * next[2], up[1]) +
+                       times_unit(h[0] * next[1] - h[1] * next[0], up[2]);
+        int32_t size = (int32_t)short_root(distance_of(turn, 0));
+
+        row[2 * kernels + k] = to_code(turn < 0 ? -size : size, scale + INPUT_BYTES * (2 * kernels + k));
+    }
+    for (i = 0; i < 3; i++)
+        squares += (uint32_t)((int32_t)newest[i] * newest[i]);
+    row[3 * kernels] = to_code((int32_t)short_root(squares), scale + INPUT_BYTES * 3 * kernels);
+    return plan;
+}
+
+/* The vector layer: the other inputs as they are, and what does not turn with the toy of the rest. */
+static void vector_sample(plush_toy *toy, const int32_t *x, uint8_t *row)
+{
+    uint32_t others = toy->inputs - 3u * toy->vectors - 3u, outputs = 3u * toy->vector_kernels + 1u, i;
+    const uint8_t *plan = toy->vector_plan;
+    int32_t up[3];
+
+    put_axes(toy, x + others);
+    direction(x + toy->inputs - 3, up);
+    for (i = 0; i < others; i++)
+        row[i] = to_code(x[i], toy->input_scales + INPUT_BYTES * i);
+    for (i = 0; i < toy->vectors; i++)
+        plan = invariants(toy, toy->axes + 3 * i, plan + 1, up, row + others + outputs * i,
+                          toy->input_scales + INPUT_BYTES * (others + outputs * i));
+}
+
 /* What the network reads of toy->sample, into the first ring. */
 static void read_inputs(plush_toy *toy)
 {
     const uint8_t *p = toy->input_plan;
     uint8_t *row = next_row(&toy->layer[0]);
-    int32_t *seen = has_gate(toy) ? past_inputs(toy, 0) : NULL;
-    uint32_t i, n;
+    int32_t *x = has_gate(toy) ? past_inputs(toy, 0) : toy->raw, *mean = toy->mean;
+    uint32_t i;
 
-    for (i = 0; i < toy->inputs; i++, p += 12) {
-        const uint8_t *part = p + 2;
-        int32_t x, offset, limit;
-        uint32_t distance;
-
-        if (p[0] == 0) {
-            x = toy->sample[*part++];
-        } else {
-            uint64_t sum = 0;
-
-            for (n = p[1]; n > 0; n--)
-                sum += square(toy->sample[*part++]);
-            x = as_signed(square_root(sum << 8)); /* with 4 fraction bits */
-        }
-        if (seen != NULL)
-            *seen++ = x;
-        p = part;
-        offset = as_signed(le32(p));
-        limit = (int32_t)(UINT32_MAX >> (17 - p[10]));
-        distance = x >= offset ? (uint32_t)x - (uint32_t)offset : (uint32_t)offset - (uint32_t)x;
-        if (distance > (uint32_t)limit)
-            distance = (uint32_t)limit;
-        x = shift_down(x >= offset ? (int32_t)distance : -(int32_t)distance, p[10]);
-        row[i] = (uint8_t)within(shift_down(x * (int32_t)le16(p + 8) + as_signed(le32(p + 4)), p[11]), 0, 255);
+    count_means(toy);
+    for (i = 0; i < toy->inputs; i++, p += 3 + p[1]) {
+        if (p[0] == CHANNEL)
+            x[i] = from_zero(toy, p[3]);
+        else if (p[0] == MAGNITUDE)
+            x[i] = magnitude(toy, p + 3, p[1]);
+        else
+            x[i] = follow_mean(toy, mean++, from_zero(toy, p[3]), p[2]);
     }
+    if (toy->vectors != 0) {
+        vector_sample(toy, x, row);
+        return;
+    }
+    for (i = 0; i < toy->inputs; i++)
+        row[i] = to_code(x[i], toy->input_scales + INPUT_BYTES * i);
 }
 
 /* One even sample, in toy->sample. Returns 1 when an answer fell due. */
@@ -1350,7 +1648,7 @@ static int hold(plush_toy *toy, const int32_t *values)
     int all = 1;
 
     for (i = 0; i < toy->channels; i++) {
-        if (lies_in(toy->ranges + 8 * i, values[i])) {
+        if (lies_in(toy->ranges + RANGE_BYTES * i, values[i])) {
             toy->held[i] = values[i];
             toy->valid[i] = 1;
         } else {
@@ -1380,6 +1678,7 @@ static void forget(plush_toy *toy)
     toy->heard = toy->running = 0;
     toy->block = toy->gate_deaf = 0;
     toy->gate_seen = toy->gate_newest = toy->gate_doubt = 0;
+    toy->mean_samples = toy->mean_shift = toy->vector_newest = 0;
     toy->warm = toy->answer.sample = 0;
     say_nothing(toy, toy->faulty ? PLUSH_FAULT : PLUSH_WARMING);
     /* So that a step ends with the very sample that fills the span. */

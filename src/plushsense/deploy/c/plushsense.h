@@ -34,7 +34,7 @@
 extern "C" {
 #endif
 
-#define PLUSH_IMAGE_VERSION 2
+#define PLUSH_IMAGE_VERSION 3
 #define PLUSH_MAX_LAYERS 4
 #define PLUSH_ONE 32768 /* a confidence or probability of 1 */
 #define PLUSH_NO_GESTURE 255
@@ -141,7 +141,7 @@ typedef struct plush_toy {
     uint16_t smoothing, layout;
     void *memory;
     uint32_t memory_bytes;
-    const uint8_t *ranges, *input_plan, *dense, *dense_weights, *classes_told, *names, *title;
+    const uint8_t *ranges, *input_plan, *vector_plan, *input_scales, *dense, *dense_weights, *classes_told, *names, *title;
     const uint8_t *event_plan, *health_plan, *limits, *gate_plan, *gate_first_rule;
     uint8_t gate_signals, gate_rules, gate_past;
     uint16_t gate_terms, gate_bytes;
@@ -153,6 +153,16 @@ typedef struct plush_toy {
     uint32_t due;            /* from the last usable frame to the next sample */
     uint8_t *valid;          /* of each channel: whether it has had a valid value */
     int32_t *held, *before, *sample;
+
+    /* Inputs: those of the newest sample if there is no gate, and running means. */
+    uint8_t means, mean_shift;
+    uint16_t mean_samples;
+    int32_t *raw, *mean;
+
+    /* The vector layer: axes of the newest samples, and the horizontal parts of its kernels' vectors. */
+    uint8_t vectors, vector_kernels, vector_taps, vector_newest;
+    int16_t *axes;
+    int32_t *across;
 
     /* The gate: the inputs of the newest samples, what it knows of each signal, and of each term of a rule. */
     uint8_t gate_seen, gate_newest, gate_doubt;

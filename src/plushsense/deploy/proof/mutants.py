@@ -32,7 +32,7 @@ class SourceMutant:
     name: str
     find: str
     replace: str
-    when: Literal["always", "dilated", "magnitude", "ranged", "smoothed", "stepped", "ties"] = "always"
+    when: Literal["always", "dilated", "magnitude", "ranged", "smoothed", "stepped", "ties", "vectors"] = "always"
 
 
 @cache
@@ -43,7 +43,7 @@ def source_mutants() -> tuple[SourceMutant, ...]:
     return tuple(load_table(row, SourceMutant, path.name, BadInput) for row in rows)
 
 
-_FIXED_BYTES, _SCALE_BYTES = 28, 8
+_FIXED_BYTES, _RANGE_BYTES, _INPUT_BYTES, _SCALE_BYTES = 28, 12, 12, 8
 _GAP_AT, _SMOOTHING_AT = 16, 24
 _INT32 = (1 << 31) - 1
 _MOST_SHIFT = 30
@@ -73,7 +73,9 @@ def mutants_of(image: bytes, source: str) -> list[Mutant]:
         mutants.append(_in_image("weight", f"one weight of {part} by one", image, weight, "B"))
         shift = layer.scales_at + _SCALE_BYTES * filter_ + 7
         mutants.append(_in_image("shift", f"one shift of {part} by one", image, shift, "B", _MOST_SHIFT))
-    mutants.append(_in_image("shift", "one input's shift by one", image, at.inputs[0] + 11, "B", _MOST_SHIFT))
+    mutants.append(_in_image("shift", "one input's shift by one", image, at.input_scales + 11, "B", _MOST_SHIFT))
+    if at.vectors:
+        mutants.append(_in_image("weight", "one weight of the vector layer by one", image, at.vector_weight, "B"))
     mutants.append(
         _in_image("constant", "the longest gap by one", image, HEAD_BYTES + _GAP_AT, "I", by=at.units_per_ms)
     )
@@ -81,12 +83,13 @@ def mutants_of(image: bytes, source: str) -> list[Mutant]:
     mutants.append(_in_image("constant", "the smoothing's weight by one", image, where, "H", 1 << PROBABILITY_BITS))
     ranged = [n for n, (_, high) in enumerate(at.ranges) if high < _INT32]
     for n in ranged[:1]:
-        where = HEAD_BYTES + _FIXED_BYTES + 8 * n + 4
+        where = HEAD_BYTES + _FIXED_BYTES + _RANGE_BYTES * n + 4
         mutants.append(_in_image("constant", f"the valid range of channel {n + 1} by one", image, where, "i"))
     shows = {
         "always": True,
         "dilated": any(layer.dilation > 1 for layer in at.layers),
         "magnitude": at.magnitudes,
+        "vectors": bool(at.vectors),
         "ranged": bool(ranged),
         # With a step of one sample, every sample has an answer.
         "stepped": at.step > 1,
@@ -143,14 +146,21 @@ class _ImageOffsets:
         (self.units_per_ms,) = struct.unpack_from("<I", image, HEAD_BYTES + 20)
         (self.smoothing,) = struct.unpack_from("<H", image, HEAD_BYTES + _SMOOTHING_AT)
         at = HEAD_BYTES + _FIXED_BYTES
-        self.ranges = [struct.unpack_from("<ii", image, at + 8 * i) for i in range(channels)]
-        at += 8 * channels
-        self.inputs: list[int] = []
-        self.magnitudes = False
+        self.ranges = [struct.unpack_from("<ii", image, at + _RANGE_BYTES * i) for i in range(channels)]
+        at += _RANGE_BYTES * channels
+        kinds = []
         for _ in range(inputs):
-            self.magnitudes |= image[at] == 1
-            self.inputs.append(at + 2 + image[at + 1])
-            at = self.inputs[-1] + 12
+            kinds.append(image[at])
+            at += 3 + image[at + 1]
+        self.magnitudes = 1 in kinds
+        self.vectors, kernels, taps = struct.unpack_from("<BBH", image, at)
+        at += 4
+        first = np.frombuffer(image, np.uint8, taps, at + 2).astype(np.int64) - 128
+        self.vector_weight = at + 2 + int(np.abs(first).argmax()) if taps else 0
+        at += self.vectors * (1 + kernels * (1 + taps))
+        self.input_scales = at
+        outputs = inputs - 3 * self.vectors - 3 + self.vectors * (3 * kernels + 1) if self.vectors else inputs
+        at += _INPUT_BYTES * outputs
         self.layers: list[_LayerOffsets] = []
         stored = np.frombuffer(image, dtype=np.uint8).astype(np.int64) - 128
         filters = 0

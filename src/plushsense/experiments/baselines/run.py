@@ -33,7 +33,7 @@ from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import ANYWHERE, WindowSet
 from plushsense.windows.features import Scaler
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, choose_classes, silent, windows_for
+from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, silent, windows_for
 from plushsense.workflow.reporting import check_results, journal_of, machine
 
 SPLITS = ("leave-one-subject-out", "windows:5")
@@ -181,8 +181,7 @@ def baselines(
         what `plushsense.experiments.baselines.score.compare` returns, with ``dataset``, ``dataset_hash``,
         ``simulated``, ``preset``, ``training``, ``window_s``, ``id``, ``code_version`` and ``machine``.
     """
-    dataset = as_dataset(dataset)
-    config = config or from_settings(**settings)
+    dataset, config = network_inputs_of(as_dataset(dataset), config or from_settings(**settings))
     if config.windows.context == ANYWHERE:
         raise ConfigError("Programs are compared on windows of gestures: choose the context stream or loop.")
     names = chosen(models)

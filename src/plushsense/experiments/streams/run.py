@@ -46,7 +46,15 @@ from plushsense.tuning.gate import GateSpec, fit_gate
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, choose_classes, classes_for, outside_streams, silent, windows_for
+from plushsense.workflow.preparation import (
+    Warn,
+    choose_classes,
+    classes_for,
+    network_inputs_of,
+    outside_streams,
+    silent,
+    windows_for,
+)
 from plushsense.workflow.reporting import check_results, journal_of
 
 
@@ -217,6 +225,7 @@ def stream_eval(
     """
     bundle = model if isinstance(model, Bundle) else Bundle.load(Path(model))
     with streams_at(path, bundle) as dataset:
+        dataset = dataset.with_inputs(bundle.layout)
         if dataset.layout.inputs != bundle.layout.inputs:
             raise BundleError(
                 f"The model reads {', '.join(bundle.layout.inputs)}, and '{dataset.head.name}' has "
@@ -315,8 +324,7 @@ def stream_benchmark(
     Returns:
         what `score.summed` returns, with ``dataset``, ``simulated``, ``split``, ``note`` and the settings.
     """
-    dataset = as_dataset(dataset)
-    config = config or from_settings(**settings)
+    dataset, config = network_inputs_of(as_dataset(dataset), config or from_settings(**settings))
     names = _named(systems)
     if out is not None:
         need("matplotlib", extra="reports")

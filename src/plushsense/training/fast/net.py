@@ -18,11 +18,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from plushsense.models.arch import NORM_EPSILON, Arch, reflected
-from plushsense.models.net import Net
+from plushsense.models.net import MOMENTUM, Net
 from plushsense.training.fast.conv import LANES, BufferPool, ThreadPool, Way, way
 from plushsense.training.fast.plan import CHUNK, plan_net
-
-MOMENTUM = 0.1
 
 # Function (tensor, start, end) that writes windows [start, end) of a batch into a tensor (rows, windows, channels).
 Fill = Callable[[Tensor, int, int], None]
@@ -63,14 +61,16 @@ class FastNet:
     """A trainable network; `step` sets the gradients of its ``parameters`` without autograd.
 
     Args:
-        net: a `Net` with the initial weights.
+        net: a `Net` with the initial weights; a vector layer is not part of this network, but `step` then returns the
+            gradient that it needs.
         batch: largest number of windows in a batch.
         threads: number of threads for the chunks of a batch; it does not affect the result.
     """
 
     def __init__(self, net: Net, batch: int, threads: int = 1) -> None:
-        arch = net.arch
+        arch = net.arch.trunk
         self.arch, self.plan = arch, plan_net(arch, batch)
+        self._passes_on = net.arch.vector is not None
         self._layers = [self._layer(net, i) for i in range(len(arch.layers))]
         self._dense, self._dense_bias = net.dense.weight.detach().clone(), net.dense.bias.detach().clone()
         self._threads, self._shared = ThreadPool(threads), BufferPool()
@@ -100,8 +100,11 @@ class FastNet:
         )
 
     @torch.no_grad()
-    def step(self, fill: Fill, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute mean loss and logits (N, K) of a batch with the classes ``y`` (N,), and set the gradients."""
+    def step(self, fill: Fill, y: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Compute mean loss and logits (N, K) of a batch with the classes ``y`` (N,), and set the gradients.
+
+        After a vector layer, also return the gradient of the inputs (T, N, C), else None.
+        """
         self._cut(len(y))
         passes, pooled = self._forward(fill)
         last = passes[-1]
@@ -114,7 +117,9 @@ class FastNet:
         slope /= len(y)
         self._dense.grad, self._dense_bias.grad = slope.t() @ features, slope.sum(0)
         self._backward(passes, pooled, slope @ self._dense)
-        return loss, logits
+        if not self._passes_on:
+            return loss, logits, None
+        return loss, logits, torch.cat([self._gradient(0, i) for i in range(len(self._edges))], dim=1)
 
     @torch.no_grad()
     def logits(self, fill: Fill, windows: int) -> Tensor:
@@ -322,7 +327,7 @@ class FastNet:
         fresh = lane not in totals
         if fresh:
             totals[lane] = self._shared.take(("total", lane), *w.shape)
-        dx = self._slope(at, i) if at else None
+        dx = self._slope(at, i) if at or self._passes_on else None
         bias = layer.way.backward(dz, x, w, totals[lane], fresh, dx, space, spectrum)
         if dx is not None and layer.mirror is not None:
             dx[planned.front :].index_add_(0, layer.mirror, dx[: planned.front])
@@ -334,7 +339,7 @@ class FastNet:
         return self._shared.take(("slope", i), planned.needs, self._size(i), planned.reads)
 
     def _gradient(self, at: int, i: int) -> Tensor:
-        """Return the part of `_slope` that belongs to the output rows of the preceding layer."""
+        """Return the part of `_slope` that belongs to the output rows of the preceding layer, or to the inputs."""
         planned = self._layers[at].way.plan
         return self._slope(at, i)[planned.front : planned.front + planned.before]
 
