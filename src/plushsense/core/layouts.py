@@ -249,7 +249,7 @@ class Layout:
     def for_vectors(self) -> Layout:
         """Return the layout with the inputs of a network that begins with a vector layer (see `models.arch`).
 
-        These are the inputs that do not come from vectors, then the axes of all vectors, then the gravity along each
+        These are the inputs that are not axes of vectors, then the axes of all vectors, then the gravity along each
         axis of the first acceleration.
 
         Raises:
@@ -264,8 +264,7 @@ class Layout:
         kinds = {c.name: c.kind for c in self.channels}
         first = next(vector for vector in self.vectors if kinds[vector[0]] == ACCELERATION)
         gravity = tuple(Derived(f"{axis}_gravity", "gravity", (axis,)) for axis in first)
-        parts = {d.name: set(d.of) for d in self.derived} | {name: {name} for name in self.names}
-        others = [name for name in self.inputs if not parts[name] <= set(axes)]
+        others = [name for name in self.inputs if name not in (*axes, *(d.name for d in gravity))]
         derived = tuple(d for d in self.derived if d.kind != "gravity") + gravity
         return replace(self, derived=derived, inputs=(*others, *axes, *(d.name for d in gravity)))
 

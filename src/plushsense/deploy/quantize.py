@@ -194,7 +194,7 @@ def _vectors(
         shift = int(min(max(np.floor(room), -MOST_AXIS_SHIFT), MOST_AXIS_SHIFT))
         unit = scale * 2.0**-shift
         lengths = step[number] * unit * 2.0 ** down[number]
-        units += [lengths, lengths, np.sqrt(lengths * np.roll(lengths, -1)), np.array([unit])]
+        units += [lengths, lengths, np.sqrt(lengths * np.roll(lengths, -1))]
         shifts.append(shift)
     vectors = IntegerVectors(layer, np.array(shifts, dtype=np.int64), whole, down)
     size = np.concatenate(units)

@@ -44,7 +44,7 @@ def parse_symbol(spec: str) -> Symbol:
         fail("nothing is given: write kernel lengths joined by '_', as in 14d1_39d2_41d4", spec, 0)
     layers: list[tuple[int, int]] = []
     vector, at = None, 0
-    if spec.startswith("v"):
+    if spec.startswith(VECTOR):
         vector, at = _number(spec, 1, "the kernel length of the vector layer")
         if spec[at : at + 1] != "_":
             fail("a vector layer has no dilation, and at least one more layer after '_'", spec, at)
@@ -122,6 +122,7 @@ NORMS: tuple[str, ...] = get_args(Norm)
 NORM_EPSILON = 1e-5
 DEFAULT_SYMBOL = "14d1_19d2_19d4"
 DEFAULT_FILTERS = (8, 12, 16)
+VECTOR = "v"  # before the kernel length of a vector layer
 VECTOR_SYMBOL = "v14_19d2_19d4"
 
 PAPER_FILTERS: tuple[tuple[int, ...], ...] = (
@@ -177,11 +178,10 @@ class VectorLayer:
 
     - v = u · d, the vertical part,
     - n = |d − v u|, the length of the horizontal part h,
-    - c = ±√|u · (h × h')|, the sense of rotation from h to h', that of the next kernel (after the last, the first),
-    - |a|, the length of the vector itself at the newest sample.
+    - c = ±√|u · (h × h')|, the sense of rotation from h to h', that of the next kernel (after the last, the first).
 
-    The outputs are the other inputs at the newest sample, then for each vector all v, all n, all c and |a|; they are
-    then standardized, with running means and variances and no gain.
+    The outputs are the other inputs at the newest sample, then for each vector all v, all n and all c; they are then
+    standardized, with running means and variances and no gain.
     """
 
     kernel: int
@@ -201,7 +201,7 @@ class VectorLayer:
     @property
     def invariants(self) -> int:
         """Number of outputs for each vector."""
-        return 3 * self.filters + 1
+        return 3 * self.filters
 
     @property
     def macs(self) -> int:
@@ -320,7 +320,7 @@ class Arch:
     def symbol(self) -> str:
         """The symbol as the paper writes it: with dilations if any of them is not 1."""
         dilated = any(layer.dilation > 1 for layer in self.layers)
-        first = [] if self.vector is None else [f"v{self.vector.kernel}"]
+        first = [] if self.vector is None else [f"{VECTOR}{self.vector.kernel}"]
         return "_".join(
             first + [f"{layer.kernel}d{layer.dilation}" if dilated else f"{layer.kernel}" for layer in self.layers]
         )

@@ -97,8 +97,6 @@ class VectorNet(nn.Module):
             length = (h.square().sum(1) + LENGTH_EPSILON).sqrt()
             turn = (torch.linalg.cross(h, h.roll(-1, 2), dim=1) * up).sum(1)
             parts += [vertical, length, turn * (turn.square() + TURN_EPSILON).pow(-0.25)]
-            newest_axes = newest[:, first : first + 3]
-            parts.append((newest_axes.square().sum(1, keepdim=True) + LENGTH_EPSILON).sqrt())
         z = torch.cat(parts, dim=1)
         return F.batch_norm(z, self.mean, self.var, None, None, self.training, MOMENTUM, NORM_EPSILON)
 
@@ -109,6 +107,10 @@ class VectorNet(nn.Module):
     def export_weights(self) -> dict[str, NDArray[np.float32]]:
         """Return a copy of the weights as float32 arrays."""
         return {name: tensor.detach().cpu().numpy().copy() for name, tensor in self.tensors().items()}
+
+    def import_weights(self, weights: Mapping[str, NDArray[Any]]) -> None:
+        """Load the layer's part of a weights dict."""
+        _copy(self.tensors(), weights)
 
 
 class Net(nn.Module):
@@ -157,7 +159,11 @@ class Net(nn.Module):
     def import_weights(self, weights: Mapping[str, NDArray[Any]]) -> None:
         """Load a weights dict; raise BundleError if it belongs to another architecture."""
         check_weights(self.arch, weights)
-        with torch.no_grad():
-            for name, tensor in self._tensors().items():
-                values = torch.from_numpy(np.array(weights[name], dtype=np.float32))
-                tensor.copy_(values.reshape(tensor.shape))
+        _copy(self._tensors(), weights)
+
+
+def _copy(tensors: Mapping[str, Tensor], weights: Mapping[str, NDArray[Any]]) -> None:
+    with torch.no_grad():
+        for name, tensor in tensors.items():
+            values = torch.from_numpy(np.array(weights[name], dtype=np.float32))
+            tensor.copy_(values.reshape(tensor.shape))

@@ -35,9 +35,7 @@ class VectorStage:
         parts = [newest[..., : self._others]]
         for number, weight in enumerate(self.weight):
             first = self._others + 3 * number
-            vector = taps[..., first : first + 3]
-            parts += list(_invariants(weight @ vector, up))
-            parts.append(np.sqrt((vector[..., -1, :] ** 2).sum(axis=-1, keepdims=True) + LENGTH_EPSILON))
+            parts += list(_invariants(weight @ taps[..., first : first + 3], up))
         return np.concatenate(parts, axis=-1)
 
     def __call__(self, taps: Floats) -> Floats:

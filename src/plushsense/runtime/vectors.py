@@ -1,14 +1,14 @@
 """The vector layer of a deployed network, in 32-bit integers.
 
-This module is the specification that ``deploy/c/plushsense.c`` implements; `plushsense.models.arch.VectorLayer` explains
-the outputs. ``>>`` is a floor division, √ is rounded down.
+This module is the specification that ``deploy/c/plushsense.c`` implements; `plushsense.models.arch.VectorLayer`
+explains the outputs. ``>>`` is a floor division, √ is rounded down.
 
 1. Axes: a = x · 2^shift (``>>`` where the shift is negative), after x was clamped so that a is within ±32767.
 2. Gravity: shifted, without its sign, until its largest component is in 2^14 … 2^15 − 1; then
    u = ±((|g| << 14) / √(Σ g²)), rounded down; u = 0 if g = 0.
 3. Kernels: d = Σ w a over the taps, then ``>> down``, which makes |d| ≤ 2^14.
-4. v = (u · d) >> 14; h = d − ((v u) >> 14); n = √(h · h); with h' of the next kernel and t = u · (h × h'), of which each
-   term is ``>> 14``: c = ±√|t|; |a| = √(a · a).
+4. v = (u · d) >> 14; h = d − ((v u) >> 14); n = √(h · h); with h' of the next kernel and t = u · (h × h'), of which
+   each term is ``>> 14``: c = ±√|t|.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class IntegerVectors:
             first = others + 3 * number
             a = scaled_axes(x[:, :, first : first + 3], shift)
             d = (self._matrices[number] @ a.astype(np.float64)).astype(np.int64) >> self.down[number][:, None]
-            parts += [*_invariants(d, up), root((a[:, -1] ** 2).sum(axis=1))[:, None]]
+            parts += list(_invariants(d, up))
         return np.concatenate(parts, axis=1)
 
     @cached_property

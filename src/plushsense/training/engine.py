@@ -196,7 +196,7 @@ class Fast:
         loss, logits, gradient = self._net.step(fill, y)
         if self._vectors is not None and windows is not None and gradient is not None:
             self._vectors.zero_grad(set_to_none=True)
-            windows.backward(gradient.permute(1, 2, 0))
+            torch.autograd.backward(windows, gradient.permute(1, 2, 0))
         return loss, logits
 
     def logits(self, x: Windows) -> Tensor:

@@ -3,8 +3,8 @@
 The forward pass computes what ``runtime/integer`` computes: weights in steps of 1/127 of the largest in their filter,
 activations in 255 steps of a fixed range, biases as in ``deploy/quantize``. Only the fixed-point scales are left out,
 which change an activation by less than a hundredth of a step unless it lies on a rounding boundary. Gradients pass
-straight through rounding. Batch normalisation is frozen. The targets are the outputs of the float network, not the
-labels, so that a few epochs on the training windows do not overfit.
+straight through rounding. Batch normalisation and a vector layer are frozen. The targets are the outputs of the float
+network, not the labels, so that a few epochs on the training windows do not overfit.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import TrainingError
 from plushsense.models.arch import NORM_EPSILON, Arch
-from plushsense.models.net import Net
+from plushsense.models.net import Net, VectorNet
 from plushsense.runtime.integer import deployable
 from plushsense.training.engine import slices, torch_threads
 from plushsense.training.spec import TrainSpec
@@ -110,8 +110,16 @@ class Rounded:
     def __init__(self, arch: Arch, weights: Mapping[str, NDArray[Any]], calibration: Mapping[str, Any]) -> None:
         self.arch = arch
         self._tensors = {name: torch.from_numpy(np.array(w, dtype=np.float32)) for name, w in weights.items()}
-        frozen = (".mean", ".var")
-        self.parameters = [t.requires_grad_() for name, t in self._tensors.items() if not name.endswith(frozen)]
+        # With 16 bits, the rounding of a vector layer changes nothing that could be learnt.
+        self._vectors = None if arch.vector is None else VectorNet(arch.vector, arch)
+        if self._vectors is not None:
+            self._vectors.import_weights(weights)
+            self._vectors.eval()
+        self.parameters = [
+            t.requires_grad_()
+            for name, t in self._tensors.items()
+            if not name.endswith((".mean", ".var")) and not name.startswith("vector.")
+        ]
         self._low, self._high = (torch.tensor(calibration[name], dtype=torch.float32) for name in ("low", "high"))
         self._tops = [torch.tensor(top, dtype=torch.float32).clamp_min(1e-6) for top in calibration["tops"]]
         self._means = [torch.tensor(mean, dtype=torch.float32) for mean in calibration["means"]]
@@ -119,6 +127,9 @@ class Rounded:
     def __call__(self, x: Tensor) -> Tensor:
         """Return the logits (N, K) of scaled windows (N, C, span)."""
         tensors, arch = self._tensors, self.arch
+        if self._vectors is not None:
+            with torch.no_grad():
+                x = self._vectors(x)
         unit = (self._high - self._low).clamp_min(1e-6) / 255
         start, mean = self._low, self._means[0]
         codes = _whole((x - start[:, None]) / unit[:, None])

@@ -146,6 +146,7 @@ def _network(grid: GridSpec, symbol: str, filters: Sequence[int], layout: Layout
         norm=grid.norm,
         window=layout.samples(grid.window_s),
         step=layout.samples(_STEP_S),
+        vectors=len(layout.vectors),
     )
 
 
@@ -163,7 +164,7 @@ def problems(
     shapes: dict[str, int] = {}
     for symbol in grid.architectures:
         try:
-            shapes[symbol] = len(parse_symbol(symbol))
+            shapes[symbol] = parse_symbol(symbol).filter_counts
         except ArchError as cause:
             wrong.append(first_line(cause))
     for filters in grid.filters:
@@ -179,6 +180,7 @@ def problems(
                     "give one a layer."
                 )
     wrong += _twice(grid)
+    wrong += _mixed(list(shapes))
     for epochs in grid.epochs:
         if epochs < 1:
             wrong.append(f"Epochs {epochs} cannot be trained: accepted are whole numbers from 1.")
@@ -225,6 +227,18 @@ def _of_settings(grid: GridSpec) -> list[str]:
     return wrong
 
 
+def _mixed(symbols: Sequence[str]) -> list[str]:
+    """Report that only some of the networks begin with a vector layer."""
+    turning = [symbol for symbol in symbols if parse_symbol(symbol).vector is not None]
+    other = next((symbol for symbol in symbols if symbol not in turning), None)
+    if not turning or other is None:
+        return []
+    return [
+        f"{turning[0]} begins with a vector layer, {other} does not, so they read different inputs: make a grid of "
+        "each kind."
+    ]
+
+
 def _refused(make: Callable[[], object]) -> list[str]:
     try:
         make()
@@ -247,7 +261,7 @@ def _twice(grid: GridSpec) -> list[str]:
                 shape = parse_symbol(symbol)
             except ArchError:
                 continue
-            network, name = (shape, filters[: len(shape)]), f"{symbol} with {slashed(filters) or '(none)'}"
+            network, name = (shape, filters[: shape.filter_counts]), f"{symbol} with {slashed(filters) or '(none)'}"
             if network in seen:
                 other = f"as {seen[network]}" if seen[network] != name else "twice"
                 wrong.append(f"{name} is the same network {other}: leave one out.")
@@ -263,7 +277,7 @@ def _too_long(grid: GridSpec, symbol: str, layout: Layout, past: int | None) -> 
     # `_of_settings` reports an unknown padding or norm.
     known = replace(grid, padding=grid.padding if grid.padding in PADDINGS else "mirror", norm="batch")
     try:
-        arch = _network(known, symbol, (1,) * 4, layout, 2)
+        arch = _network(known, symbol, (2,) * 5, layout, 2)
     except BadInput as cause:
         # The window is wrong; report it unless `_of_settings` already does.
         return [] if _of_settings(grid) else [first_line(cause)]

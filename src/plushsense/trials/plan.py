@@ -23,7 +23,7 @@ from plushsense.dataset.store import Dataset
 from plushsense.evaluation.crossval import fold_fingerprint, fold_windows, windows_fingerprint
 from plushsense.jobs.journal import JOURNAL, UNFINISHED, Journal, Result, job_id, keep_if_possible
 from plushsense.jobs.pool import Job, Report, run_jobs
-from plushsense.models.arch import Arch
+from plushsense.models.arch import VECTOR, Arch
 from plushsense.scoring import metrics
 from plushsense.scoring.metrics import Counts
 from plushsense.scoring.splits import Fold, Split, parse_split
@@ -154,6 +154,8 @@ def _cut(dataset: Dataset, grid: GridSpec, unreadable: Sequence[str], warn: Warn
     past = int(median(reaches)) if reaches else 0
     cut, fewest, failures = None, None, list[str]()
     try:
+        if any(symbol.startswith(VECTOR) for symbol in grid.architectures):
+            dataset = dataset.with_inputs(dataset.layout.for_vectors())
         cut = _Cut.of(dataset, grid, warn)
         fewest = len(cut.windows)
         fewest = min(len(fold.train) for fold in cut.folds())
@@ -235,7 +237,7 @@ def _planned(dataset: Dataset, grid: GridSpec, cut: _Cut, fits: Callable[[Arch],
     trials: list[PlannedTrial] = []
     jobs: dict[str, Job] = {}
     used: set[int] = set()
-    for training in trainings(grid, dataset.layout, len(cut.gestures)):
+    for training in trainings(grid, cut.dataset.layout, len(cut.gestures)):
         arch = training.trials[0].arch
         if not fits(arch):
             continue

@@ -14,7 +14,7 @@ A recording that is many times longer than usual for its gesture was not stopped
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -105,6 +105,12 @@ class WindowSet:
         """Return the windows at ``index``; ``recording`` still refers to all ``recording_ids``."""
         per_window = ("x", "y", "recording", "subject", "context", "stream", "window_rows", "recording_rows")
         return replace(self, **{name: getattr(self, name)[index] for name in per_window})
+
+    def only(self, inputs: Sequence[str]) -> WindowSet:
+        """Return the windows with some of the inputs."""
+        at = [self.inputs.index(name) for name in inputs]
+        vectors = tuple(tuple(at.index(axis) for axis in axes) for axes in self.vectors if set(axes) <= set(at))
+        return replace(self, x=self.x[:, at], inputs=tuple(inputs), vectors=vectors)
 
     def __repr__(self) -> str:
         n, f, t = self.x.shape

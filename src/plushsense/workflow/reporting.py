@@ -85,7 +85,7 @@ SCORES, PREDICTIONS, PAGE = "evaluation.json", "predictions.parquet", "report.ht
 
 def evaluation_id(config: RunConfig, dataset: Dataset) -> str:
     """Return an identifier of 20 hexadecimal digits, equal for equal settings and data."""
-    return job_id({"settings": config.outcome(), "data": dataset.hash})
+    return job_id({"settings": config.for_layout(dataset.layout).outcome(), "data": dataset.hash})
 
 
 def check_place(out: Path, config: RunConfig, dataset: Dataset, *, replace: bool = False) -> None:
@@ -237,11 +237,12 @@ def _evaluation_table(source: Evaluation | Mapping[str, Any] | str | os.PathLike
 
 def name_of(config: RunConfig, dataset: Dataset) -> str:
     """Return a folder name for an evaluation: the main settings and the start of `evaluation_id`."""
+    config = config.for_layout(dataset.layout)
     evaluation, model = config.evaluation, config.model
     context = config.windows.context
     if evaluation.train_context not in (None, context):
         context = f"{evaluation.train_context}-to-{context}"
     filters = "-".join(map(str, model.filters))
-    parts = (evaluation.split.replace(":", "-"), model.arch, filters, config.padding, model.norm, context)
+    parts = (evaluation.split.replace(":", "-"), str(model.arch), filters, config.padding, model.norm, context)
     words = "_".join(parts) + f"_{config.preset}_e{config.training.epochs}_seed{config.training.seed}"
     return f"{words[:180]}_{evaluation_id(config, dataset)[:8]}"

@@ -400,7 +400,7 @@ static int read_vectors(plush_toy *toy, source *from)
         if (toy->vectors > MOST_VECTORS || p[1] < 2 || p[1] > MOST_KERNELS || p[2] == 0 || p[3] != 0 ||
             toy->inputs < axes)
             return 0;
-        toy->features = (uint16_t)(toy->inputs - axes + toy->vectors * (3u * toy->vector_kernels + 1u));
+        toy->features = (uint16_t)(toy->inputs - axes + toy->vectors * 3u * toy->vector_kernels);
         for (v = 0; v < toy->vectors; v++) {
             const uint8_t *shift = next_bytes(from, 1);
 
@@ -1532,8 +1532,7 @@ static void convolve(const plush_toy *toy, const int16_t *axes, const uint8_t *w
 static const uint8_t *invariants(plush_toy *toy, const int16_t *axes, const uint8_t *plan, const int32_t *up,
                                  uint8_t *row, const uint8_t *scale)
 {
-    uint32_t kernels = toy->vector_kernels, width = 3u * toy->vectors, total[3] = {0, 0, 0}, squares = 0, k, i, n;
-    const int16_t *newest = axes + toy->vector_newest * width;
+    uint32_t kernels = toy->vector_kernels, width = 3u * toy->vectors, total[3] = {0, 0, 0}, k, i, n;
 
     for (n = 0; n < toy->vector_taps; n++)
         for (i = 0; i < 3; i++)
@@ -1560,16 +1559,13 @@ static const uint8_t *invariants(plush_toy *toy, const int16_t *axes, const uint
 
         row[2 * kernels + k] = to_code(turn < 0 ? -size : size, scale + INPUT_BYTES * (2 * kernels + k));
     }
-    for (i = 0; i < 3; i++)
-        squares += (uint32_t)((int32_t)newest[i] * newest[i]);
-    row[3 * kernels] = to_code((int32_t)short_root(squares), scale + INPUT_BYTES * 3 * kernels);
     return plan;
 }
 
 /* The vector layer: the other inputs as they are, and what does not turn with the toy of the rest. */
 static void vector_sample(plush_toy *toy, const int32_t *x, uint8_t *row)
 {
-    uint32_t others = toy->inputs - 3u * toy->vectors - 3u, outputs = 3u * toy->vector_kernels + 1u, i;
+    uint32_t others = toy->inputs - 3u * toy->vectors - 3u, outputs = 3u * toy->vector_kernels, i;
     const uint8_t *plan = toy->vector_plan;
     int32_t up[3];
 

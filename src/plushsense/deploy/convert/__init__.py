@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import BadInput, BundleError, ConfigError, check_known
+from plushsense.core.errors import ArchError, BadInput, BundleError, ConfigError, check_known
 from plushsense.core.files import write_file
+from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import check_windows
 from plushsense.runtime.fixed import LOGIT_LIMIT
@@ -82,6 +83,15 @@ CONVERTERS: dict[str, Format] = {
     "espdl-esp32": Format("model.esp32.espdl", "ESP-DL for the ESP32, int8", "espdl:to_esp32"),
     "espdl-esp32p4": Format("model.esp32p4.espdl", "ESP-DL for the ESP32-P4, int8", "espdl:to_esp32p4"),
 }
+
+
+def refuse_vectors(arch: Arch, suffix: str) -> None:
+    """Raise ArchError for a network with a vector layer, which a format with this suffix cannot hold here."""
+    if arch.vector is not None:
+        raise ArchError(
+            f"{arch.title} begins with a vector layer, which PlushSense does not write to {suffix} files: take the "
+            "format onnx, onnx-int8 or the C of plushsense export, or train a network without a vector layer."
+        )
 
 
 def check_format(name: str) -> None:

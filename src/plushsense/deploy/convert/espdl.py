@@ -21,7 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BundleError, need
-from plushsense.deploy.convert import LOGITS, Conversion, ConversionJob, Floats, compared, describe
+from plushsense.deploy.convert import (
+    LOGITS,
+    Conversion,
+    ConversionJob,
+    Floats,
+    compared,
+    describe,
+    refuse_vectors,
+)
 from plushsense.deploy.convert.onnx import OnnxGraph
 from plushsense.deploy.quantize import Ranges, folded, refuse_undeployable
 from plushsense.models.bundle import Bundle
@@ -54,6 +62,7 @@ def to_espdl(job: ConversionJob, target: str) -> Conversion:
     """
     bundle = job.bundle
     refuse_undeployable(bundle.arch)
+    refuse_vectors(bundle.arch, ".espdl")
     job = job.thinned(_MOST)
     scaled = bundle.scaler.apply(job.windows)
     some = scaled[: job.given or None]

@@ -7,6 +7,7 @@ The input ``raw`` (N, C, span) is float32 with whole numbers in raw sensor count
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,9 +30,11 @@ from plushsense.deploy.convert import (
     sum_scales,
 )
 from plushsense.deploy.quantize import integer_network
-from plushsense.models.arch import NORM_EPSILON, Arch, ConvLayer, reflected
+from plushsense.models.arch import NORM_EPSILON, Arch, ConvLayer, VectorLayer, reflected
 from plushsense.models.bundle import Bundle
+from plushsense.models.vectors import LENGTH_EPSILON, TURN_EPSILON
 from plushsense.runtime.integer import IntegerNetwork
+from plushsense.runtime.vectors import AXIS_LIMIT
 
 OPSET = 18
 IR_VERSION = 9
@@ -86,6 +89,12 @@ def float_model(bundle: Bundle) -> bytes:
     z = g.add("Sub", "shifted", RAW, g.columns("scaler.offset", whole))
     z = g.add("Mul", "sized", z, g.columns("scaler.scale", scale))
     z = g.add("Add", "scaled", z, g.columns("scaler.rest", rest))
+    if arch.vector is not None:
+        weights = bundle.weights["vector.weight"].astype(np.float64)
+        z = _invariants(g, arch, arch.vector, z, weights, (LENGTH_EPSILON, TURN_EPSILON))
+        z = g.add("Sub", "vector.centred", z, g.columns("vector.mean", bundle.weights["vector.mean"]))
+        root = np.sqrt(bundle.weights["vector.var"].astype(np.float64) + NORM_EPSILON)
+        z = g.add("Mul", "vector", z, g.columns("vector.gain", (1.0 / root).astype(np.float32)))
     for i, layer in enumerate(arch.layers):
         z, pads = _padding(g, i, arch, layer, z)
         w, b = (g.constant(n, bundle.weights[n]) for n in (f"conv{i}.weight", f"conv{i}.bias"))
@@ -119,6 +128,69 @@ def _padding(g: OnnxGraph, i: int, arch: Arch, layer: ConvLayer, z: str) -> tupl
     return g.add("Gather", f"mirror{i}", z, g.constant(f"mirror{i}.places", indices), axis=2), [0, 0]
 
 
+def _invariants(
+    g: OnnxGraph,
+    arch: Arch,
+    layer: VectorLayer,
+    z: str,
+    weights: NDArray[np.float64],
+    epsilons: tuple[float, float],
+    sizes: NDArray[np.float64] | None = None,
+) -> str:
+    """Add the vector layer, before its standardization.
+
+    ``weights`` (V, K, taps) and ``epsilons`` are those of `plushsense.models.vectors`; ``sizes`` (V,) multiply the axes
+    of each vector, which are then clipped as in `plushsense.runtime.vectors`.
+    """
+    others, one = arch.channels - layer.axes, g.constant("axis.1", np.array([1], dtype=np.int64))
+
+    def part(name: str, z: str, axis: int, first: int, last: int) -> str:
+        edges = (np.array([v], dtype=np.int64) for v in (first, last, axis))
+        return g.add("Slice", name, z, *(g.constant(f"{name}.{k}", v) for k, v in enumerate(edges)))
+
+    def length(name: str, z: str, keep: int) -> str:
+        squares = g.add("ReduceSumSquare", f"{name}.squares", z, one, keepdims=keep)
+        return g.add("Sqrt", name, g.add("Add", f"{name}.sum", squares, small))
+
+    def turned(name: str, z: str, axis: int, order: Sequence[int]) -> str:
+        return g.add("Gather", name, z, g.constant(f"{name}.order", np.array(order, dtype=np.int64)), axis=axis)
+
+    small, smaller = (g.constant(f"epsilon.{i}", np.array(e, dtype=np.float32)) for i, e in enumerate(epsilons))
+    newest = part("newest", z, 2, layer.reach, arch.span)
+    gravity = part("gravity", newest, 1, arch.channels - 3, arch.channels)
+    up = g.add("Div", "up", gravity, length("gravity.length", gravity, 1))
+    up = g.add("Unsqueeze", "up.rows", up, g.constant("axis.2", np.array([2], dtype=np.int64)))
+    outputs = [part("others", newest, 1, 0, others)] if others else []
+    for v, kernels in enumerate(weights):
+        n = f"vector{v}"
+        axes = part(f"{n}.axes", z, 1, others + 3 * v, others + 3 * v + 3)
+        if sizes is not None:
+            size, *edges = (np.array(x, dtype=np.float32) for x in (sizes[v], -AXIS_LIMIT, AXIS_LIMIT))
+            axes = g.add("Mul", f"{n}.sized", axes, g.constant(f"{n}.size", size))
+            limits = (g.constant(f"{n}.edge{k}", edge) for k, edge in enumerate(edges))
+            axes = g.add("Clip", f"{n}.clipped", axes, *limits)
+        rows = g.constant(f"{n}.rows", np.array([-1, 1, arch.span], dtype=np.int64))
+        d = g.add("Reshape", f"{n}.each", axes, rows)
+        w = g.constant(f"{n}.weight", kernels[:, None].astype(np.float32))
+        d = g.add("Conv", f"{n}.conv", d, w, kernel_shape=[layer.kernel])
+        shape = np.array([-1, 3, layer.filters, arch.span - layer.reach], dtype=np.int64)
+        d = g.add("Reshape", f"{n}.vectors", d, g.constant(f"{n}.shape", shape))
+        vertical = g.add("ReduceSum", f"{n}.vertical", g.add("Mul", f"{n}.upward", d, up), one, keepdims=1)
+        h = g.add("Sub", f"{n}.horizontal", d, g.add("Mul", f"{n}.lifted", vertical, up))
+        after = turned(f"{n}.next", h, 2, [*range(1, layer.filters), 0])
+        ahead, back = (1, 2, 0), (2, 0, 1)
+        one_way = g.add("Mul", f"{n}.a", turned(f"{n}.h1", h, 1, ahead), turned(f"{n}.n2", after, 1, back))
+        other_way = g.add("Mul", f"{n}.b", turned(f"{n}.h2", h, 1, back), turned(f"{n}.n1", after, 1, ahead))
+        cross = g.add("Sub", f"{n}.cross", one_way, other_way)
+        turn = g.add("ReduceSum", f"{n}.turn", g.add("Mul", f"{n}.around", cross, up), one, keepdims=0)
+        sized = g.add("Add", f"{n}.turn.sum", g.add("Mul", f"{n}.turn.square", turn, turn), smaller)
+        power = g.constant(f"{n}.power", np.array(-0.25, dtype=np.float32))
+        sense = g.add("Mul", f"{n}.sense", turn, g.add("Pow", f"{n}.root", sized, power))
+        flat = g.add("Squeeze", f"{n}.v", vertical, one)
+        outputs += [flat, length(f"{n}.n", h, 0), sense]
+    return g.add("Concat", "invariants", *outputs, axis=1)
+
+
 def _mean(g: OnnxGraph, z: str) -> str:
     return g.add("ReduceMean", "pooled", z, g.constant("time", np.array([2], dtype=np.int64)), keepdims=0)
 
@@ -143,7 +215,13 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
         return g.add("DequantizeLinear", f"{name}.real", g.constant(name, whole), scale, none, axis=0)
 
     offset, gain, start = input_codes(network)
-    z = g.add("Sub", "shifted", RAW, g.columns("input.offset", offset))
+    z = RAW
+    if arch.vector is not None and network.vectors is not None:
+        # In floats, so that the codes may differ by the rounding of the integer layer.
+        weights = network.vectors.weights / np.ldexp(1.0, network.vectors.down)[:, :, None]
+        sizes = np.ldexp(1.0, network.vectors.shift)
+        z = _invariants(g, arch, arch.vector, z, weights, (1.0, 1.0), sizes)
+    z = g.add("Sub", "shifted", z, g.columns("input.offset", offset))
     z = g.add("Mul", "sized", z, g.columns("input.gain", gain))
     z = quantized(g.add("Add", "scaled", z, g.columns("input.start", start)), "input")
     for i, (layer, integer_layer) in enumerate(zip(arch.layers, network.layers, strict=True)):

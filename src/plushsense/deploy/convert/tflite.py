@@ -27,6 +27,7 @@ from plushsense.deploy.convert import (
     compared,
     describe,
     input_codes,
+    refuse_vectors,
     scaling,
     sum_scales,
 )
@@ -265,6 +266,7 @@ def run_model(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32]:
 
 def to_tflite(job: ConversionJob) -> Conversion:
     """Convert the float network."""
+    refuse_vectors(job.bundle.arch, ".tflite")
     model = float_model(job.bundle)
     note = f"Input '{RAW}' (1, span, {job.bundle.arch.channels})."
     return compared(job, model, run_model(model, job.windows), "LiteRT", note=note)
@@ -272,6 +274,7 @@ def to_tflite(job: ConversionJob) -> Conversion:
 
 def to_integer_tflite(job: ConversionJob) -> Conversion:
     """Convert the network with int8 convolutions; its outputs are close to those of the C, not bit-identical."""
+    refuse_vectors(job.bundle.arch, ".tflite")
     network = integer_network(job.bundle)
     model = integer_model(job.bundle, network)
     return compared(job, model, run_model(model, job.windows), "LiteRT", network.forward(job.windows) / 256)

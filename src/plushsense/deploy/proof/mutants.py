@@ -159,7 +159,7 @@ class _ImageOffsets:
         self.vector_weight = at + 2 + int(np.abs(first).argmax()) if taps else 0
         at += self.vectors * (1 + kernels * (1 + taps))
         self.input_scales = at
-        outputs = inputs - 3 * self.vectors - 3 + self.vectors * (3 * kernels + 1) if self.vectors else inputs
+        outputs = inputs - 3 * self.vectors - 3 + 3 * self.vectors * kernels if self.vectors else inputs
         at += _INPUT_BYTES * outputs
         self.layers: list[_LayerOffsets] = []
         stored = np.frombuffer(image, dtype=np.uint8).astype(np.int64) - 128

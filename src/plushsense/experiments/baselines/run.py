@@ -7,7 +7,7 @@ import os
 import platform
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from plushsense.core.version import __version__
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.baselines.models import BASELINES, FEATURES, ROCKETS, TOO_LONG, classical, rockets
-from plushsense.experiments.baselines.score import Contender, Reader, compare
+from plushsense.experiments.baselines.score import Contender, Fit, Reader, compare
 from plushsense.jobs.journal import job_id
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
@@ -98,6 +98,32 @@ class RecurrentFit:
         return fit_recurrent(train, self.spec, self.samples, both_ways=self.both_ways)
 
 
+@dataclass(frozen=True)
+class OnInputs:
+    """A function that trains a program on some of the inputs of the windows."""
+
+    fit: Fit
+    inputs: tuple[str, ...]
+
+    def __call__(self, train: WindowSet, validation: WindowSet, /) -> Reader:
+        return OnInputsReader(self.fit(train.only(self.inputs), validation.only(self.inputs)), self.inputs)
+
+
+@dataclass(frozen=True)
+class OnInputsReader:
+    """A trained program that reads some of the inputs of the windows."""
+
+    reader: Reader
+    inputs: tuple[str, ...]
+
+    @property
+    def size_bytes(self) -> int:
+        return self.reader.size_bytes
+
+    def __call__(self, windows: WindowSet, /) -> NDArray[np.float32]:
+        return self.reader(windows.only(self.inputs))
+
+
 def chosen(models: str | Sequence[str]) -> tuple[str, ...]:
     """Return the programs in ``models`` (names of `MODELS` and `SETS`; a text has commas) in the order of `MODELS`.
 
@@ -121,8 +147,12 @@ def contenders(
     layout: Layout,
     gestures: GestureSet,
     windows: WindowSet,
+    inputs: Sequence[str],
 ) -> list[Contender]:
-    """Return the requested programs for `compare`; all use the seed of ``config.training``."""
+    """Return the requested programs for `compare`; all use the seed of ``config.training``.
+
+    Only our own network reads inputs that are not in ``inputs``.
+    """
     spec, samples = config.training, layout.samples(config.windows.window_s)
     made = classical([m for m in models if m in BASELINES], features, pca, samples, spec.seed)
     made += rockets([m for m in models if m in ROCKETS], samples, spec.seed)
@@ -139,6 +169,8 @@ def contenders(
         key["training"] = spec.key()
         fit = RecurrentFit(spec, samples, name == "bilstm")
         made.append(Contender(name, RECURRENT[name], "windows", False, fit, key))
+    if tuple(inputs) != windows.inputs:
+        made = [replace(one, fit=OnInputs(one.fit, tuple(inputs))) for one in made]
     if NETWORK in models:
         key = {"arch": arch.to_dict(), "training": spec.key(), "vectors": vectors}
         title = f"{arch.title} {arch.padding} (ours)"
@@ -181,7 +213,9 @@ def baselines(
         what `plushsense.experiments.baselines.score.compare` returns, with ``dataset``, ``dataset_hash``,
         ``simulated``, ``preset``, ``training``, ``window_s``, ``id``, ``code_version`` and ``machine``.
     """
-    dataset, config = network_inputs_of(as_dataset(dataset), config or from_settings(**settings))
+    dataset = as_dataset(dataset)
+    inputs = dataset.layout.inputs
+    dataset, config = network_inputs_of(dataset, config or from_settings(**settings))
     if config.windows.context == ANYWHERE:
         raise ConfigError("Programs are compared on windows of gestures: choose the context stream or loop.")
     names = chosen(models)
@@ -200,7 +234,7 @@ def baselines(
             warn(f"left out: {BASELINES[name].title} on {view} windows {how} PCA, which takes too long")
     table = compare(
         windows,
-        contenders(names, features, PCA[pca], config, network, dataset.layout, gestures, windows),
+        contenders(names, features, PCA[pca], config, network, dataset.layout, gestures, windows, inputs),
         asked,
         journal=journal_of(dataset, "baselines"),
         workers=config.evaluation.processes,
@@ -240,7 +274,7 @@ def comparison_id(
     """
     if pca not in PCA:
         raise ConfigError(f"Unknown choice '{pca}' for PCA: accepted are {', '.join(PCA)}.{nearest(pca, PCA)}")
-    outcome = {key: value for key, value in config.outcome().items() if key != "evaluation"}
+    outcome = {key: value for key, value in config.for_layout(dataset.layout).outcome().items() if key != "evaluation"}
     outcome |= {"seed": config.evaluation.seed, "classes": config.evaluation.classes}
     outcome |= {"splits": [parse_split(text).text for text in splits], "models": chosen(models)}
     outcome |= {"features": list(features), "pca": pca}

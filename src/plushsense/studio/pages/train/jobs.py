@@ -138,7 +138,8 @@ def _evaluate(dataset: Path, given: Mapping[str, Any]) -> JobRequest:
 
 def _checked(settings: Mapping[str, Any]) -> RunConfig:
     config = from_settings(**settings)
-    parse_symbol(config.model.arch)
+    if config.model.arch is not None:
+        parse_symbol(config.model.arch)
     return config
 
 
