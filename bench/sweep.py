@@ -120,7 +120,7 @@ class Loops:
         def fill(out: Tensor, start: int, end: int) -> None:
             torch.index_select(self.time_first, 1, batch[start:end], out=out)
 
-        loss, _ = self.fast.step(fill, self.y[batch])
+        loss, _, _ = self.fast.step(fill, self.y[batch])
         self.fast_adam.step()
         return loss
 

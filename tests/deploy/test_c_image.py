@@ -22,7 +22,7 @@ from plushsense.runtime.events import ENDED
 from plushsense.runtime.gate import JERK, LEVEL, MOST_SIZE, GateSettings, Rule, Signal, Term
 from plushsense.runtime.image import IntegerModel, image_head
 from support.c_toy import Seat, seat
-from support.integers import any_frames, models, plain_model, ruled_model
+from support.integers import any_frames, models, plain_model, ruled_model, vector_model
 
 OK, NOT_A_MODEL, OTHER_VERSION, DAMAGED, TOO_SMALL, OTHER_LAYOUT = range(6)
 
@@ -38,7 +38,7 @@ def test_what_plush_begin_says(c_library: Any) -> None:
     assert status(image) == OK
     assert status(image + b"what stands behind it in flash") == OK
     assert status(b"") == status(image[:15]) == status(b"PLSX" + image[4:]) == NOT_A_MODEL
-    assert status(image[:4] + b"\1" + image[5:]) == OTHER_VERSION == status(image[:4] + b"\3" + image[5:])
+    assert status(image[:4] + b"\2" + image[5:]) == OTHER_VERSION == status(image[:4] + b"\4" + image[5:])
     for cut in (16, 17, len(image) // 2, len(image) - 1):
         assert status(image[:cut]) == DAMAGED
     for at in range(16, len(image), 7):
@@ -56,7 +56,7 @@ def sealed(body: bytes) -> bytes:
 def test_a_good_checksum_makes_no_model(c_library: Any) -> None:
     """Every count that could lead a reader astray is refused, one at a time."""
     body = plain_model().to_bytes()[16:]
-    layer = 28 + 4 * 8 + (2 + 1 + 12) + (2 + 3 + 12)
+    layer = 28 + 4 * 12 + (3 + 1) + (3 + 3) + 4 + 2 * 12
     assert struct.unpack_from("<HHHH", body, layer) == (5, 2, 2, 6)
     changes = {
         "no layers": (0, b"\0"),
@@ -78,14 +78,19 @@ def test_a_good_checksum_makes_no_model(c_library: Any) -> None:
         "no units a ms": (20, struct.pack("<I", 0)),
         "no smoothing": (24, struct.pack("<H", 0)),
         "smoothing above 1": (24, struct.pack("<H", 32769)),
-        "an unknown input": (60, b"\2"),
-        "a channel of two parts": (60, b"\0\2"),
-        "an input of no part": (61, b"\0"),
-        "a part that is no channel": (62, b"\4"),
-        "bias": (67, struct.pack("<i", 1 << 30)),
-        "input multiplier": (71, struct.pack("<H", 32768)),
-        "input shift before": (73, b"\x11"),
-        "input shift after": (74, b"\x1f"),
+        "a zero too far from the range": (36, struct.pack("<i", -1)),
+        "an unknown input": (76, b"\3"),
+        "a channel of two parts": (76, b"\0\2"),
+        "an input of no part": (77, b"\0"),
+        "a shift without a mean": (78, b"\1"),
+        "a part that is no channel": (79, b"\4"),
+        "vectors that are not there": (86, b"\1"),
+        "kernels of no vector": (87, b"\2"),
+        "taps of no vector": (88, b"\1"),
+        "bias": (94, struct.pack("<i", 1 << 30)),
+        "input multiplier": (98, struct.pack("<H", 32768)),
+        "input shift before": (100, b"\x11"),
+        "input shift after": (101, b"\x1f"),
         "kernel 0": (layer, struct.pack("<H", 0)),
         "kernel beyond the end": (layer, struct.pack("<H", 65535)),
         "dilation 0": (layer + 2, struct.pack("<H", 0)),
@@ -104,6 +109,36 @@ def test_a_good_checksum_makes_no_model(c_library: Any) -> None:
         wrong = sealed(body[:at] + change + body[at + len(change) :])
         assert Seat(c_library, wrong, 4, 3).status == DAMAGED, what
     assert Seat(c_library, sealed(body + b"\0"), 4, 3).status == DAMAGED
+    assert Seat(c_library, sealed(body), 4, 3).status == OK
+
+
+def test_a_good_checksum_makes_no_vector_layer(c_library: Any) -> None:
+    """Every number of the layer that could lead a reader or a sum astray is refused, one at a time."""
+    model = vector_model()
+    body = model.to_bytes()[16:]
+    inputs = 28 + 4 * 12
+    gravity, layer = inputs + 6 + 4 * 4, inputs + 6 + 7 * 4
+    kernel, high = layer + 5, 28 + 12 + 4
+    assert body[gravity : gravity + 3] == b"\2\1\7" and body[layer : layer + 4] == b"\1\2\3\0"
+    changes = {
+        "a mean over too many samples": (gravity + 2, b"\x10"),
+        "gravity of two channels": (gravity + 1, b"\2"),
+        "gravity whose mean leaves 32 bits": (high, struct.pack("<i", (1 << 19) + 1)),
+        "9 vectors": (layer, b"\x09"),
+        "more vectors than axes": (layer, b"\2"),
+        "one kernel": (layer + 1, b"\1"),
+        "65 kernels": (layer + 1, b"\x41"),
+        "no taps": (layer + 2, b"\0"),
+        "256 taps": (layer + 3, b"\1"),
+        "shift of the axes": (layer + 4, b"\x21"),
+        "shift of a kernel": (kernel, b"\x1f"),
+        "a sum beyond its bits": (kernel, bytes([int(model.network.vectors.down[0, 0]) - 1])),
+    }
+    for what, (at, change) in changes.items():
+        wrong = sealed(body[:at] + change + body[at + len(change) :])
+        assert Seat(c_library, wrong, 4, 3).status == DAMAGED, what
+    for cut in range(inputs, layer + 200):
+        assert Seat(c_library, sealed(body[:cut]), 4, 3).status == DAMAGED
     assert Seat(c_library, sealed(body), 4, 3).status == OK
 
 
@@ -216,7 +251,7 @@ def test_a_swap_to_what_is_no_model_for_this_toy_changes_nothing(c_library: Any)
         other_layout = sealed(body[:26] + bytes([body[26] ^ 1]) + body[27:])
         refused = {
             NOT_A_MODEL: [b"", good[:15], b"PLSX" + good[4:]],
-            OTHER_VERSION: [good[:4] + b"\1" + good[5:], good[:4] + b"\3" + good[5:]],
+            OTHER_VERSION: [good[:4] + b"\2" + good[5:], good[:4] + b"\4" + good[5:]],
             DAMAGED: [good[: int(rng.integers(16, len(good)))] for _ in range(20)],
             OTHER_LAYOUT: [other_layout],
         }

@@ -49,7 +49,7 @@ def test_read_back(model: IntegerModel) -> None:
     image = model.to_bytes()
     network, layout, arch = model.network, model.layout, model.network.arch
     magic, version, zero, length, crc = struct.unpack_from("<4sHHII", image)
-    assert (magic, version, zero, length, crc) == (b"PLSH", 2, 0, len(image), zlib.crc32(image[16:]))
+    assert (magic, version, zero, length, crc) == (b"PLSH", 3, 0, len(image), zlib.crc32(image[16:]))
     r = Reader(image[16:])
     head = r.take("BBBBHHIIIIHH")
     assert head[:4] == (len(arch.layers), len(layout.channels), arch.channels, arch.classes)
@@ -59,14 +59,23 @@ def test_read_back(model: IntegerModel) -> None:
     assert gap == layout.gap_ms * units
     assert (smoothing, check) == (model.smoothing, layout_check(model.layout))
     for channel in layout.channels:
-        assert r.take("ii") == (channel.valid_min, channel.valid_max)
-    derived = {d.name: d.of for d in layout.derived}
-    for i, name in enumerate(layout.inputs):
-        kind, n = r.take("BB")
+        assert r.take("iii") == (channel.valid_min, channel.valid_max, channel.offset)
+    derived = {d.name: d for d in layout.derived}
+    for name in layout.inputs:
+        kind, n, shift = r.take("BBB")
         parts = r.take(f"{n}B")
-        assert kind == (name in derived)
-        assert [layout.channels[p].name for p in parts] == list(derived.get(name, (name,)))
-        scale = network.inputs
+        assert ("channel", "magnitude", "gravity")[kind] == (derived[name].kind if name in derived else "channel")
+        assert [layout.channels[p].name for p in parts] == list(derived[name].of if name in derived else (name,))
+        assert shift == (layout.gravity_shift if kind == 2 else 0)
+    vectors = network.vectors
+    assert r.take("BBH") == ((0, 0, 0) if vectors is None else vectors.weights.shape)
+    for v in range(0 if vectors is None else len(vectors.shift)):
+        assert r.take("B")[0] - 16 == vectors.shift[v]
+        for k, weights in enumerate(vectors.weights[v]):
+            assert r.take("B")[0] == vectors.down[v, k]
+            assert [w - 128 for w in r.take(f"{len(weights)}B")] == weights.tolist()
+    scale = network.inputs
+    for i in range(len(scale)):
         assert r.take("iiHBB") == tuple(
             int(column[i]) for column in (scale.offset, scale.bias, scale.multiplier, scale.before, scale.after)
         )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, BundleError
 from plushsense.models.arch import Arch, ConvLayer
@@ -16,13 +18,20 @@ from plushsense.runtime.integer import IntegerLayer, IntegerNetwork
 from support.integers import INT32, any_network, models, plain_model
 
 
-def samples_of(model: IntegerModel, n: int, seed: int) -> np.ndarray:
-    """Raw samples (n, C) of the inputs: wandering, at times an extreme."""
-    rng = np.random.default_rng(seed)
-    offset, before = model.network.inputs.offset, model.network.inputs.before
+def samples_of(model: IntegerModel, n: int, seed: int) -> NDArray[np.int64]:
+    """Raw samples (n, C) of the inputs: wandering, at times an extreme; gravity is at times nowhere."""
+    rng, arch = np.random.default_rng(seed), model.network.arch
+    axes = 0 if arch.vector is None else arch.vector.axes
+    offset, before = (
+        np.concatenate([column[: arch.channels - axes], np.zeros(axes, dtype=np.int64)])
+        for column in (model.network.inputs.offset, model.network.inputs.before)
+    )
     reach = (1 << (15 + before)) - 1
     x = offset + np.rint(np.cumsum(rng.normal(size=(n, len(offset))), axis=0) / 10 * reach).astype(np.int64)
     x[rng.random(x.shape) < 0.02] = INT32[int(rng.integers(2))]
+    if axes:
+        x[:, -3:] = np.clip(x[:, -3:] * int(rng.choice([1, 1, 200])), -(1 << 23), 1 << 23)
+        x[rng.random(n) < 0.05, -3:] = 0
     return np.clip(x, *INT32)
 
 
@@ -48,13 +57,67 @@ def test_a_window_and_a_stream_agree(model: IntegerModel, seed: int) -> None:
     assert np.array_equal(again, got)
 
 
+def first_of(network: IntegerNetwork, x: NDArray[np.int64]) -> NDArray[np.int64]:
+    """What the first layer reads of samples (T, C): them, or the outputs of the vector layer by plain integers."""
+    vectors = network.vectors
+    if vectors is None:
+        return x
+    rows, layer = [], vectors.layer
+    others = network.arch.channels - layer.axes
+    for at in range(layer.reach, len(x)):
+        taps = [[int(v) for v in row] for row in x[at - layer.reach : at + 1]]
+        up = unit_of(taps[-1][-3:])
+        row = taps[-1][:others]
+        for v in range(layer.vectors):
+            shift = int(vectors.shift[v])
+            axes = [[axis(value, shift) for value in tap[others + 3 * v : others + 3 * v + 3]] for tap in taps]
+            lifted, lengths, flat, turns = [], [], [], []
+            for weights, down in zip(vectors.weights[v].tolist(), vectors.down[v].tolist(), strict=True):
+                d = [fits(sum(w * tap[i] for w, tap in zip(weights, axes, strict=True))) >> down for i in range(3)]
+                assert max(map(abs, d)) <= 1 << 14
+                lifted.append(fits(dot(d, up)) >> 14)
+                flat.append([d[i] - (fits(lifted[-1] * up[i]) >> 14) for i in range(3)])
+                lengths.append(math.isqrt(fits(dot(flat[-1], flat[-1]))))
+            for h, n in zip(flat, [*flat[1:], flat[0]], strict=True):
+                cross = [fits(h[i - 2] * n[i - 1] - h[i - 1] * n[i - 2]) for i in range(3)]
+                turn = fits(sum(fits(c * u >> 14) for c, u in zip(cross, up, strict=True)))
+                turns.append(math.isqrt(abs(turn)) * (1 if turn > 0 else -1))
+            row = [*row, *lifted, *lengths, *turns]
+        rows.append(row)
+    return np.array(rows, dtype=np.int64)
+
+
+def fits(number: int) -> int:
+    assert -(1 << 31) <= number < 1 << 31
+    return number
+
+
+def dot(one: list[int], other: list[int]) -> int:
+    return sum(a * b for a, b in zip(one, other, strict=True))
+
+
+def axis(value: int, shift: int) -> int:
+    limit = 32767 * 2**-shift if shift < 0 else 32767 >> shift
+    held = max(-limit, min(limit, value))
+    return fits(held << shift if shift >= 0 else held >> -shift)
+
+
+def unit_of(gravity: list[int]) -> list[int]:
+    if not any(gravity):
+        return [0, 0, 0]
+    top = max(map(abs, gravity)).bit_length()
+    size = [abs(g) << 15 - top if top <= 15 else abs(g) >> top - 15 for g in gravity]
+    length = math.isqrt(dot(size, size))
+    return [(s << 14) // length * (-1 if g < 0 else 1) for s, g in zip(size, gravity, strict=True)]
+
+
 @settings(max_examples=15)
 @given(models(longest=130), st.integers(0, 1 << 30))
 def test_against_loops_of_plain_integers(model: IntegerModel, seed: int) -> None:
     """Every sum on its way fits 32 bits, or wraps once where the C lets it wrap: weights + 128."""
     network, arch = model.network, model.network.arch
     x = samples_of(model, arch.span, seed)
-    z = [[int(v) for v in row] for row in network.inputs.apply(x)]
+    z = [[int(v) for v in row] for row in network.inputs.apply(first_of(network, x))]
     for layer, part in zip(arch.layers, network.layers, strict=True):
         rows = []
         for at in range(layer.reach, len(z)):

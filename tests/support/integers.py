@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.gestures import AFFECTS, Gesture, GestureSet
 from plushsense.core.layouts import Channel, CsvFormat, Derived, Layout, magnitude_limit
-from plushsense.models.arch import Arch, ConvLayer
+from plushsense.models.arch import Arch, ConvLayer, VectorLayer
 from plushsense.runtime.decisions import Rules
 from plushsense.runtime.events import NO_GESTURE, EventSettings
 from plushsense.runtime.fixed import InputScale, LogitScale, Requantize, split_ratio
@@ -19,16 +19,18 @@ from plushsense.runtime.gate import JERK, LEVEL, MOST_SIZE, GateSettings, Rule, 
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel
 from plushsense.runtime.integer import IntegerDense, IntegerLayer, IntegerNetwork
+from plushsense.runtime.vectors import MOST_DOWN, IntegerVectors, down_for
 
 Ints = NDArray[np.int64]
 INT32 = -(1 << 31), (1 << 31) - 1
 RANGES = (INT32, (-2000, INT32[1]), (0, 1023), (-3, 3), (5, 5), (-40_000, 70_000))
+GRAVITY_RANGES = ((0, 1023), (-3, 3), (5, 5), (-32_768, 32_767), (-262_000, 262_000))
 # In no decade round, in a whole number of ms, and where a period is a whole number of 1/100 or 1/200 ms.
 RATES = (50.0, 62.5, 99.7, 100.0, 104.0, 333.3)
 
 
 def any_layout(draw: st.DrawFn) -> Layout:
-    """1 to 8 measured channels, up to 3 magnitudes, 1 to 11 inputs, each rate and gap."""
+    """1 to 8 measured channels, up to 3 magnitudes, 1 to 11 inputs, each rate and gap; at times 1 or 2 vectors."""
     ranges = draw(st.lists(st.sampled_from(RANGES), min_size=1, max_size=8))
     magnitudes = draw(st.lists(st.lists(st.integers(0, len(ranges) - 1), min_size=1, max_size=4), max_size=3))
     for of in magnitudes:
@@ -38,10 +40,18 @@ def any_layout(draw: st.DrawFn) -> Layout:
     channels = tuple(
         Channel(f"c{i}", "raw", "touch", valid_min=low, valid_max=high) for i, (low, high) in enumerate(ranges)
     )
+    vectors = []
+    for v in range(draw(st.sampled_from((0, 0, 1, 2)))):
+        low, high = draw(st.sampled_from(GRAVITY_RANGES))
+        zero = draw(st.integers(low, high))
+        channels += tuple(
+            Channel(f"v{v}{a}", "raw", "acceleration", offset=zero, valid_min=low, valid_max=high) for a in "xyz"
+        )
+        vectors.append(tuple(f"v{v}{a}" for a in "xyz"))
     derived = tuple(Derived(f"m{i}", "magnitude", tuple(f"c{k}" for k in of)) for i, of in enumerate(magnitudes))
     names = [c.name for c in channels] + [d.name for d in derived]
     inputs = draw(st.lists(st.sampled_from(names), min_size=1, max_size=11))
-    return Layout(
+    layout = Layout(
         name="any",
         title="Any toy",
         rate_hz=draw(st.sampled_from(RATES)),
@@ -51,7 +61,19 @@ def any_layout(draw: st.DrawFn) -> Layout:
         inputs=tuple(inputs),
         csv=CsvFormat(("device_ms",), ("device_ms",), ","),
         gap_ms=draw(st.sampled_from((30, 100, 250, 4000))),
+        vectors=tuple(vectors),
     )
+    return layout.for_vectors() if vectors else layout
+
+
+def any_vectors(layer: VectorLayer, rng: np.random.Generator) -> IntegerVectors:
+    """Random kernels, and shifts that leave the axes between some bits and too many."""
+    shape = layer.vectors, layer.filters, layer.kernel
+    weights = rng.integers(-128, 128, shape).astype(np.int8)
+    if rng.random() < 0.2:
+        weights = rng.choice(np.array([-128, 127], dtype=np.int8), shape)
+    down = np.minimum(down_for(weights) + rng.choice([0, 0, 1, 12], shape[:2]), MOST_DOWN)
+    return IntegerVectors(layer, rng.choice([-16, -2, 0, 3, 8, 16], layer.vectors), weights, down)
 
 
 def any_network(arch: Arch, layout: Layout, rng: np.random.Generator) -> IntegerNetwork:
@@ -72,7 +94,13 @@ def any_network(arch: Arch, layout: Layout, rng: np.random.Generator) -> Integer
         return np.asarray(rng.normal(size=n) * typical).astype(np.int64)
 
     columns = []
-    for name in layout.inputs:
+    vectors = None if arch.vector is None else any_vectors(arch.vector, rng)
+    others = layout.inputs if arch.vector is None else layout.inputs[: arch.channels - arch.vector.axes]
+    for _ in range(arch.inputs[0] - len(others)):
+        ratio = 255 / 2 ** rng.uniform(6, 16)
+        before, multiplier, after = split_ratio(ratio, 128 / ratio + 1, most_after=22)
+        columns.append((int(rng.integers(-500, 500)), min(before, 16), multiplier, 100 << after, after))
+    for name in others:
         derived = next((d for d in layout.derived if d.name == name), None)
         of = [layout.index(part) for part in (derived.of if derived else (name,))]
         low, high = int(layout.valid_min_int[of[0]]), int(layout.valid_max_int[of[0]])
@@ -89,12 +117,12 @@ def any_network(arch: Arch, layout: Layout, rng: np.random.Generator) -> Integer
         ratios = 255 / (3 * typical) * np.exp(rng.normal(size=layer.filters) / 2)
         whole = weights(layer.filters, read, layer.kernel)
         layers.append(IntegerLayer(whole, bias(typical, layer.filters), Requantize(*scales(ratios, 255))))
-    typical = 74 * 60 * np.sqrt(arch.filters[-1]) * arch.pooled
+    typical = 74 * 60 * np.sqrt(arch.features) * arch.pooled
     ratios = 1500 / typical * np.exp(rng.normal(size=arch.classes) / 2)
     dense = IntegerDense(
-        weights(arch.classes, arch.filters[-1]), bias(typical, arch.classes), LogitScale(*scales(ratios, 1 << 14))
+        weights(arch.classes, arch.features), bias(typical, arch.classes), LogitScale(*scales(ratios, 1 << 14))
     )
-    return IntegerNetwork(arch, InputScale(*np.array(columns, dtype=np.int64).T), tuple(layers), dense)
+    return IntegerNetwork(arch, InputScale(*np.array(columns, dtype=np.int64).T), tuple(layers), dense, vectors)
 
 
 def any_events(rng: np.random.Generator) -> EventSettings:
@@ -165,6 +193,10 @@ def models(draw: st.DrawFn, longest: int = 700) -> IntegerModel:
     layout = any_layout(draw)
     layers: list[ConvLayer] = []
     left = longest - 100
+    vector = None
+    if layout.vectors:
+        vector = VectorLayer(draw(st.integers(1, min(40, left // 2))), draw(st.integers(2, 9)), len(layout.vectors))
+        left -= vector.reach
     for _ in range(draw(st.integers(1, 4))):
         dilation = draw(st.integers(1, 9))
         kernel = draw(st.integers(1, min(60, left // dilation + 1)))
@@ -177,6 +209,7 @@ def models(draw: st.DrawFn, longest: int = 700) -> IntegerModel:
         classes=draw(st.integers(2, 20)),
         step=step,
         pool=step * draw(st.integers(1, 10)),
+        vector=vector,
     )
     rng = np.random.default_rng(draw(st.integers(0, 1 << 30)))
     idle = rng.random(arch.classes) < 0.2
@@ -234,6 +267,18 @@ def plain_model(seed: int = 1, **changes: Any) -> IntegerModel:
     arch = Arch((ConvLayer(5, 2, 6), ConvLayer(4, 3, 5)), **settings)
     gestures = GestureSet("plain", tuple(Gesture(f"gesture {i}", AFFECTS[i % 4]) for i in range(arch.classes)))
     return IntegerModel(any_network(arch, layout, np.random.default_rng(seed)), layout, gestures, 5000)
+
+
+def vector_model(seed: int = 1) -> IntegerModel:
+    """`plain_model` with a vector layer: 2 kernels of 3 taps with the largest weights."""
+    plain = plain_model(seed)
+    axes = tuple(replace(c, kind="acceleration") for c in plain.layout.channels[1:])
+    layout = replace(plain.layout, channels=(plain.layout.channels[0], *axes), vectors=(("x", "y", "z"),)).for_vectors()
+    arch = replace(plain.network.arch, channels=layout.n_inputs, vector=VectorLayer(3, 2, 1))
+    network = any_network(arch, layout, np.random.default_rng(seed))
+    weights = np.full((1, 2, 3), 127, dtype=np.int8)
+    vectors = IntegerVectors(VectorLayer(3, 2, 1), np.array([0]), weights, down_for(weights))
+    return replace(plain, network=replace(network, vectors=vectors), layout=layout)
 
 
 def ruled_model(seed: int = 1, **changes: Any) -> IntegerModel:

@@ -264,9 +264,9 @@ def memory_bytes(model: IntegerModel) -> int:
     features = arch.features
     gate = model.rules.gate
     pieces = [4 * channels] * 3  # held, before, the sample being made
-    pieces.append(0 if gate.rules else 4 * arch.channels)  # inputs
     pieces.append(4 * model.layout.input_kinds.count("gravity"))  # running means
     if arch.vector is not None:
+        pieces.append(0 if gate.rules else 4 * arch.channels)  # inputs
         pieces += [6 * arch.vector.vectors * arch.vector.kernel, 12 * arch.vector.filters]  # axes, horizontal parts
     for layer, read in zip(arch.layers, arch.inputs, strict=True):
         pieces.append((layer.reach + 1) * _filled(read))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from plushsense.core.errors import ConfigError, check_known
+from plushsense.core.layouts import GRAVITY_FRACTION_BITS
 from plushsense.windows.features import Scaler
 
 if TYPE_CHECKING:
@@ -27,13 +28,14 @@ Transform = Callable[["Tensor", "torch.Generator"], "Tensor"]
 class Channels:
     """What augmentations need to know about the channels.
 
-    ``vectors``: indices of the channels of each three-axis sensor (accelerometer, gyroscope). ``scaler``: scaling of
-    the windows.
+    ``vectors``: indices of the channels of each three-axis sensor (accelerometer, gyroscope); with ``has_gravity``, the
+    first is the accelerometer and the last is gravity. ``scaler``: scaling of the windows.
     """
 
     vectors: tuple[tuple[int, ...], ...]
     scaler: Scaler
     device: torch.device
+    has_gravity: bool = False
 
     def scaling(self, channels: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Return offset and scale (n, 1) of some channels: scaled = (raw - offset) * scale."""
@@ -74,6 +76,79 @@ def random_rotation(degrees: float, channels: Channels) -> Transform | None:
     return rotate
 
 
+def random_gain(share: float, channels: Channels) -> Transform | None:
+    """Make the movement of every window stronger or weaker by a random factor, up to ``share`` more or less.
+
+    The factor multiplies the difference of the acceleration from gravity, and all other vectors; its logarithm is
+    uniform. None without gravity among the inputs.
+    """
+    if not channels.has_gravity:
+        return None
+    acceleration, *others, gravity = (list(axes) for axes in channels.vectors)
+    offset, scale = channels.scaling(acceleration)
+    gravity_offset, gravity_scale = channels.scaling(gravity)
+
+    def strengthen(x: Tensor, random: torch.Generator) -> Tensor:
+        factor = _factors(len(x), share, random).to(x.device)[:, None, None]
+        out = x.clone()
+        rest = (x[:, gravity] / gravity_scale + gravity_offset) / (1 << GRAVITY_FRACTION_BITS)
+        raw = x[:, acceleration] / scale + offset
+        out[:, acceleration] = (rest + factor * (raw - rest) - offset) * scale
+        for axes in others:
+            out[:, axes] = x[:, axes] * factor
+        return out
+
+    return strengthen
+
+
+def random_tilt(degrees: float, channels: Channels) -> Transform | None:
+    """Turn gravity in every window by a random angle about a random axis, as if it were not exactly known.
+
+    None without gravity among the inputs.
+
+    Args:
+        degrees: standard deviation of the angle, which is normally distributed.
+    """
+    if not channels.has_gravity:
+        return None
+    axes = list(channels.vectors[-1])
+
+    def tilt(x: Tensor, random: torch.Generator) -> Tensor:
+        out = x.clone()
+        out[:, axes] = rotations(len(x), degrees, random).to(x.device) @ x[:, axes]
+        return out
+
+    return tilt
+
+
+def random_speed(share: float, channels: Channels) -> Transform | None:
+    """Read every window faster or slower by a random factor, up to ``share`` more or less; its end stays.
+
+    Samples between two others are interpolated; before the start of the window it is mirrored. The logarithm of the
+    factor is uniform.
+    """
+    import torch
+
+    def warp(x: Tensor, random: torch.Generator) -> Tensor:
+        last = x.shape[2] - 1
+        speed = _factors(len(x), share, random).to(x.device)
+        back = torch.arange(last, -1, -1, device=x.device)
+        at = (last - back * speed[:, None]).abs().clamp_max(last)
+        before = at.floor().long().clamp_max(max(last - 1, 0))
+        part = (at - before)[:, None]
+        index = before[:, None].expand(-1, x.shape[1], -1)
+        return x.gather(2, index) * (1.0 - part) + x.gather(2, (index + 1).clamp_max(last)) * part
+
+    return warp
+
+
+def _factors(n: int, share: float, random: torch.Generator) -> Tensor:
+    """Draw factors (n,) between 1 / (1 + share) and 1 + share, with a uniform logarithm."""
+    import torch
+
+    return torch.exp((2.0 * torch.rand(n, generator=random) - 1.0) * math.log1p(share))
+
+
 class Augmentation(NamedTuple):
     """An augmentation: ``make`` returns the transform for a strength, or None if it would change nothing.
 
@@ -89,6 +164,9 @@ class Augmentation(NamedTuple):
 # To add an augmentation, write a function like `random_rotation` and list it here.
 AUGMENTATIONS: dict[str, Augmentation] = {
     "random-rotation": Augmentation(random_rotation, 180.0, "degrees"),
+    "random-gain": Augmentation(random_gain, 1.0),
+    "random-tilt": Augmentation(random_tilt, 90.0, "degrees"),
+    "random-speed": Augmentation(random_speed, 1.0),
 }
 
 

@@ -99,7 +99,7 @@ def fit(
             initial.import_weights(start.weights)
         net = engine(arch, initial, device, min(spec.batch, len(train)), spec.threads)
         order = torch.Generator().manual_seed(spec.seed)
-        augment = augmentations(spec.augment, Channels(train.vectors, scaler, device))
+        augment = augmentations(spec.augment, Channels(train.vectors, scaler, device, arch.vector is not None))
         adam = torch.optim.Adam(net.parameters, lr=spec.learning_rate, fused=True)
         if start is not None:
             _restore(adam, net, start)

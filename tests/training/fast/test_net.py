@@ -65,7 +65,7 @@ def test_a_step_is_pytorchs(symbol: str, filters: str, padding: str, batch: int,
     before = {name: value.copy() for name, value in net.export_weights().items()}
     for name, value in fast.export_weights().items():
         assert np.array_equal(value, before[name])
-    loss, logits = fast.step(fill(x), y)
+    loss, logits, _ = fast.step(fill(x), y)
     # The same in double precision: what differs is rounding, and windows where a ReLU is all but zero.
     net.double().train()
     wanted = net(x.double())

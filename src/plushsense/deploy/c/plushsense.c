@@ -614,7 +614,7 @@ static uint32_t share_out(plush_toy *toy, uint8_t *memory)
     toy->held = (int32_t *)take(memory, &used, 4u * toy->channels);
     toy->before = (int32_t *)take(memory, &used, 4u * toy->channels);
     toy->sample = (int32_t *)take(memory, &used, 4u * toy->channels);
-    toy->raw = (int32_t *)take(memory, &used, has_gate(toy) ? 0 : 4u * toy->inputs);
+    toy->raw = (int32_t *)take(memory, &used, has_gate(toy) || toy->vectors == 0 ? 0 : 4u * toy->inputs);
     toy->mean = (int32_t *)take(memory, &used, 4u * toy->means);
     toy->axes = (int16_t *)take(memory, &used, UINT32_C(6) * toy->vectors * toy->vector_taps);
     toy->across = (int32_t *)take(memory, &used, UINT32_C(12) * toy->vector_kernels);
@@ -1583,24 +1583,22 @@ static void read_inputs(plush_toy *toy)
 {
     const uint8_t *p = toy->input_plan;
     uint8_t *row = next_row(&toy->layer[0]);
-    int32_t *x = has_gate(toy) ? past_inputs(toy, 0) : toy->raw, *mean = toy->mean;
+    int32_t *x = has_gate(toy) ? past_inputs(toy, 0) : toy->vectors != 0 ? toy->raw : NULL, *mean = toy->mean;
     uint32_t i;
 
     count_means(toy);
     for (i = 0; i < toy->inputs; i++, p += 3 + p[1]) {
-        if (p[0] == CHANNEL)
-            x[i] = from_zero(toy, p[3]);
-        else if (p[0] == MAGNITUDE)
-            x[i] = magnitude(toy, p + 3, p[1]);
-        else
-            x[i] = follow_mean(toy, mean++, from_zero(toy, p[3]), p[2]);
+        int32_t value = p[0] == MAGNITUDE ? magnitude(toy, p + 3, p[1]) : from_zero(toy, p[3]);
+
+        if (p[0] == GRAVITY)
+            value = follow_mean(toy, mean++, value, p[2]);
+        if (x != NULL)
+            x[i] = value;
+        if (toy->vectors == 0)
+            row[i] = to_code(value, toy->input_scales + INPUT_BYTES * i);
     }
-    if (toy->vectors != 0) {
+    if (toy->vectors != 0)
         vector_sample(toy, x, row);
-        return;
-    }
-    for (i = 0; i < toy->inputs; i++)
-        row[i] = to_code(x[i], toy->input_scales + INPUT_BYTES * i);
 }
 
 /* One even sample, in toy->sample. Returns 1 when an answer fell due. */

@@ -154,7 +154,7 @@ typedef struct plush_toy {
     uint8_t *valid;          /* of each channel: whether it has had a valid value */
     int32_t *held, *before, *sample;
 
-    /* Inputs: those of the newest sample if there is no gate, and running means. */
+    /* Inputs: those of the newest sample, for a vector layer without a gate; running means. */
     uint8_t means, mean_shift;
     uint16_t mean_samples;
     int32_t *raw, *mean;
