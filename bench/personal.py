@@ -37,6 +37,7 @@ def main() -> None:
     bundles = [Bundle.load(p) for p in sorted((Path(args.dataset) / "cache" / "adapting").glob("*.plush"))]
     if not bundles:
         raise SystemExit(f"no network in {args.dataset}/cache/adapting: run  plushsense adapt --evaluate first")
+    dataset = dataset.with_inputs(bundles[0].layout)
     windows = windows_for(dataset, bundles[0].arch, WindowSpec(**bundles[0].windowing), bundles[0].gestures)
     draw, cases = np.random.default_rng(0), Cases()
     for bundle in bundles:

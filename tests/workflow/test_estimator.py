@@ -202,9 +202,9 @@ def test_a_classifier_of_cut_windows_is_a_bundle_that_reads_the_toy(
 
 
 def test_any_bundle_becomes_a_classifier(bundle: Path, dataset: Dataset) -> None:
-    windows = ps.cut_windows(dataset)
-    model = ps.PlushClassifier.from_bundle(bundle)
     loaded = ps.load(bundle)
+    windows = ps.cut_windows(dataset.with_inputs(loaded.layout))
+    model = ps.PlushClassifier.from_bundle(bundle)
     assert model.classes_.tolist() == list(loaded.gestures.labels)
     assert np.allclose(model.predict_proba(windows.x), loaded.network().probabilities(loaded.scaler.apply(windows.x)))
     assert set(model.predict(windows.x)) <= set(windows.labels)

@@ -21,10 +21,18 @@ from typing import Any
 from plushsense.core.errors import ConfigError, check_known
 from plushsense.core.layouts import Layout
 from plushsense.core.toml import check_table, read_toml, refuse_unknown
-from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, VECTOR_SYMBOL, Arch, parse_filters
+from plushsense.models.arch import (
+    DEFAULT_FILTERS,
+    DEFAULT_SYMBOL,
+    VECTOR_FILTERS,
+    VECTOR_SYMBOL,
+    Arch,
+    parse_filters,
+    parse_symbol,
+)
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import parse_split
-from plushsense.training.spec import CONTEXT, PADDING, TrainSpec, preset
+from plushsense.training.spec import CONTEXT, PADDING, PRESETS, VECTOR_AUGMENT, TrainSpec, preset
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import ANYWHERE, TRAIN_CONTEXTS, WindowSpec
 
@@ -35,12 +43,12 @@ SHARED, ALL = "shared", "all"
 class ModelSpec:
     """Settings of the network, times in seconds.
 
-    ``arch`` None: the default for the layout and the preset; ``padding`` None: the preset's; ``pool_s`` None: the whole
-    window.
+    ``arch`` None: the default for the layout and the preset; ``filters`` None: the default of that network; ``padding``
+    None: the preset's; ``pool_s`` None: the whole window.
     """
 
     arch: str | None = None
-    filters: tuple[int, ...] = DEFAULT_FILTERS
+    filters: tuple[int, ...] | None = None
     padding: str | None = None
     norm: str = "batch"
     step_s: float = 0.05
@@ -53,9 +61,10 @@ class ModelSpec:
 
     def build(self, layout: Layout, classes: int, window_s: float, padding: str) -> Arch:
         """Build the network for the inputs of a layout and a number of classes."""
+        arch = self.arch or DEFAULT_SYMBOL
         return Arch.parse(
-            self.arch or DEFAULT_SYMBOL,
-            self.filters,
+            arch,
+            self.filters or default_filters(arch),
             channels=layout.n_inputs,
             classes=classes,
             padding=self.padding or padding,
@@ -65,6 +74,11 @@ class ModelSpec:
             pool=None if self.pool_s is None else layout.samples(self.pool_s),
             vectors=len(layout.vectors),
         )
+
+
+def default_filters(symbol: str) -> tuple[int, ...]:
+    """Return the filters of a network for which none are given."""
+    return DEFAULT_FILTERS if parse_symbol(symbol).vector is None else VECTOR_FILTERS
 
 
 @dataclass(frozen=True)
@@ -125,14 +139,20 @@ class RunConfig:
         return self.model.padding or PADDING[self.preset]
 
     def for_layout(self, layout: Layout) -> RunConfig:
-        """Return the settings with the default network for a layout, if none is given.
+        """Return the settings with the default network for a layout, its filters and augmentations, where not given.
 
-        With the preset ``people`` and a layout that has an accelerometer, that is a network with a vector layer.
+        With the preset ``people`` and a layout of vectors alone, one of them an acceleration, that is a network with a
+        vector layer. Beside other sensors it was no better (on the virtual toy; no real recordings were at hand).
         """
-        if self.model.arch is not None:
-            return self
-        turns = self.preset == "people" and self.padding == "stream" and layout.has_gravity
-        return replace(self, model=replace(self.model, arch=VECTOR_SYMBOL if turns else DEFAULT_SYMBOL))
+        axes = {axis for vector in layout.vectors for axis in vector}
+        turns = layout.has_gravity and set(layout.inputs) <= axes
+        fits = self.preset == "people" and self.padding == "stream"
+        arch = self.model.arch or (VECTOR_SYMBOL if turns and fits else DEFAULT_SYMBOL)
+        model = replace(self.model, arch=arch, filters=self.model.filters or default_filters(arch))
+        training = self.training
+        if parse_symbol(arch).vector is not None and training.augment == PRESETS["people"].augment:
+            training = replace(training, augment=VECTOR_AUGMENT)
+        return replace(self, model=model, training=training)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, as a bundle stores them."""

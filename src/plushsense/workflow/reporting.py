@@ -242,7 +242,7 @@ def name_of(config: RunConfig, dataset: Dataset) -> str:
     context = config.windows.context
     if evaluation.train_context not in (None, context):
         context = f"{evaluation.train_context}-to-{context}"
-    filters = "-".join(map(str, model.filters))
+    filters = "-".join(map(str, model.filters or ()))
     parts = (evaluation.split.replace(":", "-"), str(model.arch), filters, config.padding, model.norm, context)
     words = "_".join(parts) + f"_{config.preset}_e{config.training.epochs}_seed{config.training.seed}"
     return f"{words[:180]}_{evaluation_id(config, dataset)[:8]}"

@@ -23,8 +23,10 @@
 /* Not copied to where it is called: for the registers of a loop, or for the flash. */
 #if defined(__GNUC__)
 #define PLUSH_APART __attribute__((noinline))
+#define PLUSH_SMALL __attribute__((cold)) /* compiled for size */
 #else
 #define PLUSH_APART
+#define PLUSH_SMALL
 #endif
 
 /* What a model may ask for, so that every sum, size and address below is sure to fit. */
@@ -145,6 +147,7 @@ static uint32_t half(uint32_t shift)
 
 /* floor((distance * into + add) / by) for into <= by <= 2 MOST_UNITS and add <= by / 2. The product may need more than
  * 32 bits: then it is divided by hand, a byte of the distance at a time (`rest` stays below 2^8 by + 2^8 into). */
+PLUSH_APART
 static uint32_t part_of(uint32_t distance, uint32_t into, uint32_t by, uint32_t add, uint32_t narrow)
 {
     uint32_t quotient = 0, rest = 0, place;
@@ -218,9 +221,15 @@ static uint32_t distance_of(int32_t one, int32_t other)
     return one >= other ? (uint32_t)one - (uint32_t)other : (uint32_t)other - (uint32_t)one;
 }
 
+PLUSH_SMALL PLUSH_APART
+static uint32_t word_at(const uint8_t *p)
+{
+    return le32(p);
+}
+
 /* ---- The model ------------------------------------------------------------------------------------------------- */
 
-static uint32_t checksum(const uint8_t *bytes, uint32_t n) /* CRC-32, as zip and Ethernet have it */
+PLUSH_SMALL static uint32_t checksum(const uint8_t *bytes, uint32_t n) /* CRC-32, as zip and Ethernet have it */
 {
     uint32_t sum = UINT32_MAX, bit;
 
@@ -232,19 +241,19 @@ static uint32_t checksum(const uint8_t *bytes, uint32_t n) /* CRC-32, as zip and
     return ~sum;
 }
 
-static plush_status check(const uint8_t *model, uint32_t bytes)
+PLUSH_SMALL static plush_status check(const uint8_t *model, uint32_t bytes)
 {
     if (model == NULL || bytes < HEAD_BYTES || memcmp(model, "PLSH", 4) != 0)
         return PLUSH_NOT_A_MODEL;
     if (le16(model + 4) != PLUSH_IMAGE_VERSION)
         return PLUSH_OTHER_VERSION;
-    if (le32(model + 8) > bytes || le32(model + 8) <= HEAD_BYTES ||
-        checksum(model + HEAD_BYTES, le32(model + 8) - HEAD_BYTES) != le32(model + 12))
+    if (word_at(model + 8) > bytes || word_at(model + 8) <= HEAD_BYTES ||
+        checksum(model + HEAD_BYTES, word_at(model + 8) - HEAD_BYTES) != word_at(model + 12))
         return PLUSH_DAMAGED;
     return PLUSH_OK;
 }
 
-static uint32_t fill_up(uint32_t n)
+PLUSH_SMALL static uint32_t fill_up(uint32_t n)
 {
     return (n + GROUP - 1) / GROUP * GROUP;
 }
@@ -256,7 +265,7 @@ typedef struct {
 } source;
 
 /* The next bytes of a model; NULL when it has not so many. */
-static const uint8_t *next_bytes(source *from, uint32_t bytes)
+PLUSH_SMALL static const uint8_t *next_bytes(source *from, uint32_t bytes)
 {
     const uint8_t *start = from->at;
 
@@ -268,7 +277,7 @@ static const uint8_t *next_bytes(source *from, uint32_t bytes)
 }
 
 /* The next text of a model; NULL when it does not end. */
-static const uint8_t *next_text(source *from)
+PLUSH_SMALL static const uint8_t *next_text(source *from)
 {
     const uint8_t *start = from->at;
 
@@ -281,7 +290,7 @@ static const uint8_t *next_text(source *from)
 }
 
 /* The scales of so many filters or classes. */
-static const uint8_t *next_scales(source *from, uint32_t n)
+PLUSH_SMALL static const uint8_t *next_scales(source *from, uint32_t n)
 {
     const uint8_t *scales = next_bytes(from, SCALE_BYTES * n), *scale = scales;
 
@@ -293,7 +302,7 @@ static const uint8_t *next_scales(source *from, uint32_t n)
     return scales;
 }
 
-static int read_head(plush_toy *toy, source *from)
+PLUSH_SMALL static int read_head(plush_toy *toy, source *from)
 {
     const uint8_t *p = next_bytes(from, 28);
     uint32_t i;
@@ -306,10 +315,10 @@ static int read_head(plush_toy *toy, source *from)
     toy->classes = p[3];
     toy->step = (uint16_t)le16(p + 4);
     toy->blocks = (uint16_t)le16(p + 6);
-    toy->span = le32(p + 8);
-    toy->period = le32(p + 12);
-    toy->gap = le32(p + 16);
-    toy->units_per_ms = le32(p + 20);
+    toy->span = word_at(p + 8);
+    toy->period = word_at(p + 12);
+    toy->gap = word_at(p + 16);
+    toy->units_per_ms = word_at(p + 20);
     toy->smoothing = (uint16_t)le16(p + 24);
     toy->layout = (uint16_t)le16(p + 26);
     toy->ranges = next_bytes(from, RANGE_BYTES * toy->channels);
@@ -321,7 +330,7 @@ static int read_head(plush_toy *toy, source *from)
     toy->narrow = (UINT32_MAX - toy->gap) / (2 * toy->gap);
     for (i = 0; i < toy->channels; i++) {
         const uint8_t *range = toy->ranges + RANGE_BYTES * i;
-        int32_t low = as_signed(le32(range)), high = as_signed(le32(range + 4)), zero = as_signed(le32(range + 8));
+        int32_t low = as_signed(word_at(range)), high = as_signed(word_at(range + 4)), zero = as_signed(word_at(range + 8));
 
         if ((low < zero && distance_of(low, zero) > UINT32_C(1) << 31) ||
             (high > zero && distance_of(high, zero) > (uint32_t)INT32_MAX))
@@ -331,16 +340,16 @@ static int read_head(plush_toy *toy, source *from)
 }
 
 /* Whether a running mean of this channel fits 32 bits. */
-static int mean_fits(const plush_toy *toy, uint32_t channel)
+PLUSH_SMALL static int mean_fits(const plush_toy *toy, uint32_t channel)
 {
     const uint8_t *range = toy->ranges + RANGE_BYTES * channel;
-    int32_t zero = as_signed(le32(range + 8));
+    int32_t zero = as_signed(word_at(range + 8));
 
-    return distance_of(as_signed(le32(range)), zero) <= MOST_GRAVITY &&
-           distance_of(as_signed(le32(range + 4)), zero) <= MOST_GRAVITY;
+    return distance_of(as_signed(word_at(range)), zero) <= MOST_GRAVITY &&
+           distance_of(as_signed(word_at(range + 4)), zero) <= MOST_GRAVITY;
 }
 
-static int read_input_plan(plush_toy *toy, source *from)
+PLUSH_SMALL static int read_input_plan(plush_toy *toy, source *from)
 {
     uint32_t i, n;
 
@@ -366,7 +375,7 @@ static int read_input_plan(plush_toy *toy, source *from)
 }
 
 /* One kernel of a vector layer; its sums are sure to fit. */
-static int read_kernel(const plush_toy *toy, source *from)
+PLUSH_SMALL static int read_kernel(const plush_toy *toy, source *from)
 {
     const uint8_t *p = next_bytes(from, 1u + toy->vector_taps);
     uint32_t sum = 0, n;
@@ -379,7 +388,7 @@ static int read_kernel(const plush_toy *toy, source *from)
 }
 
 /* The vector layer, if there is one, and the scales of what the first layer reads. */
-static int read_vectors(plush_toy *toy, source *from)
+PLUSH_SMALL static int read_vectors(plush_toy *toy, source *from)
 {
     const uint8_t *p = next_bytes(from, 4), *scale;
     uint32_t v, k, i;
@@ -415,7 +424,7 @@ static int read_vectors(plush_toy *toy, source *from)
     if (scale == NULL)
         return 0;
     for (i = 0; i < toy->features; i++, scale += INPUT_BYTES) {
-        int32_t bias = as_signed(le32(scale + 4));
+        int32_t bias = as_signed(word_at(scale + 4));
 
         if (bias < -MOST_INPUT_BIAS || bias >= MOST_INPUT_BIAS || le16(scale + 8) > MOST_MULTIPLIER ||
             scale[10] > MOST_INPUT_SHIFT || scale[11] > MOST_SHIFT)
@@ -425,7 +434,7 @@ static int read_vectors(plush_toy *toy, source *from)
 }
 
 /* A layer that reads so many channels. */
-static int read_layer(plush_layer *layer, uint32_t channels, source *from)
+PLUSH_SMALL static int read_layer(plush_layer *layer, uint32_t channels, source *from)
 {
     const uint8_t *p = next_bytes(from, 8);
     uint32_t row = fill_up(channels), filters, rows;
@@ -449,7 +458,7 @@ static int read_layer(plush_layer *layer, uint32_t channels, source *from)
     return 1;
 }
 
-static int read_dense_and_names(plush_toy *toy, source *from)
+PLUSH_SMALL static int read_dense_and_names(plush_toy *toy, source *from)
 {
     uint32_t i;
 
@@ -466,7 +475,7 @@ static int read_dense_and_names(plush_toy *toy, source *from)
     return toy->title != NULL;
 }
 
-static int read_event_plan(plush_toy *toy, source *from)
+PLUSH_SMALL static int read_event_plan(plush_toy *toy, source *from)
 {
     const uint8_t *p = next_bytes(from, EVENT_BYTES);
     uint32_t at;
@@ -480,7 +489,7 @@ static int read_event_plan(plush_toy *toy, source *from)
     return known_least(p) >= -LOGIT_LIMIT && known_least(p) <= LOGIT_LIMIT;
 }
 
-static int read_health_plan(plush_toy *toy, source *from)
+PLUSH_SMALL static int read_health_plan(plush_toy *toy, source *from)
 {
     const uint8_t *p = next_bytes(from, HEALTH_BYTES);
     uint32_t i;
@@ -496,13 +505,13 @@ static int read_health_plan(plush_toy *toy, source *from)
     if (toy->limits == NULL)
         return 0;
     for (i = 0; i < toy->channels; i++)
-        if (as_signed(le32(toy->limits + 8 * i)) > as_signed(le32(toy->limits + 8 * i + 4)))
+        if (as_signed(word_at(toy->limits + 8 * i)) > as_signed(word_at(toy->limits + 8 * i + 4)))
             return 0;
     return 1;
 }
 
 /* The gate's signals: what is watched, and how. */
-static int read_signal(plush_toy *toy, source *from)
+PLUSH_SMALL static int read_signal(plush_toy *toy, source *from)
 {
     const uint8_t *head = next_bytes(from, 2);
     const uint8_t *parts = head == NULL ? NULL : next_bytes(from, head[1]);
@@ -514,7 +523,7 @@ static int read_signal(plush_toy *toy, source *from)
     for (n = 0; n < head[1]; n++)
         if (parts[n] >= toy->inputs)
             return 0;
-    floor = le32(how + 4);
+    floor = word_at(how + 4);
     if (how[0] == 0 || how[0] > MOST_GATE_LAG || how[1] > MOST_GATE_SHIFT || how[2] == 0 || how[2] > MOST_GATE_WEIGHT ||
         how[3] == 0 || how[3] > MOST_GATE_WEIGHT || floor == 0 || floor > (uint32_t)GATE_HELD)
         return 0;
@@ -523,7 +532,7 @@ static int read_signal(plush_toy *toy, source *from)
     return 1;
 }
 
-static int read_rule(plush_toy *toy, source *from)
+PLUSH_SMALL static int read_rule(plush_toy *toy, source *from)
 {
     const uint8_t *rule = next_bytes(from, RULE_BYTES);
     uint32_t n;
@@ -536,14 +545,14 @@ static int read_rule(plush_toy *toy, source *from)
 
         if (term == NULL || term[0] >= toy->gate_signals ||
             (term[1] != 0 && term[1] != SIGN_ABOVE && term[1] != SIGN_BELOW) || term[2] == 0 || term[3] != 0 ||
-            le32(term + 4) == 0 || le32(term + 4) > MOST_GATE_SIZE)
+            word_at(term + 4) == 0 || word_at(term + 4) > MOST_GATE_SIZE)
             return 0;
     }
     toy->gate_terms = (uint16_t)(toy->gate_terms + rule[0]);
     return 1;
 }
 
-static int read_gate_plan(plush_toy *toy, source *from)
+PLUSH_SMALL static int read_gate_plan(plush_toy *toy, source *from)
 {
     const uint8_t *head = next_bytes(from, 2);
     uint32_t n;
@@ -566,13 +575,13 @@ static int read_gate_plan(plush_toy *toy, source *from)
 }
 
 /* Reads a model that check() found good; says whether all that stands in it holds together. */
-static int read_model(plush_toy *toy, const uint8_t *model)
+PLUSH_SMALL static int read_model(plush_toy *toy, const uint8_t *model)
 {
     source from;
     uint32_t span, i;
 
     from.at = model + HEAD_BYTES;
-    from.left = le32(model + 8) - HEAD_BYTES;
+    from.left = word_at(model + 8) - HEAD_BYTES;
     if (!read_head(toy, &from) || !read_input_plan(toy, &from) || !read_vectors(toy, &from))
         return 0;
     span = (uint32_t)toy->step * toy->blocks + (toy->vectors != 0 ? toy->vector_taps - 1u : 0u);
@@ -587,7 +596,7 @@ static int read_model(plush_toy *toy, const uint8_t *model)
 }
 
 /* A piece of the memory; only reckoned while there is none. */
-static void *take(uint8_t *memory, uint32_t *used, uint32_t bytes)
+PLUSH_SMALL static void *take(uint8_t *memory, uint32_t *used, uint32_t bytes)
 {
     void *piece = memory == NULL ? NULL : memory + *used;
 
@@ -596,18 +605,18 @@ static void *take(uint8_t *memory, uint32_t *used, uint32_t bytes)
 }
 
 /* Whether health asks for the frame before. */
-static int last_matters(const plush_toy *toy)
+PLUSH_SMALL static int last_matters(const plush_toy *toy)
 {
     return toy->limits != NULL || le16(toy->health_plan + STILL_MS) != 0;
 }
 
-static int has_gate(const plush_toy *toy)
+PLUSH_SMALL static int has_gate(const plush_toy *toy)
 {
     return toy->gate_rules != 0;
 }
 
 /* Hands out the memory of a model that was read. Returns the bytes of it. */
-static uint32_t share_out(plush_toy *toy, uint8_t *memory)
+PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 {
     uint32_t used = 0, i;
 
@@ -1017,7 +1026,7 @@ static void end_event(plush_toy *toy, uint32_t since, uint32_t ms)
 
 /* The signal is gone: what is going on ends, all but the count of events is forgotten. */
 PLUSH_APART
-static void lose(plush_toy *toy, uint32_t ms)
+PLUSH_SMALL static void lose(plush_toy *toy, uint32_t ms)
 {
     if (going_on(toy))
         end_event(toy, ms, ms);
@@ -1664,7 +1673,7 @@ static void say_nothing(plush_toy *toy, plush_state state)
 }
 
 /* What was remembered of frames and of the network is dropped; what health knows stays. */
-static void forget(plush_toy *toy)
+PLUSH_SMALL static void forget(plush_toy *toy)
 {
     uint32_t phase;
 
@@ -1689,7 +1698,7 @@ struct plush_aligned {
 
 /* A toy with this model and memory. Nothing is written to the memory; a toy of which this does not say PLUSH_OK is of no
  * use. */
-PLUSH_APART
+PLUSH_SMALL PLUSH_APART
 static plush_status prepare(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                             uint32_t memory_bytes)
 {
@@ -1708,7 +1717,7 @@ static plush_status prepare(plush_toy *toy, const uint8_t *model, uint32_t model
     return PLUSH_OK;
 }
 
-uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes)
+PLUSH_SMALL uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes)
 {
     plush_toy toy;
 
@@ -1726,7 +1735,7 @@ void plush_restart(plush_toy *toy)
     forget(toy);
 }
 
-plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
+PLUSH_SMALL plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                          uint32_t memory_bytes)
 {
     plush_status status = prepare(toy, model, model_bytes, memory, memory_bytes);
@@ -1737,7 +1746,7 @@ plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_by
     return status;
 }
 
-plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
+PLUSH_SMALL plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                         uint32_t memory_bytes)
 {
     plush_toy next;
