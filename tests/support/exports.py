@@ -11,7 +11,7 @@ from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.deploy.emit import emit
 from plushsense.deploy.quantize import calibrated, integer_model
-from plushsense.models.arch import Arch
+from plushsense.models.arch import Arch, parse_symbol
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
 from plushsense.windows.features import Scaler
@@ -31,10 +31,14 @@ def bundle_of(
     """A network of random weights, its scaling and ranges those of random walks; ``settings`` go to its `Arch`."""
     read = load_layout(layout) if isinstance(layout, str) else layout
     gestures = gestures or load_gestures("plush-18")
+    vectors: tuple[tuple[int, ...], ...] = ()
+    if parse_symbol(symbol).vector is not None:
+        read, settings = read.for_vectors(), {"vectors": len(read.vectors), **settings}
+        vectors = read.input_vectors
     arch = Arch.parse(symbol, filters, channels=read.n_inputs, classes=len(gestures), **settings)
     rng = np.random.default_rng(seed)
     x = np.rint(np.cumsum(rng.normal(size=(16, arch.channels, arch.span + 60)), axis=2) * 50 + 1000).astype(np.int64)
-    return calibrated(Bundle(arch, random_weights(arch, seed), read, Scaler.fit(x), gestures), x)
+    return calibrated(Bundle(arch, random_weights(arch, seed), read, Scaler.fit(x, vectors), gestures), x)
 
 
 def exported(out: Path, bundle: Bundle) -> Path:

@@ -123,7 +123,7 @@ NORM_EPSILON = 1e-5
 DEFAULT_SYMBOL = "14d1_19d2_19d4"
 DEFAULT_FILTERS = (8, 12, 16)
 VECTOR = "v"  # before the kernel length of a vector layer
-VECTOR_SYMBOL = "v14_19d2_19d4"
+VECTOR_SYMBOL = "v14_17d2_19d4"
 VECTOR_FILTERS = (6, 16, 16)
 
 PAPER_FILTERS: tuple[tuple[int, ...], ...] = (

@@ -391,7 +391,7 @@ PLUSH_SMALL static int read_kernel(const plush_toy *toy, source *from)
 PLUSH_SMALL static int read_vectors(plush_toy *toy, source *from)
 {
     const uint8_t *p = next_bytes(from, 4), *scale;
-    uint32_t v, k, i;
+    uint32_t i;
 
     if (p == NULL)
         return 0;
@@ -404,7 +404,7 @@ PLUSH_SMALL static int read_vectors(plush_toy *toy, source *from)
         if (p[1] != 0 || p[2] != 0 || p[3] != 0)
             return 0;
     } else {
-        uint32_t axes = 3u * toy->vectors + 3u;
+        uint32_t axes = 3u * toy->vectors + 3u, v, k;
 
         if (toy->vectors > MOST_VECTORS || p[1] < 2 || p[1] > MOST_KERNELS || p[2] == 0 || p[3] != 0 ||
             toy->inputs < axes)
