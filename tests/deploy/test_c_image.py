@@ -119,7 +119,7 @@ def test_a_good_checksum_makes_no_vector_layer(c_library: Any) -> None:
     inputs = 28 + 4 * 12
     gravity, layer = inputs + 6 + 4 * 4, inputs + 6 + 7 * 4
     kernel, high = layer + 5, 28 + 12 + 4
-    assert body[gravity : gravity + 3] == b"\2\1\7" and body[layer : layer + 4] == b"\1\2\3\0"
+    assert body[gravity : gravity + 3] == b"\2\1\6" and body[layer : layer + 4] == b"\1\2\3\0"
     changes = {
         "a mean over too many samples": (gravity + 2, b"\x10"),
         "gravity of two channels": (gravity + 1, b"\2"),

@@ -46,6 +46,57 @@ def test_rotated_windows_keep_every_vectors_length_and_the_other_channels() -> N
     assert np.allclose(a, b, atol=1e-3)
 
 
+def moved(names: list[str], raw: np.ndarray, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Raw windows of an accelerometer, a gyroscope and gravity, before and after an augmentation."""
+    vectors = ((0, 1, 2), (3, 4, 5), (6, 7, 8))
+    scaler = Scaler.fit(raw, vectors)
+    augment = augmentations(names, Channels(vectors, scaler, torch.device("cpu"), has_gravity=True))
+    assert augment is not None
+    out = augment(torch.from_numpy(scaler.apply(raw)), torch.Generator().manual_seed(seed)).double().numpy()
+    return raw.astype(float), out / scaler.scale[:, None] + scaler.offset[:, None]
+
+
+def still_and_moving(n: int = 30) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    gravity = rng.integers(-4000, 4000, (n, 3, 1)) * np.ones((1, 1, 40), dtype=np.int64)
+    movement = np.cumsum(rng.integers(-200, 200, (n, 3, 40)), axis=2)
+    return np.concatenate([gravity + movement, rng.integers(-900, 900, (n, 3, 40)), 16 * gravity], axis=1)
+
+
+def test_gain_strengthens_movement_and_leaves_gravity() -> None:
+    before, after = moved(["random-gain:0.5"], still_and_moving())
+    assert np.allclose(after[:, 6:], before[:, 6:], atol=0.5)
+    rest = before[:, 6:] / 16
+    factors = (after[:, :3] - rest)[:, :, -1] / (before[:, :3] - rest)[:, :, -1]
+    usable = np.abs((before[:, :3] - rest)[:, :, -1]) > 200
+    spread = np.array([f[u] for f, u in zip(factors, usable, strict=True) if u.all()])
+    assert np.allclose(spread, spread[:, :1], rtol=0.02)
+    assert spread.min() > 1 / 1.51 and spread.max() < 1.51 and spread.std() > 0.1
+    assert np.allclose(after[0, 3:6] / before[0, 3:6], spread[0, 0], rtol=0.05)
+
+
+def test_tilt_turns_gravity_alone() -> None:
+    before, after = moved(["random-tilt:20"], still_and_moving())
+    assert np.allclose(after[:, :6], before[:, :6], atol=0.5)
+    was, now = before[:, 6:, 0], after[:, 6:, 0]
+    assert np.allclose(np.linalg.norm(was, axis=1), np.linalg.norm(now, axis=1), rtol=1e-3)
+    cosine = (was * now).sum(axis=1) / np.linalg.norm(was, axis=1) ** 2
+    assert 3 < np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean() < 30
+
+
+def test_speed_keeps_the_end_and_stretches_the_rest() -> None:
+    ramp = np.broadcast_to(np.arange(40.0), (50, 9, 40)).astype(np.int64) * 100
+    before, after = moved(["random-speed:0.5"], ramp)
+    assert np.allclose(after[:, :, -1], before[:, :, -1], atol=1)
+    slopes = (after[:, 0, -1] - after[:, 0, -11]) / 1000
+    assert slopes.min() > 1 / 1.51 and slopes.max() < 1.51 and slopes.std() > 0.1
+
+
+def test_gain_and_tilt_need_gravity() -> None:
+    channels = Channels(((0, 1, 2),), Scaler(np.zeros(3), np.ones(3)), torch.device("cpu"))
+    assert augmentations(["random-gain:0.3", "random-tilt:8"], channels) is None
+
+
 def test_without_vectors_or_degrees_nothing_happens() -> None:
     scaler = Scaler(np.zeros(3), np.ones(3))
     for vectors, degrees in (((), 45), (((0, 1, 2),), 0)):

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,3 +49,43 @@ def test_scaler_is_the_z_score_and_survives_constant_channels() -> None:
     assert np.array_equal(scaler.apply_sample(x[3, :, 4]), out[3, :, 4])
     again = Scaler.from_dict(scaler.to_dict())
     assert np.array_equal(again.apply(x), out)
+
+
+def test_gravity_is_the_running_mean_in_plain_integers() -> None:
+    """A stream, a segment and the rule of the docstring agree; the state begins again with a segment."""
+    layout = load_layout("accel-3").for_vectors()
+    rng = np.random.default_rng(0)
+    values = rng.integers(-32768, 32768, (400, 3))
+    rows = network_inputs(values, layout)
+    inputs = SampleInputs(layout)
+    for _ in range(2):
+        assert [inputs(sample) for sample in values.tolist()] == rows.tolist()
+        inputs.reset()
+    state = 0
+    for n, x in enumerate(values[:, 0].tolist(), 1):
+        shift = min(int(np.log2(n)), layout.gravity_shift)
+        state += ((x << 10) - state) >> shift
+        assert -(1 << 31) <= state < 1 << 31
+        assert rows[n - 1, 3] == state >> 6
+
+
+def test_gravity_is_known_soon_follows_a_turn_and_survives_shaking() -> None:
+    layout = load_layout("accel-3").for_vectors()
+    still = np.tile([0, 0, 8000], (50, 1))
+    turned = np.tile([8000, 0, 0], (400, 1))
+    shaken = turned + np.rint(20_000 * np.sin(np.arange(400) / 3))[:, None].astype(np.int64) * [0, 1, 1]
+    gravity = network_inputs(np.concatenate([still, turned, shaken]), layout)[:, 3:] / 16
+    assert np.allclose(gravity[0], [0, 0, 8000])
+    assert np.allclose(gravity[449], [8000, 0, 0], atol=400)
+    away = np.degrees(np.arccos(gravity[500:, 0] / np.linalg.norm(gravity[500:], axis=1)))
+    assert away.mean() < 12
+
+
+def test_inputs_are_distances_from_the_offset_of_a_channel() -> None:
+    """An analogue accelerometer rests at some hundred counts."""
+    plain = load_layout("accel-3")
+    channels = tuple(replace(c, offset=330.0, valid_min=0.0, valid_max=1023.0) for c in plain.channels)
+    layout = replace(plain, channels=channels).for_vectors()
+    values = np.array([[330, 330, 430], [330, 430, 330]])
+    assert network_inputs(values, layout)[:, :3].tolist() == [[0, 0, 100], [0, 100, 0]]
+    assert network_inputs(values, layout)[0, 3:].tolist() == [0, 0, 1600]

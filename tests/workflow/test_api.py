@@ -113,7 +113,7 @@ def test_notebook_faces(dataset: Dataset, bundle: Path) -> None:
     assert "30 recordings, 5 people" in repr(dataset)
     assert "<table>" in dataset._repr_html_()
     assert "30 recordings" in repr(ps.cut_windows(dataset))
-    assert "v14_19d2_19d4" in repr(ps.load(bundle))
+    assert "v14_17d2_19d4" in repr(ps.load(bundle))
 
 
 def long_recordings(folder: Path, people: int, recordings: int) -> Dataset:

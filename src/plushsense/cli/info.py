@@ -109,7 +109,7 @@ def run_arch(args: argparse.Namespace) -> int:
     arch = Arch.parse(
         args.spec,
         args.filters,
-        **options(args, "channels", "classes", "padding", "norm", "window", "step", "pool"),
+        **options(args, "channels", "classes", "padding", "norm", "window", "step", "pool", "vectors"),
     )
     printed = f" (the paper's Table 3 prints {arch.table3})" if arch.table3 else ""
     again = "" if arch.padding == "stream" else "; this padding recomputes the window at every step"

@@ -7,8 +7,8 @@ split is made over recordings, so that the windows to train on and those to scor
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -61,6 +61,12 @@ def fold_windows(train: WindowSet, score: WindowSet, split: Split, seed: int = 0
         _require_windows(windows, fold, split)
         divided.append(windows)
     return divided
+
+
+def train_on_validation(folds: Sequence[Fold]) -> list[Fold]:
+    """Return the folds with their validation windows among those to train on."""
+    none = np.empty(0, dtype=np.int64)
+    return [replace(f, train=np.sort(np.concatenate([f.train, f.validation])), validation=none) for f in folds]
 
 
 @dataclass(frozen=True)
@@ -193,6 +199,7 @@ def evaluate(
     workers: int = 1,
     cluster: str | None = None,
     seed: int = 0,
+    validation: bool = True,
     progress: Callable[[JobProgress], None] | None = None,
 ) -> Evaluation:
     """Train and score a model on each fold of ``split``.
@@ -206,6 +213,7 @@ def evaluate(
         workers: folds at a time, each in a process of its own.
         cluster: address of a Ray cluster that runs the folds instead.
         seed: seed of the split.
+        validation: whether to hold back windows for validation; without it they are trained on.
         progress: called when a fold reports an epoch, with (epoch, epochs, row of the history) as its message, or is
             done.
 
@@ -216,6 +224,7 @@ def evaluate(
         raise ConfigError("A journal needs a key that identifies what is trained: give evaluate(..., key={...}).")
     parsed = parse_split(split)
     folds = fold_windows(train_windows, score_windows, parsed, seed)
+    folds = folds if validation else train_on_validation(folds)
     hashes = [windows_fingerprint(train_windows)]
     hashes.append(hashes[0] if score_windows is train_windows else windows_fingerprint(score_windows))
     base = {"version": _VERSION, "key": dict(key or {}), "windows": hashes}

@@ -96,9 +96,13 @@ class VectorNet(nn.Module):
             h = d - vertical[:, None] * up
             length = (h.square().sum(1) + LENGTH_EPSILON).sqrt()
             turn = (torch.linalg.cross(h, h.roll(-1, 2), dim=1) * up).sum(1)
-            parts += [vertical, length, turn * (turn.square() + TURN_EPSILON).pow(-0.25)]
+            parts += [vertical, length, self.sense(turn, length)]
         z = torch.cat(parts, dim=1)
         return F.batch_norm(z, self.mean, self.var, None, None, self.training, MOMENTUM, NORM_EPSILON)
+
+    def sense(self, turn: Tensor, length: Tensor) -> Tensor:
+        """Return the sense of rotation (N, K, T') from u · (h × h') and the lengths of h, both (N, K, T')."""
+        return turn * (turn.square() + TURN_EPSILON).pow(-0.25)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors by their names in a weights dict."""

@@ -17,7 +17,7 @@ import numpy as np
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
-from plushsense.evaluation.crossval import fold_windows
+from plushsense.evaluation.crossval import fold_windows, train_on_validation
 from plushsense.models.arch import Arch
 from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import TrainSpec
@@ -63,6 +63,7 @@ def preview_evaluation(
         fit_on = windows_for(dataset, network, config.trained_on, gestures, anywhere=config.anywhere)
     split = parse_split(config.evaluation.split)
     folds = fold_windows(fit_on, score, split, config.evaluation.seed)
+    folds = folds if config.holds_back else train_on_validation(folds)
     rate = _seconds_a_mac(fit_on, network, config.training)
     side_by_side = min(config.evaluation.processes, len(folds))
     head = {"split": split.text, "leaky": split.leaky, "context": config.scored_on.context, "folds": len(folds)}

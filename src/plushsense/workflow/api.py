@@ -371,6 +371,7 @@ def evaluate(
         workers=config.evaluation.processes,
         cluster=cluster,
         seed=config.evaluation.seed,
+        validation=config.holds_back,
         progress=progress,
     )
     if out is not None:

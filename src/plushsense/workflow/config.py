@@ -134,6 +134,11 @@ class RunConfig:
         return replace(self.windows, context="stream") if self.windows.context == ANYWHERE else self.windows
 
     @property
+    def holds_back(self) -> bool:
+        """Whether an evaluation holds people back for validation: not if nothing depends on them."""
+        return self.training.patience is not None or not parse_split(self.evaluation.split).apart
+
+    @property
     def padding(self) -> str:
         """The padding of ``model``, or if that is None, of the preset."""
         return self.model.padding or PADDING[self.preset]

@@ -9,7 +9,7 @@ from typing import Any
 from nicegui import context, run, ui
 
 from plushsense.core.errors import PlushSenseError
-from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, NORMS, PADDINGS
+from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, NORMS, PADDINGS, VECTOR_FILTERS, VECTOR_SYMBOL
 from plushsense.scoring.splits import parse_split
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, button, html, on_change, query_path, section, tag
@@ -39,8 +39,8 @@ _ADVANCED: dict[str, tuple[str, ...]] = {
     SEARCH: ("architectures", "filters", "batches", "padding", "context", "classes", "device", "share"),
 }
 _PLACEHOLDERS = {
-    "arch": DEFAULT_SYMBOL,
-    "filters": ",".join(map(str, DEFAULT_FILTERS)),
+    "arch": f"{DEFAULT_SYMBOL} / {VECTOR_SYMBOL}",
+    "filters": " / ".join(",".join(map(str, counts)) for counts in (DEFAULT_FILTERS, VECTOR_FILTERS)),
     "classes": "shared",
     "batch": "64",
     "architectures": "14d1_39d2_41d4,14d1_19d2_19d4",
