@@ -4,8 +4,8 @@
  * From top to bottom: small arithmetic - reading the model - layers - pooling, dense layer, probabilities - events -
  * health - inputs, samples and frames - the functions that others call.
  *
- * Every rule here is stated in PlushSense's Python too (windows/clock, windows/features, models/fixed,
- * models/integer, models/events, models/gate, models/health), which defines what is right.
+ * Every rule here is stated in PlushSense's Python too (windows/clock, windows/features, runtime/fixed,
+ * runtime/vectors, runtime/integer, runtime/events, runtime/gate, runtime/health), which defines what is right.
  */
 #include "plushsense.h"
 
@@ -1025,8 +1025,8 @@ static void end_event(plush_toy *toy, uint32_t since, uint32_t ms)
 }
 
 /* The signal is gone: what is going on ends, all but the count of events is forgotten. */
-PLUSH_APART
-PLUSH_SMALL static void lose(plush_toy *toy, uint32_t ms)
+PLUSH_SMALL PLUSH_APART
+static void lose(plush_toy *toy, uint32_t ms)
 {
     if (going_on(toy))
         end_event(toy, ms, ms);
