@@ -163,3 +163,16 @@ def test_the_toy_at_rest_does_not_flatter_a_training(tmp_path: Path) -> None:
     assert scores["simulated"]
     assert scores["nobody"]["windows"] > 0
     assert scores["accuracy"] < 0.6, "after one epoch only rest is known, and rest is nobody's"
+
+
+def test_a_gesture_of_one_person_is_named(dataset: Dataset) -> None:
+    from plushsense.windows.cut import cut_windows
+    from plushsense.workflow.preparation import warn_of_single_people
+
+    windows = cut_windows(dataset)
+    said: list[str] = []
+    warn_of_single_people(windows, said.append)
+    assert said == []
+    person, label = str(windows.subject[0]), windows.labels[0]
+    warn_of_single_people(windows.take(np.flatnonzero((windows.y != 0) | (windows.subject == person))), said.append)
+    assert len(said) == 1 and said[0].startswith(f"only {person} made '{label}'")

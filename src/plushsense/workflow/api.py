@@ -50,6 +50,7 @@ from plushsense.workflow.preparation import (
     network_inputs_of,
     outside_streams,
     silent,
+    warn_of_single_people,
     windows_for,
 )
 from plushsense.workflow.reporting import check_place, journal_of, save_evaluation
@@ -352,6 +353,8 @@ def evaluate(
     if int8:
         refuse_undeployable(network)
     score = fit_on = windows_for(dataset, network, config.scored_on, gestures, warn)
+    if parse_split(config.evaluation.split).apart:
+        warn_of_single_people(score, warn)
     if config.trained_on != config.scored_on:
         fit_on = windows_for(dataset, network, config.trained_on, gestures, anywhere=config.anywhere)
     from plushsense.training.fit import resolve_device

@@ -85,6 +85,17 @@ def windows_for(
     return cut
 
 
+def warn_of_single_people(windows: WindowSet, warn: Warn) -> None:
+    """Warn of each gesture that only one person made: without that person, there is nothing to learn it from."""
+    for index, label in enumerate(windows.labels):
+        people = set(windows.subject[windows.y == index].tolist())
+        if len(people) == 1 and not people & {NOBODY, UNKNOWN_SUBJECT}:
+            warn(
+                f"only {people.pop()} made '{label}', so it cannot be learnt when that person is left out: leave it "
+                "out with --classes, or record it with more people"
+            )
+
+
 def outside_streams(windows: WindowSet, dataset: Dataset, people: Collection[str]) -> NDArray[np.bool_]:
     """Return a mask (N,) of the windows that lie in no stream of ``people``.
 
