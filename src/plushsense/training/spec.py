@@ -113,7 +113,7 @@ PRESETS: dict[str, TrainSpec] = {
 }
 
 # Augmentations of the preset "people" for a network with a vector layer, whose outputs a rotation does not change.
-VECTOR_AUGMENT = ("random-gain:0.3", "random-tilt:8", "random-speed:0.2")
+VECTOR_AUGMENT = ("random-gain:0.3", "random-tilt:8")
 
 # Default padding of the network for each preset.
 PADDING: dict[str, str] = {"search": "stream", "loso": "stream", "people": "stream", "paper": "mirror"}
