@@ -38,6 +38,7 @@ def run(args: argparse.Namespace) -> int:
 
 def lines(e: dict[str, Any]) -> list[str]:
     """Format the scores of an evaluation as text: a row for each person, then the means."""
+    from plushsense.reports.wording import describe_leakage
     from plushsense.scoring.metrics import column_metrics
 
     names = {key: metric.name for key, metric in column_metrics().items()}
@@ -62,6 +63,7 @@ def lines(e: dict[str, Any]) -> list[str]:
     out.append(f"vote by recording, pooled: {', '.join(f'{name} {figure(voted[k])}' for k, name in names.items())}")
     for kind, part in e["by_context"].items():
         out.append(f"  on {kind} windows: accuracy {figure(part['accuracy'])} ({part['windows']} windows)")
+    out.append(describe_leakage(e["leakage"]))
     return out + (deployed(e["int8"]) if "int8" in e else [])
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.gestures import NOBODY
+from plushsense.evaluation.leakage import audit_leakage
 from plushsense.evaluation.scores import FoldRecord, Predictions, compute_scores, gather_predictions, write_predictions
 from plushsense.jobs.journal import Journal, Result, job_id
 from plushsense.jobs.pool import Job, Report, run_jobs
@@ -254,6 +255,7 @@ def evaluate(
     tested = [(fold.name, fold.test) for fold in folds]
     predictions = gather_predictions(score_windows, tested, [outcome["probabilities"] for outcome in outcomes])
     table = compute_scores(predictions, records, score_windows.affects, parsed.apart)
+    table["leakage"] = audit_leakage(train_windows, score_windows, folds)
     if all("deployed" in outcome for outcome in outcomes):
         deployed = gather_predictions(score_windows, tested, [outcome["deployed"] for outcome in outcomes])
         after = compute_scores(deployed, records, score_windows.affects, parsed.apart)

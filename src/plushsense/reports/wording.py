@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
-from plushsense.reports.table import DASH, count, text
+from plushsense.reports.table import DASH, count, percent, text
 
 _TEXTS = tomllib.loads(resources.files("plushsense.reports").joinpath("wording.toml").read_text(encoding="utf-8"))
 CONTEXT_WORDS: dict[str, str] = _TEXTS["contexts"]
@@ -66,7 +66,17 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
         answers.append(("At rest", rest))
     if not evaluation.get("leaky"):
         answers.insert(2, ("Leak", _NO_LEAK))
+    if audit := evaluation.get("leakage"):
+        answers.append(("Leakage audit", describe_leakage(audit)))
     return answers
+
+
+def describe_leakage(audit: Mapping[str, Any]) -> str:
+    """Describe a leakage audit (`plushsense.evaluation.leakage`) in one sentence."""
+    shares = ", ".join(
+        f"{noun} {percent(audit[key] / max(audit['windows'], 1))}" for key, noun in _TEXTS["leakage"].items()
+    )
+    return f"Of the {count(audit['windows'])} scored windows, the share that was in some way trained on: {shares}."
 
 
 def averaged_over(evaluation: Mapping[str, Any]) -> str:

@@ -30,6 +30,7 @@ from plushsense.deploy.quantize import (
 )
 from plushsense.evaluation.crossval import EpochProgress, Evaluation, FoldOutput, windows_fingerprint
 from plushsense.evaluation.crossval import evaluate as crossvalidate
+from plushsense.evaluation.leakage import warn_of_copies
 from plushsense.evaluation.scores import FoldRecord, gather_predictions
 from plushsense.evaluation.scores import compute_scores as score_predictions
 from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possible
@@ -377,6 +378,7 @@ def evaluate(
         validation=config.holds_back,
         progress=progress,
     )
+    warn_of_copies(result.table["leakage"], warn)
     if out is not None:
         with dataset.generation.writing():
             save_evaluation(result, dataset, config, network, Path(out))

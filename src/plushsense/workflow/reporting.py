@@ -212,24 +212,31 @@ def write_report(
         )
 
 
+def load_evaluation(source: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a saved evaluation: its folder, or the ``evaluation.json`` in it.
+
+    Raises:
+        BadInput: if there is none.
+    """
+    path = Path(source)
+    path = path / SCORES if path.is_dir() else path
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(table, dict):
+            raise ValueError("no JSON object")
+    except FileNotFoundError:
+        raise BadInput(
+            f"There is no evaluation at '{path}': create one with  plushsense evaluate ... --out DIR"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise BadInput(f"'{path}' is not an evaluation ({error}): give a folder written by evaluate.") from None
+    return table
+
+
 def _evaluation_table(source: Evaluation | Mapping[str, Any] | str | os.PathLike[str]) -> dict[str, Any]:
     if isinstance(source, Evaluation):
         return source.to_dict()
-    if isinstance(source, Mapping):
-        table = dict(source)
-    else:
-        path = Path(source)
-        path = path / SCORES if path.is_dir() else path
-        try:
-            table = json.loads(path.read_text(encoding="utf-8"))
-            if not isinstance(table, dict):
-                raise ValueError("no JSON object")
-        except FileNotFoundError:
-            raise BadInput(
-                f"There is no evaluation at '{path}': create one with  plushsense evaluate ... --out DIR"
-            ) from None
-        except (OSError, ValueError) as error:
-            raise BadInput(f"'{path}' is not an evaluation ({error}): give a folder written by evaluate.") from None
+    table = dict(source) if isinstance(source, Mapping) else load_evaluation(source)
     # The title names the network, and the model card shows its numbers.
     table.pop("model", None)
     return table

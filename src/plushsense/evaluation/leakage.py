@@ -1,0 +1,179 @@
+"""Audit folds for leakage: count the scored windows that a model has, in some form, been trained on."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.gestures import NOBODY
+from plushsense.scoring.splits import Fold, Index
+from plushsense.windows.cut import WindowSet
+
+# A window is nearly a copy of another if, shifted by at most 0.5 s, it differs by less than 10 % of its own variation.
+NEAR = 0.1
+SHIFT_S = 0.5
+# Candidates are the training windows with the most similar sorted values.
+_CANDIDATES = 3
+_QUANTILES = 16
+# Two windows are compared sample by sample if their sorted values differ by less than this share of the variation:
+# without a shift, they differ no more than the windows do.
+_SIMILAR = 0.3
+_LISTED = 10
+_BLOCK = 256
+
+KINDS = {
+    "same_recording": "recording also trained on",
+    "overlapping": "samples in common with a training window",
+    "same_person": "person also trained on",
+    "copies": "equal to a training window of another recording",
+    "near_duplicates": "nearly equal to a training window of another recording",
+}
+
+Mask = NDArray[np.bool_]
+
+
+def audit_leakage(train: WindowSet, score: WindowSet, folds: Sequence[Fold]) -> dict[str, Any]:
+    """Count the scored windows of all folds that have something in common with the windows trained on in their fold.
+
+    Validation windows count as trained on. Nobody (recordings at rest) is no person. Windows without variation are
+    neither copies nor near-duplicates: a toy at rest is equal to itself.
+
+    Args:
+        train, score: the windows that the indices of ``folds`` refer to.
+
+    Returns:
+        ``windows``, the number of scored windows; a count for each of `KINDS`; ``pairs``, the recordings with most
+        copies or near-duplicates, as {scored, trained, windows}.
+    """
+    signatures = _Signatures.of(train, score)
+    totals, pairs = dict.fromkeys(("windows", *KINDS), 0), Counter[tuple[str, str]]()
+    for fold in folds:
+        known = np.union1d(fold.train, fold.validation)
+        test = fold.test
+        people = np.setdiff1d(train.subject[known], [NOBODY])
+        copies, near, twins = signatures.duplicates(known, test)
+        found = {
+            "same_recording": np.isin(_ids(score, test), _ids(train, known)),
+            "overlapping": _overlapping(train, known, score, test),
+            "same_person": np.isin(score.subject[test], people),
+            "copies": copies,
+            "near_duplicates": near,
+        }
+        totals["windows"] += len(test)
+        for kind, mask in found.items():
+            totals[kind] += int(mask.sum())
+        for mine, twin in zip(_ids(score, test[near]), _ids(train, twins[near]), strict=True):
+            pairs[str(mine), str(twin)] += 1
+    listed = [{"scored": a, "trained": b, "windows": n} for (a, b), n in pairs.most_common(_LISTED)]
+    return {**totals, "pairs": listed}
+
+
+def warn_of_copies(audit: Mapping[str, Any], warn: Callable[[str], None]) -> None:
+    """Warn of scored windows that are copies of training windows, naming two recordings."""
+    if audit["near_duplicates"]:
+        first = audit["pairs"][0]
+        warn(
+            f"{audit['near_duplicates']} of {audit['windows']} scored windows are copies, or nearly, of training "
+            f"windows of another recording (as {first['scored']} of {first['trained']}), so the scores are too high: "
+            "exclude one of the two recordings"
+        )
+
+
+def _ids(windows: WindowSet, index: Index) -> NDArray[np.str_]:
+    return np.array(windows.recording_ids, dtype=np.str_)[windows.recording[index]]
+
+
+def _overlapping(train: WindowSet, known: Index, score: WindowSet, test: Index) -> Mask:
+    """Return which scored windows (n,) share rows of a stream with a training window."""
+    shared = np.zeros(len(test), dtype=np.bool_)
+    rows, trained = score.window_rows[test], train.window_rows[known]
+    for stream in np.setdiff1d(score.stream[test], [""]):
+        mine = np.flatnonzero((score.stream[test] == stream) & (rows[:, 0] >= 0))
+        theirs = trained[(train.stream[known] == stream) & (trained[:, 0] >= 0)]
+        theirs = theirs[np.argsort(theirs[:, 0])]
+        if not len(theirs) or not len(mine):
+            continue
+        # Of the training windows that begin before the end of a scored one, does any end after its beginning?
+        before = np.searchsorted(theirs[:, 0], rows[mine, 1])
+        latest = np.concatenate([[-1], np.maximum.accumulate(theirs[:, 1])])[before]
+        shared[mine] = latest > rows[mine, 0]
+    return shared
+
+
+class _Signatures:
+    """Sorted values of windows, in which a window and its slightly shifted copy differ little."""
+
+    def __init__(self, train: WindowSet, score: WindowSet, scale: NDArray[np.float32]) -> None:
+        self._train, self._score, self._scale = train, score, scale
+        self._shift = min(round(SHIFT_S * score.rate_hz), score.x.shape[2] // 4)
+        self._of_train = _sorted_values(train, scale)
+        self._of_score = self._of_train if score is train else _sorted_values(score, scale)
+
+    @classmethod
+    def of(cls, train: WindowSet, score: WindowSet) -> _Signatures:
+        spread = train.x.astype(np.float32).std(axis=(0, 2)) if len(train) else np.ones(train.x.shape[1], np.float32)
+        return cls(train, score, (1 / np.where(spread > 0, spread, 1)).astype(np.float32))
+
+    def duplicates(self, known: Index, test: Index) -> tuple[Mask, Mask, Index]:
+        """Return which scored windows are copies, which are nearly, (n,) each, and the training window (n,) of each."""
+        copies, near = np.zeros(len(test), dtype=np.bool_), np.zeros(len(test), dtype=np.bool_)
+        twins = np.full(len(test), -1, dtype=np.int64)
+        for at, candidates in self._candidates(known, test):
+            for index in candidates.T:
+                mine, theirs = test[at], known[index]
+                other = _ids(self._score, mine) != _ids(self._train, theirs)
+                pick = np.flatnonzero(other & ~near[at] & self._similar(mine, theirs))
+                x, y = self._scaled(self._score, mine[pick]), self._scaled(self._train, theirs[pick])
+                same = (x == y).all(axis=(1, 2))
+                close = same | (_difference(x, y, self._shift) < NEAR)
+                copies[at[pick]] = same
+                near[at[pick[close]]] = True
+                twins[at[pick[close]]] = theirs[pick[close]]
+        return copies, near, twins
+
+    def _similar(self, test: Index, known: Index) -> Mask:
+        """Return for which pairs (n,) of windows with variation the sorted values differ by less than `_SIMILAR`."""
+        x, y = self._of_score[test], self._of_train[known]
+        variation = x.reshape(len(x), -1, _QUANTILES).var(axis=2).sum(axis=1)
+        error = np.square(x - y).reshape(len(x), -1, _QUANTILES).mean(axis=2).sum(axis=1)
+        similar: Mask = (variation > 0) & (error < _SIMILAR**2 * variation)
+        return similar
+
+    def _scaled(self, windows: WindowSet, index: Index) -> NDArray[np.float32]:
+        return windows.x[index] * self._scale[:, None]
+
+    def _candidates(self, known: Index, test: Index) -> Iterator[tuple[Index, Index]]:
+        """Yield blocks of positions in ``test`` (b,) with the most similar positions in ``known`` (b, k)."""
+        mine, theirs = self._of_score[test], self._of_train[known]
+        squares = np.square(theirs).sum(axis=1)
+        for start in range(0, len(test) if len(known) else 0, _BLOCK):
+            at = np.arange(start, min(start + _BLOCK, len(test)))
+            distance = squares - 2 * (mine[at] @ theirs.T)
+            nearest = np.argpartition(distance, min(_CANDIDATES, len(known)) - 1, axis=1)
+            yield at, nearest[:, :_CANDIDATES]
+
+
+def _sorted_values(windows: WindowSet, scale: NDArray[np.float32]) -> NDArray[np.float32]:
+    n, inputs, samples = windows.x.shape
+    places = np.linspace(0, samples - 1, _QUANTILES).round().astype(np.int64)
+    out = np.empty((n, inputs * _QUANTILES), dtype=np.float32)
+    for start in range(0, n, _BLOCK):
+        ordered = np.sort(windows.x[start : start + _BLOCK], axis=2)[:, :, places] * scale[:, None]
+        out[start : start + _BLOCK] = ordered.reshape(len(ordered), -1)
+    return out
+
+
+def _difference(x: NDArray[np.float32], y: NDArray[np.float32], shift: int) -> NDArray[np.float64]:
+    """Return the RMS difference (n,) of windows (n, F, T) at the best shift, as a share of the variation of ``x``."""
+    samples = x.shape[2]
+    best = np.full(len(x), np.inf)
+    for lag in range(-shift, shift + 1):
+        a, b = (x[..., lag:], y[..., : samples - lag]) if lag >= 0 else (x[..., :lag], y[..., -lag:])
+        variation = a.var(axis=2).sum(axis=1)
+        error = np.square(a - b).mean(axis=2).sum(axis=1)
+        best = np.minimum(best, np.sqrt(error / np.maximum(variation, 1e-12)))
+    return best

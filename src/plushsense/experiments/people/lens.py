@@ -1,0 +1,204 @@
+"""Score one network under several splits side by side, calibrate it, and describe each person it was scored on.
+
+The leaky split by windows, splits by recording and splits by person answer different questions. Here all means and
+intervals are over people, whatever the split, so that they can be compared.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from plushsense.core.errors import ConfigError
+from plushsense.core.files import write_file
+from plushsense.core.gestures import NOBODY
+from plushsense.core.version import __version__
+from plushsense.dataset.index import as_dataset
+from plushsense.dataset.store import Dataset, read_people
+from plushsense.evaluation.crossval import Evaluation
+from plushsense.evaluation.scores import Predictions
+from plushsense.experiments.people.traits import measure_people, trait_correlations, unusual_traits
+from plushsense.jobs.journal import job_id
+from plushsense.jobs.progress import JobProgress
+from plushsense.scoring.calibration import cross_fitted_temperature, reliability
+from plushsense.scoring.metrics import class_scores, column_metrics, confusion, summary
+from plushsense.scoring.splits import parse_split
+from plushsense.workflow.api import evaluate
+from plushsense.workflow.config import RunConfig, from_settings
+from plushsense.workflow.preparation import Warn, silent
+from plushsense.workflow.reporting import check_results
+
+SPLITS = ("windows:5", "by-recording:5", "by-subject:5", "leave-one-subject-out")
+TABLE, PAGE = "lens.json", "lens.html"
+
+
+def lens(
+    dataset: Dataset | str | os.PathLike[str],
+    config: RunConfig | None = None,
+    *,
+    splits: Sequence[str] = SPLITS,
+    out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    cluster: str | None = None,
+    progress: Callable[[JobProgress], None] | None = None,
+    warn: Warn = silent,
+    **settings: Any,
+) -> dict[str, Any]:
+    """Evaluate one network under each split; describe people and calibration under the last split by person.
+
+    Finished folds are stored as by `evaluate`, so that a stopped run, or an earlier evaluation, is continued.
+
+    Args:
+        config, settings: as for `evaluate`; its split is not used.
+        splits: at least one, such as "windows:5" (leaky) and "leave-one-subject-out".
+        out: a folder for ``lens.json`` and ``lens.html``; an error if it holds one of other settings or data, unless
+            ``overwrite``.
+
+    Returns:
+        ``splits``: {split, leaky, folds, train_windows, people, accuracy {mean, sd, ci95}, macro_f1 {…}, by_recording,
+        pooled, leakage} of each; ``calibration`` (see `calibration_of`), ``people`` (see `people_of`) and ``traits``
+        (see `trait_correlations`), which are None without a split by person.
+    """
+    dataset = as_dataset(dataset)
+    config = config or from_settings(**settings)
+    if not splits:
+        raise ConfigError(f"The lens needs at least one split: for example --splits {','.join(SPLITS)}.")
+    parsed = [parse_split(text) for text in splits]
+    identity = lens_id(dataset, config, splits)
+    if out is not None:
+        check_results(Path(out), "A lens", TABLE, identity, replace=overwrite)
+    rows, honest = [], None
+    for number, split in enumerate(parsed):
+        run = replace(config, evaluation=replace(config.evaluation, split=split.text))
+        done = evaluate(dataset, run, cluster=cluster, progress=progress, warn=silent if number else warn)
+        rows.append(_split_row(done))
+        honest = done if split.apart else honest
+    result: dict[str, Any] = {
+        "splits": rows,
+        "by_person": None if honest is None else honest.split.text,
+        "calibration": None,
+        "people": None,
+        "traits": None,
+    }
+    if honest is not None:
+        measured = measure_people(dataset, honest.predictions.labels)
+        people = people_of(honest, measured, dataset)
+        scores = {row["subject"]: row["accuracy"] for row in people}
+        result |= {
+            "calibration": calibration_of(honest.predictions),
+            "people": people,
+            "traits": trait_correlations({p: measured[p] for p in scores if p in measured}, scores),
+        }
+    config = config.for_layout(dataset.layout)
+    result |= {
+        "id": identity,
+        "name": config.model.arch,
+        "model": {"arch": config.model.arch, "filters": config.model.filters, "preset": config.preset},
+        "seed": config.evaluation.seed,
+        "dataset": dataset.head.name,
+        "dataset_hash": dataset.hash,
+        "simulated": dataset.head.simulated,
+        "code_version": __version__,
+    }
+    if out is not None:
+        with dataset.generation.writing():
+            _save(result, Path(out))
+    return result
+
+
+def lens_id(dataset: Dataset, config: RunConfig, splits: Sequence[str]) -> str:
+    """Return an identifier of 20 hexadecimal digits, equal for equal settings and data."""
+    outcome = config.for_layout(dataset.layout).outcome() | {"splits": [parse_split(text).text for text in splits]}
+    return job_id({"lens": outcome, "data": dataset.hash})
+
+
+def _split_row(done: Evaluation) -> dict[str, Any]:
+    """Return the scores of an evaluation with means over its people, whatever the split."""
+    table = done.table
+    people = table["subjects"]
+    return {
+        "split": done.split.text,
+        "leaky": done.split.leaky,
+        "apart": done.split.apart,
+        "folds": len(table["folds"]),
+        "train_windows": round(np.mean([f["train_windows"] for f in table["folds"]])),
+        "people": len(people),
+        **{key: summary([row[key] for row in people if row[key] is not None]) for key in column_metrics()},
+        "by_recording": table["by_recording"],
+        "pooled": table["pooled"],
+        "leakage": table["leakage"],
+    }
+
+
+def calibration_of(predictions: Predictions) -> dict[str, Any]:
+    """Return the reliability of predictions on people left out, as they are and scaled by a temperature.
+
+    Each person's temperature is fitted on the predictions of all other people; recordings of nobody are left out.
+
+    Returns:
+        ``before`` and ``after``: results of `reliability`; ``temperature``: the median over the people.
+    """
+    people = predictions.subject != NOBODY
+    p, truth = predictions.probabilities[people], predictions.truth[people]
+    scaled, temperatures = cross_fitted_temperature(p, truth, predictions.subject[people])
+    return {
+        "before": reliability(p, truth),
+        "after": reliability(scaled, truth),
+        "temperature": float(np.median(list(temperatures.values()))) if temperatures else None,
+    }
+
+
+def people_of(
+    done: Evaluation, measured: Mapping[str, Mapping[str, float | None]], dataset: Dataset
+) -> list[dict[str, Any]]:
+    """Describe each person of an evaluation, the worst read first.
+
+    Returns:
+        {subject, windows, recordings, accuracy, macro_f1, by_recording_accuracy, known (what subjects.csv says),
+        traits, unusual (sentences), gestures: {gesture, windows, recall, read_as, share}} of each; the gestures in the
+        order of their recall, with the one that most often is read instead and its share of the windows.
+    """
+    predictions, labels = done.predictions, done.predictions.labels
+    files = read_people(dataset.path)
+    unusual = unusual_traits(measured)
+    rows = []
+    for row in done.table["subjects"]:
+        name = row["subject"]
+        mine = predictions.subject == name
+        counts = confusion(predictions.truth[mine], predictions.predicted[mine], len(labels))
+        recall, made = class_scores(counts).recall, counts.sum(axis=1)
+        gestures = []
+        for k in sorted(np.flatnonzero(made > 0).tolist(), key=lambda k: recall[k]):
+            wrong = counts[k].copy()
+            wrong[k] = 0
+            read_as, share = labels[int(wrong.argmax())], float(wrong.max() / made[k])
+            gestures.append({"gesture": labels[k], "windows": int(made[k]), "recall": float(recall[k])})
+            gestures[-1] |= {"read_as": read_as if share else None, "share": share}
+        known = {}
+        if name in files:
+            person = files[name]
+            known = {"age_group": person.age_group, "gender": person.gender, **person.more}
+        rows.append(
+            {
+                **row,
+                "known": {key: value for key, value in known.items() if value},
+                "traits": dict(measured.get(name, {})),
+                "unusual": unusual.get(name, []),
+                "gestures": gestures,
+            }
+        )
+    return sorted(rows, key=lambda row: -1.0 if row["accuracy"] is None else row["accuracy"])
+
+
+def _save(result: dict[str, Any], out: Path) -> None:
+    from plushsense.experiments.people.report import lens_page
+
+    out.mkdir(parents=True, exist_ok=True)
+    write_file(out / PAGE, lens_page(result))
+    write_file(out / TABLE, json.dumps(result, ensure_ascii=False, indent=1))

@@ -1,0 +1,81 @@
+"""The leakage audit finds what a split shares between training and test, and copies under other names."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plushsense.evaluation.crossval import fold_windows
+from plushsense.evaluation.leakage import KINDS, audit_leakage, warn_of_copies
+from plushsense.scoring.splits import Fold, parse_split
+from plushsense.windows.cut import WindowSet
+from support.fakes import study
+
+
+def moving(people: int = 4, samples: int = 100) -> WindowSet:
+    """Windows of smooth noise, no two alike."""
+    windows = study(people=people, nobody=2)
+    noise = np.random.default_rng(0).normal(size=(len(windows), 2, samples + 9))
+    smooth = np.stack([noise[:, :, i : i + samples] for i in range(10)]).sum(axis=0)
+    return replace(windows, x=np.round(1000 * smooth).astype(np.int32))
+
+
+def audited(windows: WindowSet, split: str) -> dict[str, int]:
+    return audit_leakage(windows, windows, fold_windows(windows, windows, parse_split(split)))
+
+
+def test_each_split_shares_what_it_must() -> None:
+    windows = moving()
+    by_window, by_recording, by_subject = (audited(windows, s) for s in ("windows:4", "by-recording:4", "by-subject:4"))
+    assert all(found["windows"] == len(windows) for found in (by_window, by_recording, by_subject))
+    assert by_window["same_recording"] > 0 and by_window["overlapping"] > 0
+    people = int((windows.subject != "none").sum())
+    assert by_recording["same_recording"] == 0 and by_recording["same_person"] == people
+    # The past of a recording at rest may reach into another one of its stream, which nobody made either.
+    assert not any(by_subject[key] for key in KINDS if key != "overlapping")
+    assert not any(found["near_duplicates"] for found in (by_window, by_recording))
+
+
+def test_overlap_is_found_in_the_stream() -> None:
+    windows = study(people=3, nobody=0)
+    first = np.flatnonzero(windows.recording == 1)
+    other = np.flatnonzero(windows.subject == "P02")
+    none = np.empty(0, dtype=np.int64)
+    # Rows 80 to 160 and 120 to 200 of one recording; the windows of another stream have the same numbers of rows.
+    apart = Fold("f", ("P00",), other, none, first[:1])
+    assert audit_leakage(windows, windows, [apart])["overlapping"] == 0
+    together = Fold("f", ("P00",), np.append(other, first[1]), none, first[:1])
+    assert audit_leakage(windows, windows, [together])["overlapping"] == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "copies", "near"),
+    [
+        (lambda x: x, 1, 1),
+        (lambda x: np.concatenate([x[:, 20:], x[:, :20] * 0], axis=1), 0, 1),
+        (lambda x: x + np.random.default_rng(1).integers(-150, 151, x.shape), 0, 1),
+        (lambda x: x * 3 // 2, 0, 0),
+        (lambda x: x[:, ::-1], 0, 0),
+    ],
+    ids=["equal", "shifted by 0.2 s", "with a little noise", "stronger", "reversed"],
+)
+def test_a_copy_of_another_person_is_found(change: object, copies: int, near: int) -> None:
+    windows = moving()
+    mine, theirs = (int(np.flatnonzero(windows.subject == who)[0]) for who in ("P01", "P03"))
+    x = windows.x.copy()
+    x[theirs] = change(x[mine])  # type: ignore[operator]
+    planted = replace(windows, x=x)
+    fold = Fold("P01", ("P01",), np.flatnonzero(windows.subject != "P01"), np.empty(0, np.int64), np.array([mine]))
+    found = audit_leakage(planted, planted, [fold])
+    assert (found["copies"], found["near_duplicates"]) == (copies, near)
+    said: list[str] = []
+    warn_of_copies(found, said.append)
+    assert len(said) == near and all("P01/" in line and "P03/" in line for line in said)
+
+
+def test_recordings_without_movement_are_no_copies() -> None:
+    windows = moving()
+    still = replace(windows, x=np.zeros_like(windows.x))
+    assert audited(still, "by-subject:4")["near_duplicates"] == 0
