@@ -30,6 +30,7 @@ def run(args: argparse.Namespace) -> int:
         **options(args, "layout", "gestures", "subjects", "name", "licence", "consent", "people"),
         progress=ProgressReporter("reading"),
         add_to=args.add,
+        adopt_proposals=args.adopt,
         columns=_columns(args.column),
         limits=None if args.max_gb is None else UnpackLimits(total_bytes=_whole_bytes(args.max_gb)),
     )
@@ -39,6 +40,8 @@ def run(args: argparse.Namespace) -> int:
             say(f"warning: {line}")
         if len(result["warnings"]) > _MOST_WARNINGS:
             say(f"... and {len(result['warnings']) - _MOST_WARNINGS} more warnings; all are in {args.dest}/*.csv")
+        for proposal in done.proposals:
+            say(f"suggestion: {proposal['reason']}: {proposal['advice']}")
         for status, entries in (("left out", done.left_out), ("rejected", done.rejected)):
             for entry in entries:
                 say(f"{status}: {entry['file']}: {entry['reason']}")

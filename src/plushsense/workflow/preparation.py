@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.dataset.importing.proposals import median_gesture_s
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.evaluation.crossval import fold_windows
 from plushsense.models.arch import Arch, parse_symbol
@@ -94,6 +95,21 @@ def warn_of_single_people(windows: WindowSet, warn: Warn) -> None:
                 f"only {people.pop()} made '{label}', so it cannot be learnt when that person is left out: leave it "
                 "out with --classes, or record it with more people"
             )
+
+
+def warn_of_long_windows(dataset: Dataset, arch: Arch, window_s: float, gestures: GestureSet, warn: Warn) -> None:
+    """Warn if a window, or the span of the network, is longer than half of the recordings of the gestures."""
+    usual_s = median_gesture_s(dataset, gestures.labels)
+    span_s = max(window_s, arch.span / dataset.layout.rate_hz)
+    if usual_s is not None and span_s > usual_s:
+        if span_s > window_s:
+            advice = f"shorter kernels (--arch), as the layout has {dataset.layout.rate_hz:g} samples a second"
+        else:
+            advice = f"[windows] window_s = {max(0.5, round(usual_s, 1)):g} in a --config file"
+        warn(
+            f"a decision reads {span_s:.1f} s, but half of the recordings last less than {usual_s:.1f} s, so most "
+            f"windows begin before their gesture: try {advice}"
+        )
 
 
 def outside_streams(windows: WindowSet, dataset: Dataset, people: Collection[str]) -> NDArray[np.bool_]:

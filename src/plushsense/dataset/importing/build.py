@@ -196,6 +196,7 @@ class ImportSummary:
     excluded: int = 0
     added: dict[str, int] = field(default_factory=dict)
     already_there: int = 0
+    proposals: list[dict[str, Any]] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""

@@ -38,6 +38,7 @@ from plushsense.dataset.importing.build import (
     read_copied,
     summarize_import,
 )
+from plushsense.dataset.importing.proposals import adopt, matching_layouts, propose_settings
 from plushsense.dataset.importing.sources import (
     SourceFile,
     SourceScan,
@@ -219,14 +220,21 @@ class ImportOptions:
     columns: Mapping[str, str] = field(default_factory=dict)
     limits: UnpackLimits = field(default_factory=UnpackLimits)
 
-    def known_layout(self, own: Layout | None = None) -> Layout:
-        """Return the layout ``own`` of the source, else the given one; raise ConfigError if there is none."""
-        if (layout := own or self.layout) is None:
-            raise ConfigError(
-                f"--layout is needed, since only sessions of plushsense record name theirs: accepted are "
-                f"{', '.join(layout_names())}, or a TOML file of your own."
-            )
-        return layout
+    def known_layout(self, own: Layout | None, files: Iterable[Path]) -> tuple[Layout, list[str]]:
+        """Return the layout ``own`` of the source, else the given one, else the one that the header of a file names.
+
+        The second value are notes. Raises ConfigError if there is none, or several fit.
+        """
+        if (layout := own or self.layout) is not None:
+            return layout, []
+        found = matching_layouts(files)
+        if len(found) == 1:
+            return found[0], [f"the layout is '{found[0].name}', as the header of the files has its channels"]
+        fit = f"the header of the files fits {' and '.join(layout.name for layout in found)}. " if found else ""
+        raise ConfigError(
+            f"--layout is needed: {fit}Accepted are {', '.join(layout_names())}, or a TOML file of your own, which "
+            "names the channels (see docs/importing.md)."
+        )
 
     def known_gestures(self, layout: Layout) -> GestureSet | None:
         """Return the gesture set; None if it is to be inferred from the labels."""
@@ -244,7 +252,7 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     simulated = is_simulation(around or source, all_files)
     files, refused = split_regular_files(f for f in all_files if f.name != SIMULATION_MARK)
     sessions = read_sessions(files)
-    layout = options.known_layout(common_layout(sessions, options.layout, options.layout_origin))
+    layout, notes = options.known_layout(common_layout(sessions, options.layout, options.layout_origin), files)
     gestures = options.known_gestures(layout)
     in_session = [f for f in files if sessions and session_of(f, sessions) is not None]
     rest = sorted(set(files) - set(in_session)) if in_session else files
@@ -257,8 +265,8 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
         + classify_files(shape, source, plain, mapping, gestures)
     )
     classified = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in classified]
-    people, notes = people_of(sessions)
-    search = SourceScan(layout, gestures, shape if rest else "sessions", classified, people, notes=notes)
+    people, more = people_of(sessions)
+    search = SourceScan(layout, gestures, shape if rest else "sessions", classified, people, notes=notes + more)
     for file in (f for f in rest if f.suffix.lower() == ".xdf"):
         name = printable_path(file.relative_to(source))
         person = None if file.parent == around else file.parent.resolve().name
@@ -298,9 +306,9 @@ def scan_xdf(path: Path, options: ImportOptions) -> SourceScan:
 
 
 def _scan_of_file(path: Path, shape: str, options: ImportOptions) -> SourceScan:
-    layout = options.known_layout()
+    layout, notes = options.known_layout(None, [path])
     simulated = is_simulation(path.resolve().parent, [])
-    return SourceScan(layout, options.known_gestures(layout), shape, [], simulated=simulated)
+    return SourceScan(layout, options.known_gestures(layout), shape, [], notes=notes, simulated=simulated)
 
 
 def _add_xdf(path: Path, name: str, person: str | None, options: ImportOptions, search: SourceScan) -> None:
@@ -322,8 +330,8 @@ def scan_table(path: Path, options: ImportOptions) -> SourceScan:
     """Convert and search a table with one row per sample."""
     if parse_name(path.name) is not None:
         raise DatasetError(f"'{path}' is one recording: give the folder that holds the people's folders.")
-    check_roles(options.columns, options.known_layout())
     search = _scan_of_file(path, "table", options)
+    check_roles(options.columns, search.layout)
     person = (options.mapping or {}).get(path.name)
     _add(read_table(path, path.name, options.new_folder("converted"), person, search.layout, options.columns), search)
     return search
@@ -396,6 +404,18 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
     return search
 
 
+def _propose(done: ImportSummary, adopting: bool) -> None:
+    """Measure a new data set; add what fits it better to the summary, and to its layout if ``adopting``."""
+    found = propose_settings(done.dataset)
+    done.proposals = [{**p.to_dict(), "advice": p.advice(adopted=adopting)} for p in found]
+    head = done.dataset.head
+    layout = adopt(head.layout, found) if adopting else head.layout
+    if layout != head.layout:
+        head = replace(head, layout=layout)
+        write_file(done.dataset.path / HEAD, head.to_toml())
+        done.dataset = rebuild_index(done.dataset.path, head).dataset
+
+
 def import_recordings(
     source: str | Path,
     dest: str | Path,
@@ -412,6 +432,7 @@ def import_recordings(
     people: str | Path | None = None,
     columns: Mapping[str, str] | None = None,
     limits: UnpackLimits | None = None,
+    adopt_proposals: bool = False,
 ) -> ImportSummary:
     """Create a data set at ``dest`` from recordings, or add them to an existing one.
 
@@ -419,7 +440,8 @@ def import_recordings(
         source: a folder that a recorder wrote (sessions, a folder per person or per label), a zip of one, an XDF file,
             or one table (.csv, .parquet).
         dest: a new or empty folder for the data set; with ``add_to`` the existing data set.
-        layout: the sensor layout, its name or path; not needed with ``add_to`` and for sessions of PlushSense.
+        layout: the sensor layout, its name or path; not needed with ``add_to``, for sessions of PlushSense, and for
+            files whose header names all channels of one built-in layout.
         gestures: the gesture set; by default ``plush-18`` for plush layouts, else inferred from the labels.
         subjects: "folder" (the folder is the person) or the path of a mapping file ``file,subject``.
         simulated: whether the virtual toy made the recordings; detected in folders that `plushsense simulate` wrote.
@@ -427,6 +449,8 @@ def import_recordings(
         people: the path of a people's table, see `dataset.store.read_people`.
         columns: the column of a table by role (``{"label": "activity"}``), or the ``stream`` of an XDF file.
         limits: limits of unpacking a zip.
+        adopt_proposals: put the proposed rate, gap and offsets (see `propose_settings`) into the layout of the new
+            data set; otherwise they are only reported.
 
     Returns:
         The summary. Every source file is imported (possibly with warnings), left out, or rejected with a reason.
@@ -448,6 +472,8 @@ def import_recordings(
     head = None
     if add_to:
         head = DatasetHead.read(dest)
+        if adopt_proposals:
+            raise ConfigError("--add keeps the layout of the data set: leave --adopt out.")
         if given is not None and given.to_dict() != head.layout.to_dict():
             raise DatasetError(f"'{dest}' has the layout '{head.layout.name}', not '{given.name}': leave --layout out.")
         if name or licence or consent:
@@ -477,6 +503,7 @@ def import_recordings(
                 simulated=search.simulated,
             )
             done = create_dataset(source, dest, search, new_head, people_info, progress)
+            _propose(done, adopt_proposals)
         else:
             try:
                 done = add_to_dataset(dest, search, gestures, people_info, progress)
