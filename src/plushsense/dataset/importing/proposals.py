@@ -51,7 +51,7 @@ class Proposal:
 
 
 def matching_layouts(files: Iterable[Path]) -> list[Layout]:
-    """Return the built-in layouts with most channels of which the header of a CSV file, the first that fits, has all."""
+    """Return the built-in layouts with most channels, all of which the header of the first fitting CSV file names."""
     layouts = [load_layout(name) for name in layout_names()]
     for path in files:
         if path.suffix.lower() == ".csv":
