@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
@@ -163,6 +164,29 @@ def test_the_toy_at_rest_does_not_flatter_a_training(tmp_path: Path) -> None:
     assert scores["simulated"]
     assert scores["nobody"]["windows"] > 0
     assert scores["accuracy"] < 0.6, "after one epoch only rest is known, and rest is nobody's"
+
+
+def test_a_file_under_two_labels_and_a_long_window_are_named(
+    dataset: Dataset, make_session: Callable[[Path, int], None], tmp_path: Path
+) -> None:
+    from plushsense.models.arch import Arch
+    from plushsense.workflow.preparation import warn_of_files_twice, warn_of_long_windows
+
+    said: list[str] = []
+    warn_of_files_twice(dataset, dataset.gestures, said.append)
+    assert said == []
+    make_session(tmp_path / "R" / "P1", 1)
+    slow = next((tmp_path / "R" / "P1").glob("Slow_*.csv"))
+    (slow.parent / slow.name.replace("Slow", "Fast")).write_bytes(slow.read_bytes())
+    twice = ps.import_recordings(tmp_path / "R", tmp_path / "TWICE", layout="accel-3").dataset
+    warn_of_files_twice(twice, twice.gestures, said.append)
+    assert len(said) == 1 and "as two gestures" in said[0] and "P1/Slow_" in said[0] and "P1/Fast_" in said[0]
+
+    arch = Arch.parse("14d1", (4,), channels=3, classes=3, window=250)
+    warn_of_long_windows(dataset, arch, 1.0, dataset.gestures, said.append)
+    assert len(said) == 2 and "shorter kernels" in said[1]  # the network reads 2.5 s
+    warn_of_long_windows(dataset, arch, 2.5, dataset.gestures, said.append)
+    assert len(said) == 3 and "window_s" in said[2]
 
 
 def test_a_gesture_of_one_person_is_named(dataset: Dataset) -> None:

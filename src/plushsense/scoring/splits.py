@@ -179,7 +179,11 @@ def _people(subject: NDArray[np.str_], split: str, needed: int) -> list[str]:
             "import them again with a mapping file (--subjects map.csv), or use by-recording:5."
         )
     if len(people) < needed:
-        raise BadInput(f"{split} needs at least {needed} people (test, validation, training); there are {len(people)}.")
+        raise BadInput(
+            f"{split} needs at least {needed} people (test, validation, training); there are {len(people)} "
+            f"({', '.join(people) or 'nobody'}): record more people, or use by-recording:5, which says nothing about "
+            "new people."
+        )
     return people
 
 

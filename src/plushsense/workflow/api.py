@@ -51,6 +51,7 @@ from plushsense.workflow.preparation import (
     network_inputs_of,
     outside_streams,
     silent,
+    warn_of_files_twice,
     warn_of_long_windows,
     warn_of_single_people,
     windows_for,
@@ -204,6 +205,7 @@ def train(
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     if quantize_aware:
         refuse_undeployable(network)
+    warn_of_files_twice(dataset, gestures, warn)
     warn_of_long_windows(dataset, network, config.windows.window_s, gestures, warn)
     windows = windows_for(dataset, network, config.windows, gestures, warn, config.anywhere)
     scored = windows
@@ -355,6 +357,7 @@ def evaluate(
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     if int8:
         refuse_undeployable(network)
+    warn_of_files_twice(dataset, gestures, warn)
     warn_of_long_windows(dataset, network, config.windows.window_s, gestures, warn)
     score = fit_on = windows_for(dataset, network, config.scored_on, gestures, warn)
     if parse_split(config.evaluation.split).apart:

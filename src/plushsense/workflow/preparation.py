@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.dataset.importing.proposals import median_gesture_s
-from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
+from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
 from plushsense.evaluation.crossval import fold_windows
 from plushsense.models.arch import Arch, parse_symbol
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
@@ -95,6 +95,19 @@ def warn_of_single_people(windows: WindowSet, warn: Warn) -> None:
                 f"only {people.pop()} made '{label}', so it cannot be learnt when that person is left out: leave it "
                 "out with --classes, or record it with more people"
             )
+
+
+def warn_of_files_twice(dataset: Dataset, gestures: GestureSet, warn: Warn) -> None:
+    """Warn of recordings with the same file content, which teach two gestures, or score a person on another's."""
+    same: dict[tuple[str, int, int], list[RecordingInfo]] = {}
+    for recording in dataset.used:
+        if recording.gesture in gestures.labels:
+            same.setdefault((recording.sha256, recording.first_row, recording.rows), []).append(recording)
+    for first, *others in same.values():
+        for other in others:
+            labels = {first.gesture, other.gesture}
+            known = "as two gestures" if len(labels) == 2 else f"twice as '{first.gesture}'"
+            warn(f"the same file is in the data set {known}: {first.id} and {other.id}; exclude one of them")
 
 
 def warn_of_long_windows(dataset: Dataset, arch: Arch, window_s: float, gestures: GestureSet, warn: Warn) -> None:
