@@ -30,6 +30,7 @@ class Gesture:
         nobody: whether it is recorded without a person (the toy at rest).
         idle: whether it means that nothing happens; it never starts an event.
         energetic: whether it is so abrupt that the threshold rules of the gate can detect it before the network does.
+        labels: further labels of recordings that are this gesture, as in a set of merged gestures.
     """
 
     label: str
@@ -40,6 +41,7 @@ class Gesture:
     idle: bool = False
     energetic: bool = False
     description: str = ""
+    labels: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not plain_label(self.label):
@@ -65,8 +67,9 @@ class GestureSet:
     inferred: bool = False
 
     def __post_init__(self) -> None:
-        plain = [plain_label(g.label) for g in self.gestures]
-        doubled = sorted({g.label for g in self.gestures if plain.count(plain_label(g.label)) > 1})
+        names = [(label, plain_label(label)) for g in self.gestures for label in (g.label, *g.labels)]
+        plain = [name for _, name in names]
+        doubled = sorted({label for label, name in names if plain.count(name) > 1})
         if doubled:
             raise GestureError(f"Gesture set '{self.name}' has '{doubled[0]}' twice: labels must differ.")
 
@@ -96,7 +99,7 @@ class GestureSet:
     def find(self, label: str) -> Gesture | None:
         """Return the gesture with this label, with case ignored and ``_`` equal to a space; None if not in the set."""
         plain = plain_label(label)
-        return next((g for g in self.gestures if plain_label(g.label) == plain), None)
+        return next((g for g in self.gestures if plain in map(plain_label, (g.label, *g.labels))), None)
 
     def get(self, label: str) -> Gesture:
         """Return the gesture with this label; raise GestureError with the nearest label if it is not in the set."""
@@ -119,7 +122,12 @@ class GestureSet:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        return asdict(self)
+        table = asdict(self)
+        for gesture in table["gestures"]:
+            # Files of sets without merged gestures stay as they were.
+            if not gesture["labels"]:
+                del gesture["labels"]
+        return table
 
     @classmethod
     def from_dict(cls, table: dict[str, Any], where: str = "gesture set") -> GestureSet:

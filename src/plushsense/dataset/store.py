@@ -302,6 +302,18 @@ class Dataset:
         other._stored_layout = self._stored_layout
         return other
 
+    def with_gestures(self, gestures: GestureSet) -> Dataset:
+        """Return this data set with recordings named by a set of merged gestures; itself if none of them is merged."""
+        if not any(gesture.labels for gesture in gestures.gestures):
+            return self
+        names = {g.label: found.label for g in self.gestures.gestures if (found := gestures.find(g.label)) is not None}
+        others = tuple(g for g in self.gestures.gestures if g.label not in names)
+        head = replace(self.head, gestures=GestureSet(gestures.name, (*gestures.gestures, *others)))
+        recordings = [replace(r, gesture=names.get(r.gesture, r.gesture)) for r in self.recordings]
+        other = Dataset(self.path, head, recordings, self.streams, self.generation)
+        other._stored_layout = self._stored_layout
+        return other
+
     @property
     def layout(self) -> Layout:
         """The sensor layout of every recording."""

@@ -313,7 +313,7 @@ class _AnswerWork:
         from plushsense.training.fit import fit
 
         fold, withheld = task
-        dataset = _opened(self.dataset).with_inputs(self.layout)
+        dataset = _opened(self.dataset).with_inputs(self.layout).with_gestures(self.gestures)
         gestures = self.gestures.subset([g for g in self.gestures.labels if g != withheld])
         train, validation = (_without(shared.take(at), withheld) for at in (fold.train, fold.validation))
         arch = replace(self.arch, classes=len(gestures))

@@ -299,7 +299,7 @@ def adapt(
     with tempfile.TemporaryDirectory(prefix="plushsense-") as place:
         dataset = _dataset(recordings, given, Path(place))
         person = _person(dataset, subject)
-        dataset = dataset.with_inputs(given.layout)
+        dataset = dataset.with_inputs(given.layout).with_gestures(given.gestures)
         _same_layout(given, dataset)
         _warn_of_training(given, person, warn)
         own, left_out = _recordings_of(dataset, person, given, warn)

@@ -53,7 +53,7 @@ def training_windows(
         BundleError: if the training windows are missing, or cannot be distinguished from the validation windows.
     """
     refuse_undeployable(bundle.arch)
-    dataset = as_dataset(dataset).with_inputs(bundle.layout)
+    dataset = as_dataset(dataset).with_inputs(bundle.layout).with_gestures(bundle.gestures)
     origin = bundle.provenance
     if isinstance(origin.get("subjects"), int):
         raise BundleError(

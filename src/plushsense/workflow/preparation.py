@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.core.gestures import NOBODY, GestureSet, load_gestures
 from plushsense.dataset.importing.proposals import median_gesture_s
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
 from plushsense.evaluation.crossval import fold_windows
@@ -27,8 +27,16 @@ def silent(_: str) -> None:
 
 
 def network_inputs_of(dataset: Dataset, config: RunConfig) -> tuple[Dataset, RunConfig]:
-    """Return the data set with the inputs that the network of ``config`` reads, and the settings with that network."""
+    """Return the data set as the network of ``config`` reads it, and the settings with that network.
+
+    The data set has the inputs of the network and, if the classes are the file of a gesture set, its gestures.
+    """
     config = config.for_layout(dataset.layout)
+    chosen = config.evaluation.classes
+    if isinstance(chosen, str) and chosen.endswith(".toml"):
+        gestures = load_gestures(chosen)
+        dataset = dataset.with_gestures(gestures)
+        config = replace(config, evaluation=replace(config.evaluation, classes=gestures.labels))
     if config.model.arch is not None and parse_symbol(config.model.arch).vector is not None:
         dataset = dataset.with_inputs(dataset.layout.for_vectors())
     return dataset, config

@@ -225,7 +225,7 @@ def stream_eval(
     """
     bundle = model if isinstance(model, Bundle) else Bundle.load(Path(model))
     with streams_at(path, bundle) as dataset:
-        dataset = dataset.with_inputs(bundle.layout)
+        dataset = dataset.with_inputs(bundle.layout).with_gestures(bundle.gestures)
         if dataset.layout.inputs != bundle.layout.inputs:
             raise BundleError(
                 f"The model reads {', '.join(bundle.layout.inputs)}, and '{dataset.head.name}' has "

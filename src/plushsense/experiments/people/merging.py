@@ -1,0 +1,208 @@
+"""Propose merges of gestures that a network confuses, within one affect (paper, sections 4.3 and 4.4).
+
+The confusion is taken person by person, so that a few people with many windows do not decide, and nothing is trained:
+the probabilities of merged gestures are added. Merges that are chosen and scored on the same people look too good, so
+the scores are also given with the merges of each person chosen on all other people.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from plushsense.core.errors import BadInput, ConfigError
+from plushsense.core.files import write_file
+from plushsense.core.gestures import NOBODY, Gesture, GestureSet
+from plushsense.dataset.index import as_dataset
+from plushsense.dataset.store import Dataset
+from plushsense.evaluation.scores import Predictions, read_predictions
+from plushsense.scoring.metrics import column_metrics, confusion, summary
+from plushsense.workflow.reporting import PREDICTIONS, load_evaluation
+
+Groups = tuple[tuple[int, ...], ...]
+"""A partition of the classes."""
+
+Floats = NDArray[np.float64]
+
+
+def propose_merges(
+    dataset: Dataset | str | os.PathLike[str],
+    evaluation: str | os.PathLike[str],
+    *,
+    merges: int | None = None,
+    out: str | os.PathLike[str] | None = None,
+) -> dict[str, Any]:
+    """Merge the two groups of gestures that people's windows are most confused between, again and again.
+
+    Only gestures of one affect are merged, and never one that is recorded without a person or means that nothing
+    happens.
+
+    Args:
+        evaluation: a folder that `evaluate` wrote, of gestures of ``dataset``.
+        merges: how many merges the gesture set in ``out`` has.
+        out: a TOML file to write, for ``--classes`` of `train` and `evaluate`.
+
+    Returns:
+        ``steps``, one for each number of merges from 0: {merges, classes, merged (labels), confusion, people, largest,
+        scores, crossfitted}. ``confusion`` is the mean over people of the share of windows that the two groups of the
+        last merge exchanged, in ``people`` of them; ``largest`` the share of the most frequent class; ``scores`` and
+        ``crossfitted`` hold the summary of each metric over people, with merges chosen on all people and on the others.
+
+    Raises:
+        BadInput: for an evaluation of other gestures; ConfigError: for a number of merges that is not possible.
+    """
+    folder = Path(evaluation)
+    table, predictions = load_evaluation(folder), read_predictions(folder / PREDICTIONS)
+    gestures = _gestures_of(as_dataset(dataset), predictions.labels)
+    people = np.array(sorted(set(predictions.subject.tolist()) - {NOBODY}), dtype=np.str_)
+    if len(people) < 2:
+        raise BadInput(f"'{folder}' has one person, but merges are chosen by several: evaluate more people.")
+    counts = np.stack([_counts(predictions, predictions.subject == person) for person in people])
+    path = merge_path(counts, gestures)
+    # Without a person, another order of merges may follow, of another length.
+    others = [merge_path(np.delete(counts, i, axis=0), gestures) for i in range(len(people))]
+    steps = []
+    for number, (groups, exchanged, confused) in enumerate(path):
+        chosen = [other[min(number, len(other) - 1)][0] for other in others]
+        sizes = np.array([np.isin(predictions.truth, group).sum() for group in groups])
+        steps.append(
+            {
+                "merges": number,
+                "classes": len(groups),
+                "merged": [[predictions.labels[k] for k in group] for group in groups if len(group) > 1],
+                "confusion": exchanged,
+                "people": confused,
+                "largest": float(sizes.max() / sizes.sum()),
+                "scores": _scores(predictions, people, lambda _, groups=groups: groups),  # type: ignore[misc]
+                "crossfitted": _scores(predictions, people, lambda i, chosen=chosen: chosen[i]),  # type: ignore[misc]
+            }
+        )
+    result = {
+        "steps": steps,
+        "split": table["split"],
+        "leaky": table["leaky"],
+        "simulated": table["simulated"],
+        "people": len(people),
+        "gestures": None,
+    }
+    if out is not None:
+        if merges is None or not 0 < merges < len(path):
+            raise ConfigError(f"merges is {merges}: accepted are 1 to {len(path) - 1}, the steps that are possible.")
+        merged = merged_set(gestures, path[merges][0])
+        write_file(Path(out), tomli_w.dumps(_without_defaults(merged)))
+        result["gestures"] = str(out)
+    return result
+
+
+def merge_path(counts: NDArray[np.int64], gestures: GestureSet) -> list[tuple[Groups, float | None, int | None]]:
+    """Merge the most confused pair of groups until two are left, or none that may be merged and is confused.
+
+    Args:
+        counts: confusion matrices of the people, (people, K, K).
+
+    Returns:
+        the groups after 0, 1, 2, … merges, with the confusion of the last merge, and in how many people it occurs.
+    """
+    groups: Groups = tuple((k,) for k in range(len(gestures)))
+    path: list[tuple[Groups, float | None, int | None]] = [(groups, None, None)]
+    while len(groups) > 2:
+        best: tuple[float, int, int, int] | None = None
+        for a, b in combinations(range(len(groups)), 2):
+            if _may_merge([gestures.gestures[k] for k in (*groups[a], *groups[b])]):
+                exchanged = _exchanged(counts, groups[a], groups[b])
+                mean = float(exchanged.mean()) if len(exchanged) else 0.0
+                if mean > 0 and (best is None or mean > best[0]):
+                    best = (mean, int((exchanged > 0).sum()), a, b)
+        if best is None:
+            break
+        mean, people, a, b = best
+        joined = tuple(sorted((*groups[a], *groups[b])))
+        groups = tuple(sorted([g for i, g in enumerate(groups) if i not in (a, b)] + [joined]))
+        path.append((groups, mean, people))
+    return path
+
+
+def merged_set(gestures: GestureSet, groups: Groups) -> GestureSet:
+    """Return the gesture set in which the gestures of each group are one.
+
+    It has the label of their family if it is the whole family, otherwise the labels of its members joined by "+".
+    """
+    made = []
+    for group in groups:
+        members = [gestures.gestures[k] for k in group]
+        first = members[0]
+        if len(members) == 1:
+            made.append(first)
+            continue
+        family = {g.label for g in gestures.gestures if g.family == first.family}
+        whole = family == {g.label for g in members}
+        label = first.family if whole else " + ".join(g.label for g in members)
+        made.append(
+            Gesture(
+                label,
+                first.affect,
+                family=label,
+                energetic=all(g.energetic for g in members),
+                description="; ".join(g.description for g in members if g.description),
+                labels=tuple(name for g in members for name in (g.label, *g.labels) if name != label),
+            )
+        )
+    return GestureSet(f"{gestures.name}, {len(groups)} classes", tuple(made))
+
+
+def _gestures_of(dataset: Dataset, labels: Sequence[str]) -> GestureSet:
+    missing = [label for label in labels if dataset.gestures.find(label) is None]
+    if missing:
+        raise BadInput(
+            f"The evaluation has the gesture '{missing[0]}', which '{dataset.head.name}' has not: give the data set "
+            "that was evaluated."
+        )
+    return GestureSet(dataset.gestures.name, tuple(dataset.gestures.get(label) for label in labels))
+
+
+def _may_merge(members: Sequence[Gesture]) -> bool:
+    return len({g.affect for g in members}) == 1 and not any(g.nobody or g.idle or g.free_choice for g in members)
+
+
+def _exchanged(counts: NDArray[np.int64], a: Sequence[int], b: Sequence[int]) -> Floats:
+    """Return the mean share of windows of one group that are read as the other, of each person who made both."""
+    made_a, made_b = counts[:, a].sum(axis=(1, 2)), counts[:, b].sum(axis=(1, 2))
+    both = (made_a > 0) & (made_b > 0)
+    there = counts[both][:, a][:, :, b].sum(axis=(1, 2)) / made_a[both]
+    back = counts[both][:, b][:, :, a].sum(axis=(1, 2)) / made_b[both]
+    return np.asarray((there + back) / 2, dtype=np.float64)
+
+
+def _counts(predictions: Predictions, mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    return confusion(predictions.truth[mask], predictions.predicted[mask], len(predictions.labels))
+
+
+def _scores(predictions: Predictions, people: NDArray[np.str_], groups_of: Callable[[int], Groups]) -> dict[str, Any]:
+    """Return the summary over people of each metric, with the groups of each person."""
+    values: dict[str, list[float]] = {key: [] for key in column_metrics()}
+    for i, person in enumerate(people):
+        mine, groups = predictions.subject == person, groups_of(i)
+        member = np.zeros((len(predictions.labels), len(groups)))
+        for g, group in enumerate(groups):
+            member[list(group), g] = 1
+        read = (predictions.probabilities[mine] @ member).argmax(axis=1).astype(np.int64)
+        truth = member.argmax(axis=1)[predictions.truth[mine]].astype(np.int64)
+        for key, metric in column_metrics().items():
+            values[key].append(metric.function(confusion(truth, read, len(groups))))
+    return {key: summary(found) for key, found in values.items()}
+
+
+def _without_defaults(gestures: GestureSet) -> dict[str, Any]:
+    """Return the table of a TOML file, without the keys that have their defaults."""
+    table = gestures.to_dict()
+    plain = vars(replace(Gesture("x"), family=""))
+    rows = [{k: v for k, v in g.items() if k == "label" or v != plain[k]} for g in table["gestures"]]
+    return {"name": table["name"], "gestures": rows}
