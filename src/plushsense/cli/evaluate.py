@@ -1,4 +1,4 @@
-"""Implement ``plushsense evaluate DATASET --split leave-one-subject-out|by-subject:5|by-recording:5|windows:5``."""
+"""Implement ``plushsense evaluate DATASET --split …``, ``report OUT.html --dataset DS`` and ``report SWEEP``."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 from plushsense.cli.output import emit, figure, say, spread, table, warn
 from plushsense.cli.settings import marks, report_jobs, settings
+from plushsense.core.errors import ConfigError
 from plushsense.workflow.reporting import name_of
 
 
@@ -84,3 +85,34 @@ def deployed(e: dict[str, Any]) -> list[str]:
         *(f"{name + ' lost':<20}{spread(e['loss'][key])}" for key, name in reversed(names.items())),
         f"float and 8 bits agree on {100 * (e['agreement'] or 0):.1f} % of the windows",
     ]
+
+
+def run_report(args: argparse.Namespace) -> int:
+    from plushsense.experiments.sweep.report import is_sweep
+    from plushsense.workflow.reporting import write_report
+
+    if is_sweep(args.out):
+        return _sweep_report(args)
+    if args.dataset is None or args.page or args.mlflow:
+        problem = "--dataset is missing" if args.dataset is None else "--page and --mlflow are for a sweep"
+        raise ConfigError(
+            f"'{args.out}' is not a folder written by sweep, and {problem}: give a sweep's folder, or  "
+            "plushsense report OUT.html --dataset DATASET"
+        )
+    folder = Path(args.dataset) / "evaluations"
+    evaluations = args.evaluation or [str(p.parent) for p in sorted(folder.glob("*/evaluation.json"))]
+    path = write_report(args.out, args.dataset, evaluations, args.model, args.title)
+    emit(args, {"report": str(path), "evaluations": len(evaluations), "models": len(args.model)}, str(path))
+    return 0
+
+
+def _sweep_report(args: argparse.Namespace) -> int:
+    from plushsense.experiments.sweep.report import write_sweep_report
+
+    if args.dataset or args.evaluation or args.model:
+        raise ConfigError(
+            f"'{args.out}' is a sweep: --dataset, --evaluation and --model are for a page of evaluations."
+        )
+    done = write_sweep_report(args.out, args.page, title=args.title, mlflow=args.mlflow)
+    emit(args, done, [f"{done['report']}: {done['done']} of {done['trials']} trials", *done["said"]])
+    return 0
