@@ -22,6 +22,8 @@ _QUANTILES = 16
 # Two windows are compared sample by sample if their sorted values differ by less than this share of the variation:
 # without a shift, they differ no more than the windows do.
 _SIMILAR = 0.3
+# Windows in which fewer samples differ from the one before are not judged: two people press a switch alike.
+_CHANGING = 0.25
 _LISTED = 10
 _BLOCK = 256
 
@@ -39,8 +41,8 @@ Mask = NDArray[np.bool_]
 def audit_leakage(train: WindowSet, score: WindowSet, folds: Sequence[Fold]) -> dict[str, Any]:
     """Count the scored windows of all folds that have something in common with the windows trained on in their fold.
 
-    Validation windows count as trained on. Nobody (recordings at rest) is no person. Windows without variation are
-    neither copies nor near-duplicates: a toy at rest is equal to itself.
+    Validation windows count as trained on. Nobody (recordings at rest) is no person. Windows that rarely change are
+    neither copies nor near-duplicates: a toy at rest is equal to itself, and so are presses of a switch.
 
     Args:
         train, score: the windows that the indices of ``folds`` refer to.
@@ -112,6 +114,7 @@ class _Signatures:
         self._shift = min(round(SHIFT_S * score.rate_hz), score.x.shape[2] // 4)
         self._of_train = _sorted_values(train, scale)
         self._of_score = self._of_train if score is train else _sorted_values(score, scale)
+        self._changes = np.array([(x[:, 1:] != x[:, :-1]).any(axis=0).mean() for x in score.x])
 
     @classmethod
     def of(cls, train: WindowSet, score: WindowSet) -> _Signatures:
@@ -136,11 +139,11 @@ class _Signatures:
         return copies, near, twins
 
     def _similar(self, test: Index, known: Index) -> Mask:
-        """Return for which pairs (n,) of windows with variation the sorted values differ by less than `_SIMILAR`."""
+        """Return for which pairs (n,) of windows that change the sorted values differ by less than `_SIMILAR`."""
         x, y = self._of_score[test], self._of_train[known]
         variation = x.reshape(len(x), -1, _QUANTILES).var(axis=2).sum(axis=1)
         error = np.square(x - y).reshape(len(x), -1, _QUANTILES).mean(axis=2).sum(axis=1)
-        similar: Mask = (variation > 0) & (error < _SIMILAR**2 * variation)
+        similar: Mask = (self._changes[test] >= _CHANGING) & (error < _SIMILAR**2 * variation)
         return similar
 
     def _scaled(self, windows: WindowSet, index: Index) -> NDArray[np.float32]:
