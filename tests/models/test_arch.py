@@ -20,11 +20,13 @@ from plushsense.models.arch import (
     PAPER_FILTERS,
     TABLE3,
     TABLE3_MISPRINT,
+    VECTOR_SYMBOL,
     Arch,
     ConvLayer,
     parse_filters,
     parse_symbol,
     reflected,
+    symbol_at_rate,
 )
 
 CELLS = [
@@ -210,3 +212,13 @@ def test_from_dict_refuses_what_is_incomplete(table: dict[str, object]) -> None:
 def test_reflection_is_numpys(length: int, left: int) -> None:
     expected = np.pad(np.arange(length), (left, 0), mode="reflect")
     assert reflected(length, left).tolist() == expected.tolist()
+
+
+def test_default_kernels_last_as_long_at_other_rates() -> None:
+    assert symbol_at_rate(DEFAULT_SYMBOL, 100) == symbol_at_rate(DEFAULT_SYMBOL, 90) == DEFAULT_SYMBOL
+    assert symbol_at_rate(VECTOR_SYMBOL, 25) == "v4_9d1_19d1"
+    assert symbol_at_rate("14d1_19d2_19d4", 200) == "14d2_19d4_19d8"
+    for rate in (10, 20, 25, 50, 60, 200, 1000):
+        arch = Arch.parse(symbol_at_rate(DEFAULT_SYMBOL, rate), (8, 12, 16), window=round(2.5 * rate))
+        assert 1.0 <= arch.receptive_field / rate <= 1.35 and arch.span <= 2.5 * rate
+        assert arch.parameters <= Arch.parse(DEFAULT_SYMBOL, (8, 12, 16)).parameters

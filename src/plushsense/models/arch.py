@@ -65,6 +65,23 @@ def parse_symbol(spec: str) -> Symbol:
         at += 1
 
 
+def symbol_at_rate(spec: str, rate_hz: float) -> str:
+    """Return a symbol made for 100 Hz with kernels that last as long at another rate; itself from 67 to 150 Hz.
+
+    Dilations follow the rate as far as whole numbers can; then kernels become shorter, never longer.
+    """
+    if 2 / 3 <= (factor := rate_hz / DEFAULT_RATE_HZ) <= 1.5:
+        return spec
+    symbol = parse_symbol(spec)
+
+    def scaled(kernel: int, dilation: int) -> tuple[int, int]:
+        spacing = max(1, round(dilation * factor))
+        return max(2, min(kernel, 1 + round((kernel - 1) * dilation * factor / spacing))), spacing
+
+    vector = [] if symbol.vector is None else [f"{VECTOR}{scaled(symbol.vector, 1)[0]}"]
+    return "_".join([*vector, *("{}d{}".format(*scaled(*layer)) for layer in symbol.layers)])
+
+
 def parse_filters(text: str) -> tuple[int, ...]:
     """Return the filter counts of ``"8,12,16"``; raise ArchError for anything but whole numbers from 1."""
     counts: list[int] = []
@@ -120,7 +137,8 @@ PADDINGS: tuple[str, ...] = get_args(Padding)
 NORMS: tuple[str, ...] = get_args(Norm)
 
 NORM_EPSILON = 1e-5
-DEFAULT_SYMBOL = "14d1_19d2_19d4"
+DEFAULT_SYMBOL = "14d1_19d2_19d4"  # at DEFAULT_RATE_HZ
+DEFAULT_RATE_HZ = 100.0
 DEFAULT_FILTERS = (8, 12, 16)
 VECTOR = "v"  # before the kernel length of a vector layer
 VECTOR_SYMBOL = "v14_17d2_19d4"

@@ -29,6 +29,7 @@ from plushsense.models.arch import (
     Arch,
     parse_filters,
     parse_symbol,
+    symbol_at_rate,
 )
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import parse_split
@@ -148,11 +149,14 @@ class RunConfig:
 
         With the preset ``people`` and a layout of vectors alone, one of them an acceleration, that is a network with a
         vector layer. Beside other sensors it was no better (on the virtual toy; no real recordings were at hand).
+        Kernels of default networks that stream last as long at any rate.
         """
         axes = {axis for vector in layout.vectors for axis in vector}
         turns = layout.has_gravity and set(layout.inputs) <= axes
         fits = self.preset == "people" and self.padding == "stream"
         arch = self.model.arch or (VECTOR_SYMBOL if turns and fits else DEFAULT_SYMBOL)
+        if self.model.arch is None and self.padding == "stream":
+            arch = symbol_at_rate(arch, layout.rate_hz)
         model = replace(self.model, arch=arch, filters=self.model.filters or default_filters(arch))
         training = self.training
         if parse_symbol(arch).vector is not None and training.augment == PRESETS["people"].augment:
