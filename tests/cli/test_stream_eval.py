@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.streams.run import streams_at, trained_people
+from plushsense.experiments.streams.run import streams_at
 from plushsense.experiments.streams.systems import SYSTEMS
-from plushsense.models.bundle import Bundle
+from plushsense.models.bundle import Bundle, trained_people
 
 Cli = Callable[..., Any]
 

@@ -25,7 +25,7 @@ from plushsense.core.errors import BadInput, BundleError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
-from plushsense.dataset.store import UNKNOWN_SUBJECT
+from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.models.arch import Arch
 from plushsense.models.reference import Network, check_weights
 from plushsense.windows.features import Scaler
@@ -223,6 +223,18 @@ def known_people(provenance: Mapping[str, Any]) -> set[str]:
     listed = [provenance.get(key) for key in _PEOPLE]
     codes = {str(code) for each in listed if isinstance(each, list | tuple) for code in each}
     return codes - {NOBODY, UNKNOWN_SUBJECT}
+
+
+def trained_people(bundle: Bundle, dataset: Dataset) -> set[str]:
+    """Return the people of a data set on whom a bundle was trained or tuned, or to whom it was adapted.
+
+    If the bundle comes from a data set of another name and other content, equal codes stand for other people. The
+    person that it was adapted to is always included, because the bundle does not name that person's data set.
+    """
+    origin = bundle.provenance
+    same = origin.get("dataset") in (None, dataset.head.name) or origin.get("dataset_hash") == dataset.hash
+    adapted = set() if bundle.adapted_to is None else {bundle.adapted_to}
+    return adapted | (known_people(origin) if same else set())
 
 
 def _without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:

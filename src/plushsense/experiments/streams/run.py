@@ -38,7 +38,7 @@ from plushsense.experiments.streams.systems import ANYWHERE, SYSTEMS, WINDOWS
 from plushsense.jobs.journal import job_id
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
-from plushsense.models.bundle import Bundle, known_people
+from plushsense.models.bundle import Bundle, known_people, trained_people
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.events import LATE_S
 from plushsense.training.spec import TrainSpec
@@ -280,18 +280,6 @@ def stream_eval(
             "late_s": late_s,
             "note": describe_false_events(dataset),
         }
-
-
-def trained_people(bundle: Bundle, dataset: Dataset) -> set[str]:
-    """Return the people of a data set on whom a bundle was trained or tuned, or to whom it was adapted.
-
-    If the bundle comes from a data set of another name and other content, equal codes stand for other people. The
-    person that it was adapted to is always included, because the bundle does not name that person's data set.
-    """
-    origin = bundle.provenance
-    same = origin.get("dataset") in (None, dataset.head.name) or origin.get("dataset_hash") == dataset.hash
-    adapted = set() if bundle.adapted_to is None else {bundle.adapted_to}
-    return adapted | (known_people(origin) if same else set())
 
 
 def stream_benchmark(

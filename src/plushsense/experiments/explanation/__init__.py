@@ -1,0 +1,1 @@
+"""Which channels and moments decided: occlusion of a network's inputs, checked by deletion."""
