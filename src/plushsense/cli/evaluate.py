@@ -1,4 +1,4 @@
-"""Implement ``plushsense evaluate DATASET --split …``, ``report OUT.html --dataset DS`` and ``report SWEEP``."""
+"""Implement ``plushsense evaluate``, ``baselines`` and ``report``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.cli.output import emit, figure, say, spread, table, warn
-from plushsense.cli.settings import marks, report_jobs, settings
+from plushsense.cli.settings import listed, marks, report_jobs, settings
 from plushsense.core.errors import ConfigError
 from plushsense.workflow.reporting import name_of
 
@@ -64,7 +64,8 @@ def lines(e: dict[str, Any]) -> list[str]:
     out.append(f"vote by recording, pooled: {', '.join(f'{name} {figure(voted[k])}' for k, name in names.items())}")
     for kind, part in e["by_context"].items():
         out.append(f"  on {kind} windows: accuracy {figure(part['accuracy'])} ({part['windows']} windows)")
-    out.append(describe_leakage(e["leakage"]))
+    if "leakage" in e:
+        out.append(describe_leakage(e["leakage"]))
     return out + (deployed(e["int8"]) if "int8" in e else [])
 
 
@@ -116,3 +117,47 @@ def _sweep_report(args: argparse.Namespace) -> int:
     done = write_sweep_report(args.out, args.page, title=args.title, mlflow=args.mlflow)
     emit(args, done, [f"{done['report']}: {done['done']} of {done['trials']} trials", *done["said"]])
     return 0
+
+
+def run_baselines(args: argparse.Namespace) -> int:
+    from plushsense.dataset.index import open_dataset
+    from plushsense.experiments.baselines.run import PAGE, baselines, comparison_id
+
+    config = settings(args, workers=args.workers)
+    dataset = open_dataset(args.dataset)
+    choice: dict[str, Any] = {"splits": listed(args.split), "pca": args.pca}
+    choice |= {"models": listed(args.models), "features": listed(args.features)}
+    name = f"baselines_{comparison_id(dataset, config, **choice)[:8]}"
+    out = Path(args.out) if args.out else dataset.path / "evaluations" / name
+    result = baselines(
+        dataset,
+        config,
+        **choice,
+        out=out,
+        overwrite=args.force,
+        cluster=args.cluster,
+        progress=report_jobs("comparing", "fits"),
+        warn=warn,
+    )
+    result |= {"out": str(out), "report": str(out / PAGE)}
+    say(f"written: {out}")
+    emit(args, result, _baseline_lines(result))
+    return 0
+
+
+def _baseline_lines(result: dict[str, Any]) -> list[str]:
+    """Format the comparison as text: a table with one line per model, with explanations."""
+    from plushsense.experiments.baselines.report import (
+        COUNTS,
+        LEAKY,
+        SIMULATION,
+        describe_costs,
+        describe_data,
+        program_table,
+    )
+
+    out = [SIMULATION, ""] if result["simulated"] else []
+    out += [describe_data(result), "", program_table(result).text(), "", describe_costs(result)]
+    if any(split["leaky"] for split in result["splits"]):
+        out += ["", COUNTS if result["gaps"] else LEAKY]
+    return out

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.layouts import GRAVITY_FRACTION_BITS, MAGNITUDE_FRACTION_BITS, Layout
-from plushsense.experiments.explanation.occlusion import Blocks, ExplainedGesture
+from plushsense.experiments.people.occlusion import Blocks, ExplainedGesture
 from plushsense.reports.figures import data_uri, new_figure
 from plushsense.reports.page import render_page
 from plushsense.reports.table import Column, Table, number, percent

@@ -17,8 +17,8 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.version import __version__
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.explanation.occlusion import BLOCK_S, Blocks, ExplainedGesture, explain_gesture
-from plushsense.experiments.explanation.report import explanation_page
+from plushsense.experiments.people.explanation_report import explanation_page
+from plushsense.experiments.people.occlusion import BLOCK_S, Blocks, ExplainedGesture, explain_gesture
 from plushsense.jobs.journal import job_id
 from plushsense.models.bundle import Bundle, known_people, trained_people
 from plushsense.windows.cut import WindowSet, whole_gestures
@@ -69,7 +69,7 @@ def explain(
         DatasetError: if no window is read correctly.
     """
     bundle = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
-    dataset = as_dataset(dataset).with_inputs(bundle.layout)
+    dataset = as_dataset(dataset).with_inputs(bundle.layout).with_gestures(bundle.gestures)
     chosen = _chosen_gestures(bundle, dataset, gestures, warn)
     identity = explain_id(bundle, dataset, gestures)
     if out is not None:

@@ -14,7 +14,7 @@ import pytest
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.explanation.occlusion import Blocks, attributions, explain_gesture, quiet_windows
+from plushsense.experiments.people.occlusion import Blocks, attributions, explain_gesture, quiet_windows
 from plushsense.models.arch import Arch, ConvLayer
 from plushsense.models.bundle import Bundle, trained_people
 from plushsense.windows.features import Scaler

@@ -1,1 +1,0 @@
-"""Which channels and moments decided: occlusion of a network's inputs, checked by deletion."""
