@@ -33,7 +33,7 @@ import polars
 from numpy.typing import NDArray
 
 import plushsense as ps
-from plushsense.cli.search import report_search
+from plushsense.cli.sweep import report_search
 from plushsense.core.errors import PlushSenseError
 from plushsense.experiments.search.halving import Costs, Rung, Scores, SearchSpec, halving
 from plushsense.experiments.search.run import prepare, search
