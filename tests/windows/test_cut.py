@@ -106,6 +106,10 @@ def test_shared_gestures_and_why_not_the_others(dataset: Dataset) -> None:
         "Custom": "free choice: everybody did something else",
         "Shake": "made by 1 of 2 people",
     }
+    maker = next(r.subject for r in dataset.recordings if r.gesture == "Shake")
+    others = [r.id for r in dataset.recordings if r.subject != maker]
+    append_marks(dataset.path, [Mark(recording, "exclude", "test", "not of this study") for recording in others])
+    assert "Shake" in shared_gestures(open_dataset(dataset.path))[0].labels, "who is excluded does not count"
 
 
 def test_bad_settings_are_refused(dataset: Dataset) -> None:

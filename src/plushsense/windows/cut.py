@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
-from plushsense.core.gestures import GestureSet
+from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, usual_rows
-from plushsense.dataset.store import RECORDINGS, Dataset, Progress, RecordingInfo
+from plushsense.dataset.store import RECORDINGS, UNKNOWN_SUBJECT, Dataset, Progress, RecordingInfo
 from plushsense.windows.clock import Segment, resample
 from plushsense.windows.features import network_inputs
 
@@ -283,7 +283,8 @@ def shared_gestures(dataset: Dataset, share: float = 0.9) -> tuple[GestureSet, d
     Included are gestures that at least ``share`` of the people made, and those that are recorded without a person;
     never gestures of free choice.
     """
-    people = dataset.subjects
+    # People whose recordings are all excluded do not count.
+    people = {r.subject for r in dataset.used} - {NOBODY, UNKNOWN_SUBJECT}
     shared, left_out = [], {}
     for gesture in dataset.gestures.gestures:
         made = {r.subject for r in dataset.used if r.gesture == gesture.label}
@@ -291,8 +292,8 @@ def shared_gestures(dataset: Dataset, share: float = 0.9) -> tuple[GestureSet, d
             left_out[gesture.label] = "free choice: everybody did something else"
         elif not made:
             left_out[gesture.label] = "no recording"
-        elif gesture.nobody or len(made & set(people)) >= share * len(people):
+        elif gesture.nobody or len(made & people) >= share * len(people):
             shared.append(gesture.label)
         else:
-            left_out[gesture.label] = f"made by {len(made & set(people))} of {len(people)} people"
+            left_out[gesture.label] = f"made by {len(made & people)} of {len(people)} people"
     return dataset.gestures.subset(shared), left_out
