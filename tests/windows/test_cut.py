@@ -8,6 +8,8 @@ from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
 from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.index import open_dataset
+from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.store import Dataset
 from plushsense.windows.cut import WindowSpec, cut_windows, shared_gestures
 
@@ -85,8 +87,6 @@ def test_a_longer_span_reaches_further_back(dataset: Dataset) -> None:
 
 
 def test_trimmed_and_excluded_recordings(dataset: Dataset) -> None:
-    from plushsense.dataset.index import open_dataset
-    from plushsense.dataset.marks import Mark, append_marks
 
     wave = next(r for r in dataset.recordings if r.gesture == "Wave" and r.rows == 120)
     long = next(r for r in dataset.recordings if r.rows == 410)
