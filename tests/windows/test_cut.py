@@ -87,7 +87,6 @@ def test_a_longer_span_reaches_further_back(dataset: Dataset) -> None:
 
 
 def test_trimmed_and_excluded_recordings(dataset: Dataset) -> None:
-
     wave = next(r for r in dataset.recordings if r.gesture == "Wave" and r.rows == 120)
     long = next(r for r in dataset.recordings if r.rows == 410)
     append_marks(
