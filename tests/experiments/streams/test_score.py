@@ -23,6 +23,8 @@ from plushsense.experiments.streams.replay import (
     StreamTrace,
     StreamTruth,
     count_events,
+    model_events,
+    people_scores,
     people_with_streams,
     rate,
     read_streams,
@@ -36,7 +38,6 @@ from plushsense.experiments.streams.score import (
     crossvalidated_streams,
     people_folds,
     pooled_scores,
-    scored_people,
     summed,
 )
 from plushsense.experiments.streams.systems import (
@@ -168,7 +169,18 @@ def steps(*pieces: tuple[int, int]) -> np.ndarray:
 def stream_trace(truth: StreamTruth, *pieces: tuple[int, int]) -> StreamTrace:
     trace = made_trace([steps(*pieces)])
     hours = trace.seconds / 3600
-    return StreamTrace(truth, TraceReplayer(trace), hours, hours / 2, 2.0 / 3600)
+    truth = replace(truth, hours=hours, free_hours=hours / 2, rest_hours=2.0 / 3600)
+    return StreamTrace(truth, TraceReplayer(trace))
+
+
+def truth_with(
+    truths: tuple[Interval, ...],
+    rest: tuple[tuple[float, float], ...] = (),
+    other: tuple[tuple[float, float], ...] = (),
+    doubtful: tuple[tuple[float, float], ...] = (),
+    hours: float = 1.0,
+) -> StreamTruth:
+    return StreamTruth("P1/s", "P1", False, truths, rest, other, doubtful, 3600 * hours, hours, 0.8 * hours, 0.0)
 
 
 def when(step: int) -> float:
@@ -177,10 +189,7 @@ def when(step: int) -> float:
 
 
 def test_every_count_of_one_stream_by_hand() -> None:
-    truth = StreamTruth(
-        "P1/s",
-        "P1",
-        False,
+    truth = truth_with(
         (
             Interval(when(10), when(30), "Hug"),
             Interval(when(60), when(80), "Hit"),
@@ -206,28 +215,28 @@ def test_every_count_of_one_stream_by_hand() -> None:
     assert found.total("affect").hits == 1 and found.total("anything").hits == 2
     assert found.levels["family"]["Hold"].truths == 2
     shown = found.to_dict()
-    assert shown["false_events_per_hour"] == pytest.approx(4 / h.hours)
-    assert shown["outside_per_uncovered_hour"] == pytest.approx(3 / h.free_hours)
-    assert shown["at_rest_per_hour"] == pytest.approx(1 / h.rest_hours)
+    assert shown["false_events_per_hour"] == pytest.approx(4 / h.truth.hours)
+    assert shown["outside_per_uncovered_hour"] == pytest.approx(3 / h.truth.free_hours)
+    assert shown["at_rest_per_hour"] == pytest.approx(1 / h.truth.rest_hours)
     assert StreamScore.from_journal(found.to_journal()).to_dict() == shown
     n = count_events([h], argmax_spec())
     assert (n.hits, n.truths, n.insertions) == (1, 3, 4) and n.f1 == pytest.approx(gesture.f1)
 
 
 def test_a_gate_is_heard_at_once_and_named_by_the_network() -> None:
-    truth = StreamTruth("s", "P1", False, (Interval(0.30, 1.5, "Hit"),), (), (), ())
+    truth = truth_with((Interval(0.30, 1.5, "Hit"),))
     inputs = np.zeros((400, 3), dtype=np.int64)
     inputs[::2] = 1
     inputs[32:60] = 4000 * np.tile([[1], [1], [-1], [-1]], (7, 1))
     trace = made_trace([steps((REST, 20), (HIT, 10), (REST, 30))], inputs)
     settings = replace(GATE, rules=(replace(GATE.rules[0], gesture=255),))
     spec = replace(argmax_spec(), enter=0.9, end_s=0.2, wait_s=2.0, gate=settings)
-    found = score(StreamTrace(truth, TraceReplayer(trace), 1.0, 1.0, 0.0), spec)
+    found = score(StreamTrace(truth, TraceReplayer(trace)), spec)
     affect, gesture = found.total("affect"), found.total()
     assert found.gate_events == 1 and affect.hits == gesture.hits == 1
     assert affect.latencies[0] < 0.1
     assert gesture.latencies[0] == pytest.approx(when(20) - 0.30)
-    without = score(StreamTrace(truth, TraceReplayer(trace), 1.0, 1.0, 0.0), replace(spec, gate=GateSettings()))
+    without = score(StreamTrace(truth, TraceReplayer(trace)), replace(spec, gate=GateSettings()))
     assert without.total("affect").latencies[0] == pytest.approx(when(20) - 0.30)
 
 
@@ -238,7 +247,7 @@ def test_the_quick_counts_are_those_of_the_whole_score(seed: int) -> None:
     starts = np.sort(draw.uniform(0, 20, 8))
     labels = draw.choice(["Hug", "Squeeze", "Hit"], 8)
     truths = tuple(Interval(float(s), float(s + 1), str(k)) for s, k in zip(starts, labels, strict=True))
-    h = StreamTrace(StreamTruth("s", "P1", False, truths, (), (), ((3.0, 4.0),)), TraceReplayer(trace), 0.5, 0.4, 0.0)
+    h = StreamTrace(truth_with(truths, doubtful=((3.0, 4.0),), hours=0.5), TraceReplayer(trace))
     for spec in (argmax_spec(), argmax_spec(0.3), DecideSpec(enter=0.5), DecideSpec(gate=GATE)):
         n, whole = count_events([h], spec), score(h, spec).total()
         assert (n.hits, n.truths, n.matched, n.insertions) == (
@@ -250,7 +259,7 @@ def test_settings_are_chosen_on_those_who_tune() -> None:
     truths = tuple(Interval(when(20 + 60 * n), when(40 + 60 * n), "Hug") for n in range(3))
     # Each hug is preceded by a short false blow, which a least duration would swallow.
     pieces = [p for _ in range(3) for p in ((REST, 8), (HIT, 2), (REST, 12), (HUG, 18), (REST, 20))]
-    tuning = [stream_trace(StreamTruth("s", "P1", False, truths, (), (), ()), *pieces)]
+    tuning = [stream_trace(truth_with(truths), *pieces)]
     points = searched(tuning, SYSTEMS["hysteresis"])
     best = fewest(points, 1.0)
     assert (best.recall, best.false_per_hour) == (1.0, 0.0)
@@ -260,7 +269,7 @@ def test_settings_are_chosen_on_those_who_tune() -> None:
     with_gate = [replace(p.spec, gate=GateSettings(), wait_s=1.0) for p in gated(tuning, points, GATE)]
     assert all(replace(p.spec, wait_s=1.0) in with_gate for p in best_of(points))
     plain = tried(tuning, [argmax_spec()])[0]
-    assert plain.recall == 1.0 and plain.false_per_hour == pytest.approx(rate(3, tuning[0].hours))
+    assert plain.recall == 1.0 and plain.false_per_hour == pytest.approx(rate(3, tuning[0].truth.hours))
     several = [TunedPoint(argmax_spec(), r, f, 0.0) for r, f in ((0.5, 4.0), (0.8, 9.0), (0.8, 8.0), (0.6, 10.0))]
     assert best_of(several) == [several[0], several[2]]
     assert fewest(several, 0.55) == several[2] and fewest(several, 0.9) == several[2]
@@ -318,9 +327,14 @@ def test_truth_lies_where_it_was_recorded(dataset: Dataset) -> None:
 
 def test_time_that_was_heard_and_time_without_truth(dataset: Dataset) -> None:
     (h,) = read_streams(dataset, bundle(), ["P1"])
-    assert 3600 * h.hours == pytest.approx(16.0, abs=0.1)
-    assert 3600 * h.free_hours == pytest.approx(16.0 - 1.49 - 0.59, abs=0.1)
-    assert 3600 * h.rest_hours == pytest.approx(0.99, abs=0.05)
+    truth = h.truth
+    # They are those that the model reads, but need no model.
+    parts = h.replayer.trace.parts
+    assert 3600e6 * truth.hours == pytest.approx(sum(p.ends_us - p.start_us for p in parts)) and len(parts) == 2
+    assert 3600 * truth.hours == pytest.approx(16.0, abs=0.1)
+    assert 3600 * truth.free_hours == pytest.approx(16.0 - 1.49 - 0.59, abs=0.1)
+    assert 3600 * truth.rest_hours == pytest.approx(0.99, abs=0.05)
+    assert truth.stop_s == pytest.approx(16.0, abs=0.02)
 
 
 @dataclass(frozen=True)
@@ -368,7 +382,7 @@ def test_folds_keep_people_apart_and_are_resumed(dataset: Dataset, tmp_path: Pat
     assert plain["truths"] == 12 and plain["hits"] + plain["deletions"] == 12
     assert [p["subject"] for p in plain["people"]] == sorted(tested)
     assert sum(p["truths"] for p in plain["people"]) == 12
-    alone = pooled_scores(scored_people(dataset, bundle(), tested, argmax_spec(0.0)))
+    alone = pooled_scores(people_scores(model_events(dataset, bundle(), tested, argmax_spec(0.0)), GESTURES))
     for name in ("events", "hits", "insertions", "fragmentations", "merges", "latency_s", "cost_per_truth"):
         assert alone[name] == plain[name], name
     assert table["reference"] is None and table["at_recall"] == []

@@ -1,8 +1,12 @@
-"""Read streams once with a model, and score any decision settings on the stored outputs against the true gestures."""
+"""The true gestures of whole streams, and scores of events against them.
+
+The truth of a stream does not depend on a model. Streams are read once with a model, whose stored outputs then give the
+events of any decision settings.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,7 +34,7 @@ from plushsense.scoring.events import (
     tally,
     uncovered_s,
 )
-from plushsense.windows.clock import row_times_us
+from plushsense.windows.clock import resample, row_times_us
 from plushsense.windows.cut import recordings_in_time
 
 Stretch = tuple[float, float]
@@ -38,11 +42,13 @@ Stretch = tuple[float, float]
 
 @dataclass(frozen=True)
 class StreamTruth:
-    """The true intervals of one stream.
+    """The true intervals of one stream, in seconds since its first frame, and its length.
 
-    ``truths`` are gestures that the model has as classes, ``rest`` idle ones, ``other`` gestures that are not among its
-    classes. ``doubtful`` are excluded recordings and those not stopped in time; events there are not counted.
-    ``labelled`` tells whether every sample of the stream has a label.
+    ``truths`` are gestures that are classes, ``rest`` idle ones, ``other`` gestures that are not among the classes.
+    ``doubtful`` are excluded recordings and those not stopped in time; events there are not counted. ``labelled`` tells
+    whether every sample of the stream has a label. ``stop_s`` is the time of the last frame. ``hours`` are those
+    without gaps and doubtful stretches, ``free_hours`` without true gestures as well, and ``rest_hours`` those in
+    recordings at rest.
     """
 
     stream: str
@@ -52,10 +58,14 @@ class StreamTruth:
     rest: tuple[Stretch, ...]
     other: tuple[Stretch, ...]
     doubtful: tuple[Stretch, ...]
+    stop_s: float
+    hours: float
+    free_hours: float
+    rest_hours: float
 
 
 def truth_of(dataset: Dataset, stream: StreamInfo, frames: Frames, gestures: GestureSet) -> StreamTruth:
-    """Return the true intervals of ``stream``, whose rows are ``frames``, with the labels of a model's ``gestures``."""
+    """Return the true intervals of ``stream``, whose rows are ``frames``; ``gestures`` are the classes."""
     in_time = {r.id for r in recordings_in_time(dataset.used)}
     times = row_times_us(frames, dataset.layout.period_us) / 1e6
     truths: list[Interval] = []
@@ -78,8 +88,20 @@ def truth_of(dataset: Dataset, stream: StreamInfo, frames: Frames, gestures: Ges
             rest.append(stretch)
         else:
             truths.append(Interval(*stretch, gesture.label))
+    parts = [(float(times[s.first_row]), float(times[s.last_row - 1])) for s in resample(frames, dataset.layout)]
+    seconds = uncovered_s(parts, [])
     return StreamTruth(
-        stream.id, stream.subject, dataset.layout.is_labelled, tuple(truths), tuple(rest), tuple(other), tuple(doubtful)
+        stream.id,
+        stream.subject,
+        dataset.layout.is_labelled,
+        tuple(truths),
+        tuple(rest),
+        tuple(other),
+        tuple(doubtful),
+        stop_s=float(times[-1]) if len(times) else 0.0,
+        hours=uncovered_s(parts, doubtful) / 3600,
+        free_hours=uncovered_s(parts, [*((t.start_s, t.stop_s) for t in truths), *doubtful]) / 3600,
+        rest_hours=(seconds - uncovered_s(parts, rest)) / 3600,
     )
 
 
@@ -87,6 +109,11 @@ def located(dataset: Dataset, stream: StreamInfo) -> list[RecordingInfo]:
     """Return the recordings that lie in a stream, ordered by position."""
     mine = [r for r in dataset.recordings if r.stream == stream.id and r.stream_row >= 0]
     return sorted(mine, key=lambda r: r.stream_row)
+
+
+def scored_streams(dataset: Dataset, subjects: Iterable[str]) -> list[StreamInfo]:
+    """Return the streams of ``subjects`` that have a recording in them, person by person."""
+    return [s for person in subjects for s in dataset.streams if s.subject == person and located(dataset, s)]
 
 
 def people_with_streams(dataset: Dataset) -> list[str]:
@@ -102,33 +129,32 @@ PLACES = ("rest", "other", "unmarked")
 
 @dataclass(frozen=True, eq=False)
 class StreamTrace:
-    """One stream with its truth, and its length: ``hours`` without doubtful stretches, ``free_hours`` without true
-    gestures as well, and ``rest_hours`` in recordings at rest.
-    """
+    """One stream with its truth and the stored outputs of a model."""
 
     truth: StreamTruth
     replayer: TraceReplayer
-    hours: float
-    free_hours: float
-    rest_hours: float
 
 
 def read_streams(dataset: Dataset, model: Bundle | IntegerModel, subjects: Sequence[str]) -> list[StreamTrace]:
     """Run the model once over every stream of ``subjects`` that has a recording in it."""
     traces = []
-    for stream in dataset.streams:
-        if stream.subject not in subjects or not located(dataset, stream):
-            continue
+    for stream in scored_streams(dataset, subjects):
         frames = dataset.read_stream(stream.id)
-        trace = trace_of(frames, model)
         truth = truth_of(dataset, stream, frames, model.gestures)
-        parts = [(p.start_us / 1e6, p.ends_us / 1e6) for p in trace.parts]
-        marked = [(t.start_s, t.stop_s) for t in truth.truths]
-        left = uncovered_s(parts, truth.doubtful)
-        free = uncovered_s(parts, [*marked, *truth.doubtful])
-        rest = uncovered_s(parts, []) - uncovered_s(parts, truth.rest)
-        traces.append(StreamTrace(truth, TraceReplayer(trace), left / 3600, free / 3600, rest / 3600))
+        traces.append(StreamTrace(truth, TraceReplayer(trace_of(frames, model))))
     return traces
+
+
+StreamEvents = tuple[StreamTruth, Sequence[ReportedEvent]]
+
+
+def model_events(
+    dataset: Dataset, model: Bundle | IntegerModel, subjects: Sequence[str], spec: DecideSpec
+) -> Iterator[StreamEvents]:
+    """Yield the truth of every stream of ``subjects``, with the events that the model reports in it."""
+    for person in subjects:
+        for stream in read_streams(dataset, model, [person]):
+            yield stream.truth, stream.replayer.events(spec)
 
 
 @dataclass
@@ -201,10 +227,9 @@ def rate(count: float, hours: float) -> float | None:
     return count / hours if hours > 0 else None
 
 
-def counted_events(stream: StreamTrace, spec: DecideSpec) -> list[ReportedEvent]:
-    """Return the events that decision settings give on a stream, without those that begin in a doubtful stretch."""
-    doubtful = stream.truth.doubtful
-    return [e for e in stream.replayer.events(spec) if not any(a <= e.start_s < b for a, b in doubtful)]
+def _counted(truth: StreamTruth, events: Sequence[ReportedEvent]) -> list[ReportedEvent]:
+    """Return the events that do not begin in a doubtful stretch."""
+    return [e for e in events if not any(a <= e.start_s < b for a, b in truth.doubtful)]
 
 
 def gesture_intervals(events: Sequence[ReportedEvent], gestures: GestureSet) -> list[Interval]:
@@ -215,7 +240,7 @@ def gesture_intervals(events: Sequence[ReportedEvent], gestures: GestureSet) -> 
 
 @dataclass
 class EventCounts:
-    """Counts for tuning: gestures hit and events matched, their totals, and the hours of the streams."""
+    """Counts for curves and tuning: gestures hit and events matched, their totals, and the hours of the streams."""
 
     hits: int = 0
     truths: int = 0
@@ -241,37 +266,56 @@ class EventCounts:
         both = precision + self.recall
         return 2 * precision * self.recall / both if both else 0.0
 
+    def add(self, other: EventCounts) -> None:
+        """Add the counts of another stream."""
+        for name, value in vars(other).items():
+            setattr(self, name, getattr(self, name) + value)
+
 
 def count_events(streams: Sequence[StreamTrace], spec: DecideSpec, late_s: float = LATE_S) -> EventCounts:
     """Return only the counts at the level of gestures, equal to those of `score` but faster to compute."""
     counts = EventCounts()
     for stream in streams:
-        gestures, truths = stream.replayer.trace.gestures, stream.truth.truths
-        events = gesture_intervals(counted_events(stream, spec), gestures)
-        counts.hours += stream.hours
-        counts.truths += len(truths)
-        over = overlaps(truths, events, late_s)
-        number = {label: n for n, label in enumerate(gestures.labels)}
-        predicted = np.array([number.get(e.label, -1) for e in events], dtype=np.int64)
-        same = over & (np.array([number[t.label] for t in truths], dtype=np.int64)[:, None] == predicted)
-        matched = same.any(axis=0)
-        counts.hits += int(same.any(axis=1).sum())
-        counts.matched += int(matched.sum())
-        counts.insertions += int((~matched & ~((predicted < 0) & over.any(axis=0))).sum())
+        gestures = stream.replayer.trace.gestures
+        counts.add(count_matches(stream.truth, stream.replayer.events(spec), gestures, late_s))
     return counts
+
+
+def count_matches(
+    truth: StreamTruth, events: Sequence[ReportedEvent], gestures: GestureSet, late_s: float = LATE_S
+) -> EventCounts:
+    """Return only the counts of `score_events` at the level of gestures."""
+    truths, intervals = truth.truths, gesture_intervals(_counted(truth, events), gestures)
+    over = overlaps(truths, intervals, late_s)
+    number = {label: n for n, label in enumerate(gestures.labels)}
+    predicted = np.array([number.get(e.label, -1) for e in intervals], dtype=np.int64)
+    same = over & (np.array([number[t.label] for t in truths], dtype=np.int64)[:, None] == predicted)
+    matched = same.any(axis=0)
+    insertions = ~matched & ~((predicted < 0) & over.any(axis=0))
+    return EventCounts(int(same.any(axis=1).sum()), len(truths), int(matched.sum()), int(insertions.sum()), truth.hours)
 
 
 def score(
     stream: StreamTrace, spec: DecideSpec, weights: ErrorCosts | None = None, late_s: float = LATE_S
 ) -> StreamScore:
     """Return the scores of one decision setting on one stream."""
-    gestures = stream.replayer.trace.gestures
-    events = counted_events(stream, spec)
+    return score_events(stream.truth, stream.replayer.events(spec), stream.replayer.trace.gestures, weights, late_s)
+
+
+def score_events(
+    truth: StreamTruth,
+    events: Sequence[ReportedEvent],
+    gestures: GestureSet,
+    weights: ErrorCosts | None = None,
+    late_s: float = LATE_S,
+) -> StreamScore:
+    """Return the scores of events in one stream; ``gestures`` are the classes of ``truth`` and of the events."""
+    events = _counted(truth, events)
     families = dict(zip(gestures.labels, gestures.families, strict=True))
     affects = dict(zip(gestures.labels, gestures.affects, strict=True))
     by_gesture = gesture_intervals(events, gestures)
-    truths = stream.truth.truths
-    out = StreamScore(hours=stream.hours, free_hours=stream.free_hours, rest_hours=stream.rest_hours)
+    truths = truth.truths
+    out = StreamScore(hours=truth.hours, free_hours=truth.free_hours, rest_hours=truth.rest_hours)
     out.gate_events = sum(bool(e.source) for e in events)
     out.levels["gesture"] = tally(truths, by_gesture, late_s)
     out.levels["family"] = tally(_called(truths, families), _called(by_gesture, families), late_s)
@@ -284,10 +328,24 @@ def score(
     whole = [Interval(e.start_s, e.stop_s, "anything") for e in events]
     out.levels["anything"] = tally([Interval(t.start_s, t.stop_s, "anything") for t in truths], whole, late_s)
     for event in outside_insertions(truths, by_gesture, late_s):
-        out.places[_place(event, stream.truth)] += 1
+        out.places[_place(event, truth)] += 1
     named_affects = [AFFECTS[e.affect] for e in events]
     out.cost = cost(truths, by_gesture, named_affects, families, affects, weights, late_s)
     return out
+
+
+def people_scores(
+    streams: Iterable[StreamEvents],
+    gestures: GestureSet,
+    weights: ErrorCosts | None = None,
+    late_s: float = LATE_S,
+) -> dict[str, StreamScore]:
+    """Return the scores of each person, from the truth and the events of every stream."""
+    scores: dict[str, StreamScore] = {}
+    for truth, events in streams:
+        mine = score_events(truth, events, gestures, weights, late_s)
+        scores.setdefault(truth.subject, StreamScore()).add(mine)
+    return scores
 
 
 def _called(intervals: Sequence[Interval], names: Mapping[str, str]) -> list[Interval]:

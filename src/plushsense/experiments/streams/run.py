@@ -22,7 +22,7 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import HEAD, Dataset
 from plushsense.deploy.quantize import calibration
-from plushsense.experiments.streams.replay import people_with_streams
+from plushsense.experiments.streams.replay import model_events, people_scores, people_with_streams
 from plushsense.experiments.streams.score import (
     EpochReport,
     Fitted,
@@ -31,7 +31,6 @@ from plushsense.experiments.streams.score import (
     crossvalidated_streams,
     people_folds,
     pooled_scores,
-    scored_people,
     summed,
 )
 from plushsense.experiments.streams.systems import ANYWHERE, SYSTEMS, WINDOWS
@@ -266,8 +265,8 @@ def stream_eval(
         if not known_people(bundle.provenance):
             warn("the bundle does not say on whom it was trained: if on these people, the scores are too high")
         spec = DecideSpec.from_dict(bundle.decision)
-        scores = scored_people(dataset, bundle, wanted, spec, Settings((), late_s=late_s))
-        table = pooled_scores(scores)
+        found = model_events(dataset, bundle, wanted, spec)
+        table = pooled_scores(people_scores(found, bundle.gestures, late_s=late_s))
         for person, row in table["people"].items():
             row["trained_on"] = person in met
         return {

@@ -51,7 +51,7 @@ from plushsense.scoring.metrics import BOOTSTRAP_SEED, summary
 from plushsense.scoring.splits import make_folds, parse_split
 
 # Part of every job's id: increase it when the meaning of a stored fold changes.
-_VERSION = 2
+_VERSION = 3
 SMOOTHING_S = 0.3
 
 
@@ -283,19 +283,6 @@ def _tuned_setting(point: TunedPoint) -> dict[str, Any]:
     """Return a chosen setting, without its gate, and its scores on the tuning people."""
     spec = {k: v for k, v in vars(point.spec).items() if k not in ("gate", "health", "fitted")}
     return {"spec": spec, "recall": point.recall, "false_events_per_hour": point.false_per_hour, "f1": point.f1}
-
-
-def scored_people(
-    dataset: Dataset, model: Bundle, subjects: Sequence[str], spec: DecideSpec, settings: Settings | None = None
-) -> dict[str, StreamScore]:
-    """Return the scores of one model with given decision settings for each person who has streams."""
-    settings = settings or Settings(())
-    scores: dict[str, StreamScore] = {}
-    for person in subjects:
-        streams = read_streams(dataset, model, [person])
-        if streams:
-            scores[person] = total(streams, spec, settings.weights, settings.late_s)
-    return scores
 
 
 HITS, TRUTHS, FALSE, HOURS = range(4)
