@@ -5,7 +5,7 @@
     │   ├── ArchError           an architecture symbol
     │   ├── LayoutError         a sensor layout
     │   ├── GestureError        a gesture set
-    │   ├── FileFormatError     a recording file
+    │   ├── FileFormatError     a file of recordings or predictions
     │   ├── DatasetError        a data set folder
     │   │   └── ForgottenError  a person was removed in the meantime
     │   ├── BundleError         a model bundle
@@ -52,7 +52,7 @@ class GestureError(BadInput):
 
 
 class FileFormatError(BadInput):
-    """A recording file that cannot be read."""
+    """A file of recordings or predictions that cannot be read."""
 
 
 class DatasetError(BadInput):

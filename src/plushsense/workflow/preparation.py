@@ -32,14 +32,19 @@ def network_inputs_of(dataset: Dataset, config: RunConfig) -> tuple[Dataset, Run
     The data set has the inputs of the network and, if the classes are the file of a gesture set, its gestures.
     """
     config = config.for_layout(dataset.layout)
-    chosen = config.evaluation.classes
-    if isinstance(chosen, str) and chosen.endswith(".toml"):
-        gestures = load_gestures(chosen)
-        dataset = dataset.with_gestures(gestures)
-        config = replace(config, evaluation=replace(config.evaluation, classes=gestures.labels))
+    dataset, classes = named_classes(dataset, config.evaluation.classes)
+    config = replace(config, evaluation=replace(config.evaluation, classes=classes))
     if config.model.arch is not None and parse_symbol(config.model.arch).vector is not None:
         dataset = dataset.with_inputs(dataset.layout.for_vectors())
     return dataset, config
+
+
+def named_classes(dataset: Dataset, choice: str | Sequence[str]) -> tuple[Dataset, str | tuple[str, ...]]:
+    """Return the data set and the classes; if they are the file of a gesture set, the data set has its gestures."""
+    if isinstance(choice, str) and choice.endswith(".toml"):
+        gestures = load_gestures(choice)
+        return dataset.with_gestures(gestures), gestures.labels
+    return dataset, choice if isinstance(choice, str) else tuple(choice)
 
 
 def choose_classes(dataset: Dataset, choice: str | Sequence[str], warn: Warn = silent) -> GestureSet:

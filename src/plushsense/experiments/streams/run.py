@@ -1,4 +1,4 @@
-"""Run the continuous benchmark: one bundle on whole streams, or every system on people left out."""
+"""Run the continuous benchmark: a bundle or predictions on whole streams, or every system on people left out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, check_known, nearest, need
+from plushsense.core.errors import (
+    BadInput,
+    BundleError,
+    ConfigError,
+    DatasetError,
+    FileFormatError,
+    check_known,
+    nearest,
+    need,
+)
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.version import __version__
@@ -22,7 +31,17 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import HEAD, Dataset
 from plushsense.deploy.quantize import calibration
-from plushsense.experiments.streams.replay import model_events, people_scores, people_with_streams
+from plushsense.experiments.streams.predictions import read_predictions, shortened, write_events
+from plushsense.experiments.streams.replay import (
+    EventCounts,
+    StreamEvents,
+    count_matches,
+    model_events,
+    people_scores,
+    people_with_streams,
+    scored_streams,
+    truth_of,
+)
 from plushsense.experiments.streams.score import (
     EpochReport,
     Fitted,
@@ -44,11 +63,12 @@ from plushsense.training.spec import TrainSpec
 from plushsense.tuning.gate import GateSpec, fit_gate
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
-from plushsense.workflow.config import RunConfig, from_settings
+from plushsense.workflow.config import SHARED, RunConfig, from_settings
 from plushsense.workflow.preparation import (
     Warn,
     choose_classes,
     classes_for,
+    named_classes,
     network_inputs_of,
     outside_streams,
     silent,
@@ -179,6 +199,10 @@ SIMULATED_RATES = (
     "The people of these streams are simulated and make only the recorded gestures, so the false events are true ones."
 )
 
+_UNKNOWN_TRAINING = (
+    "Predictions do not say on whom their system was trained: if on these people, the scores are too high."
+)
+
 
 def describe_false_events(dataset: Dataset) -> str:
     """Return a sentence that explains how to read the false events on this data."""
@@ -186,15 +210,34 @@ def describe_false_events(dataset: Dataset) -> str:
 
 
 @contextmanager
-def streams_at(path: str | os.PathLike[str], bundle: Bundle) -> Iterator[Dataset]:
-    """Open the data set at ``path``, or import a folder of GestureRecorder files as a temporary data set."""
+def streams_at(path: str | os.PathLike[str], bundle: Bundle | None = None) -> Iterator[Dataset]:
+    """Open the data set at ``path``, or import a folder of GestureRecorder files as a temporary data set.
+
+    Such a folder gets the layout and the gestures of ``bundle``; by default those that its files and labels suggest.
+    """
     place = Path(path)
     if (place / HEAD).is_file() or not place.is_dir():
         yield as_dataset(place)
         return
     with tempfile.TemporaryDirectory(prefix="plushsense-") as folder:
-        made = import_recordings(place, Path(folder) / "DS", layout=bundle.layout, gestures=bundle.gestures)
-        yield made.dataset
+        layout, gestures = (None, None) if bundle is None else (bundle.layout, bundle.gestures)
+        yield import_recordings(place, Path(folder) / "DS", layout=layout, gestures=gestures).dataset
+
+
+def _people_of(dataset: Dataset, path: str | os.PathLike[str], subjects: Sequence[str] | None) -> list[str]:
+    """Return the people who have a stream, and raise for one of ``subjects`` who has none."""
+    there = people_with_streams(dataset)
+    if not there:
+        raise DatasetError(
+            f"'{path}' has no stream in which a recording is located: give a folder with fulldatastream.csv and "
+            "the recordings of that session, or a data set with such streams."
+        )
+    for person in subjects or ():
+        if person not in there:
+            raise BadInput(
+                f"'{person}' has no stream in '{path}'; there are those of: {', '.join(there)}.{nearest(person, there)}"
+            )
+    return there
 
 
 def stream_eval(
@@ -203,6 +246,7 @@ def stream_eval(
     *,
     subjects: Sequence[str] | None = None,
     late_s: float = LATE_S,
+    events: str | os.PathLike[str] | None = None,
     warn: Warn = silent,
 ) -> dict[str, Any]:
     """Replay whole streams through one bundle with its own decision settings, and score its events.
@@ -212,6 +256,7 @@ def stream_eval(
         subjects: people to score; by default all on whom the bundle was not trained. A person on whom it was trained is
             scored only if named here, and is marked in the result.
         late_s: longest time in seconds after a gesture's end at which an event still counts as its answer.
+        events: a CSV file to write the events to, which `score_predictions` reads.
         warn: called with a sentence on the people who are left out or were trained on.
 
     Returns:
@@ -230,20 +275,9 @@ def stream_eval(
                 f"The model reads {', '.join(bundle.layout.inputs)}, and '{dataset.head.name}' has "
                 f"{', '.join(dataset.layout.inputs)}: give streams of the same sensors."
             )
-        there = people_with_streams(dataset)
-        if not there:
-            raise DatasetError(
-                f"'{path}' has no stream in which a recording is located: give a folder with fulldatastream.csv and "
-                "the recordings of that session, or a data set with such streams."
-            )
+        there = _people_of(dataset, path, subjects)
         trained = trained_people(bundle, dataset)
         wanted = list(there) if subjects is None else list(dict.fromkeys(subjects))
-        for person in wanted:
-            if person not in there:
-                raise BadInput(
-                    f"'{person}' has no stream in '{path}'; there are those of: {', '.join(there)}."
-                    f"{nearest(person, there)}"
-                )
         if subjects is None:
             wanted = [p for p in there if p not in trained]
             left_out = [p for p in there if p in trained]
@@ -265,7 +299,9 @@ def stream_eval(
         if not known_people(bundle.provenance):
             warn("the bundle does not say on whom it was trained: if on these people, the scores are too high")
         spec = DecideSpec.from_dict(bundle.decision)
-        found = model_events(dataset, bundle, wanted, spec)
+        found = list(model_events(dataset, bundle, wanted, spec))
+        if events is not None:
+            write_events(events, found, bundle.gestures)
         table = pooled_scores(people_scores(found, bundle.gestures, late_s=late_s))
         for person, row in table["people"].items():
             row["trained_on"] = person in met
@@ -278,6 +314,82 @@ def stream_eval(
             "gate_rules": len(spec.gate.rules),
             "late_s": late_s,
             "note": describe_false_events(dataset),
+        }
+
+
+def score_predictions(
+    path: str | os.PathLike[str],
+    predictions: str | os.PathLike[str],
+    *,
+    subjects: Sequence[str] | None = None,
+    classes: str | Sequence[str] = SHARED,
+    threshold: float = 0.0,
+    late_s: float = LATE_S,
+    warn: Warn = silent,
+) -> dict[str, Any]:
+    """Score the predictions of any system against the true gestures of whole streams.
+
+    Args:
+        path: a data set, or a folder of recordings with their stream.
+        predictions: a CSV file of decisions or events, as `plushsense.experiments.streams.predictions` describes it.
+        subjects: people whose streams are scored, also those that the file does not name; by default the streams that
+            it names.
+        classes: gestures to score, as for `train`: "shared", "all", labels, or the TOML file of a gesture set.
+        threshold: lowest score of a prediction that counts.
+        late_s: longest time in seconds after a gesture's end at which an event still counts as its answer.
+        warn: called with a sentence on streams and gestures that are left out.
+
+    Returns:
+        the figures of `stream_eval`, except those on the model; and ``curve``: recall, F1 and false events per hour at
+        up to 21 thresholds, if the file has scores.
+
+    Raises:
+        FileFormatError: for a file that cannot be used, with the line; DatasetError: where no stream has a recording
+            in it; ConfigError: for a threshold outside 0 to 1; BadInput: for a person without a stream.
+    """
+    if not 0.0 <= threshold <= 1.0:
+        raise ConfigError(f"The threshold is {threshold:g}: accepted are 0 to 1, as for scores.")
+    with streams_at(path) as dataset:
+        dataset, classes = named_classes(dataset, classes)
+        gestures = choose_classes(dataset, classes, warn)
+        there = scored_streams(dataset, _people_of(dataset, path, subjects))
+        wanted = [s for s in there if subjects is None or s.subject in subjects]
+        alone = wanted[0].id if len(wanted) == 1 else None
+        read = read_predictions(predictions, gestures, dataset.gestures, there, alone)
+        if threshold > 0 and not read.scored:
+            raise FileFormatError(f"'{predictions}' has no column 'score': add one, or give no threshold.")
+        if subjects is None:
+            if left_out := [s.id for s in wanted if s.id not in read.rows]:
+                warn(
+                    f"not scored, as '{predictions}' has no row of them: {shortened(left_out)}; for a stream without "
+                    "events give one row with an empty label, or name the people with --subjects"
+                )
+            wanted = [s for s in wanted if s.id in read.rows]
+        truths = [truth_of(dataset, s, dataset.read_stream(s.id), gestures) for s in wanted]
+        read.check_ends(truths)
+        found: list[StreamEvents] = [(truth, read.events(truth.stream, threshold)) for truth in truths]
+        curve = []
+        for value in read.thresholds():
+            counts = EventCounts()
+            for truth in truths:
+                counts.add(count_matches(truth, read.events(truth.stream, value), gestures, late_s))
+            shares = {"recall": counts.recall, "f1": counts.f1, "false_events_per_hour": counts.false_per_hour}
+            curve.append({"threshold": value, **shares})
+        table = pooled_scores(people_scores(found, gestures, late_s=late_s))
+        for row in (table, *table["people"].values()):
+            del row["gate_events"]  # predictions do not say what began an event
+        return {
+            **table,
+            "curve": curve,
+            "dataset": dataset.head.name,
+            "simulated": dataset.head.simulated,
+            "predictions": str(predictions),
+            "form": "events" if read.are_events else "decisions",
+            "threshold": threshold,
+            "classes": list(gestures.labels),
+            "streams": [truth.stream for truth in truths],
+            "late_s": late_s,
+            "note": f"{describe_false_events(dataset)} {_UNKNOWN_TRAINING}",
         }
 
 
