@@ -94,6 +94,26 @@ def test_a_folder_of_the_recorder_gives_what_its_data_set_gives(
     assert not place.exists()
 
 
+def test_the_predictions_of_another_system(cli: Cli, dataset: Dataset, bundle: Path, tmp_path: Path) -> None:
+    file = tmp_path / "events.csv"
+    own = cli("stream-eval", dataset.path, "--model", bundle, "--events", file, "--json").json
+    found = cli("stream-eval", dataset.path, "--predictions", file, "--json").json
+    assert {k: found[k] for k in (*KEYS, "per_class", "hours")} == {k: own[k] for k in (*KEYS, "per_class", "hours")}
+    assert list(found["people"]) == ["P4", "P5"] and found["curve"] == []
+    decisions = tmp_path / "decisions.csv"
+    rows = [f"{at / 5},{'Fast' if at % 30 < 10 else ''},{(at % 7) / 10}" for at in range(1, 100)]
+    decisions.write_text("\n".join(["t,label,score", *rows]), encoding="utf-8")
+    words = ("stream-eval", dataset.path, "--predictions", decisions, "--subjects", "P4", "--classes", "all")
+    shown = cli(*words)
+    assert shown.status == 0 and "threshold  recall" in shown.out and "upper bound" in shown.out
+    curve = cli(*words, "--json").json["curve"]
+    assert [p["threshold"] for p in curve] == [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+    fewer = cli(*words, "--threshold", "0.5", "--json").json
+    assert fewer["threshold"] == 0.5 and fewer["false_events_per_hour"] == curve[5]["false_events_per_hour"]
+    refused = cli("stream-eval", dataset.path, "--predictions", decisions)
+    assert refused.status == 2 and "no column 'stream'" in refused.err and refused.out == ""
+
+
 def test_every_system_on_people_left_out(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     out = tmp_path / "OUT"
@@ -130,7 +150,14 @@ def test_every_system_on_people_left_out(cli: Cli, dataset: Dataset, tmp_path: P
     ("words", "said"),
     [
         ((), "either --model BUNDLE"),
-        (("--model", "m.plush", "--split", "by-subject:2"), "either --model BUNDLE"),
+        (("--model", "m.plush", "--split", "by-subject:2"), "not allowed with argument --model"),
+        (("--model", "m.plush", "--predictions", "p.csv"), "not allowed with argument --model"),
+        (("--model", "m.plush", "--threshold", "0.5"), "--threshold belongs to --predictions"),
+        (("--predictions", "p.csv", "--events", "e.csv"), "--events belongs to --model"),
+        (("--predictions", "p.csv", "--out", "X"), "belong to --split"),
+        (("--predictions", "p.csv", "--threshold", "2"), "accepted are 0 to 1"),
+        (("--predictions", "p.csv", "--subjects", "P33"), "'P33' has no stream"),
+        (("--predictions", "no.csv"), "no file 'no.csv'"),
         (("--split", "by-recording:2"), "does not keep people apart"),
         (("--split", "by-subject:2", "--systems", "hybird"), "Did you mean 'hybrid'?"),
         (("--split", "by-subject:2", "--subjects", "P1"), "--subjects belongs to --model"),

@@ -1,4 +1,4 @@
-"""Implement ``plushsense stream-eval DATASET|FOLDER --model BUNDLE``, ``… DATASET --split …``, and ``protocol``."""
+"""Implement ``plushsense stream-eval DATASET|FOLDER`` with --model, --predictions or --split, and ``protocol``."""
 
 from __future__ import annotations
 
@@ -15,34 +15,58 @@ from plushsense.jobs.progress import ProgressReporter
 
 
 def run_stream_eval(args: argparse.Namespace) -> int:
-    if (args.model is None) == (args.split is None):
-        raise ConfigError("Give either --model BUNDLE, to replay streams through it, or --split by-subject:5.")
+    if args.model is None and args.predictions is None and args.split is None:
+        raise ConfigError(
+            "Give either --model BUNDLE, to replay streams through it, or --predictions FILE.csv, to score another "
+            "system, or --split by-subject:5, to compare systems."
+        )
     if not 0.0 <= args.late <= 10.0:
         raise ConfigError(f"--late is {args.late:g}: accepted are 0 to 10 seconds.")
-    return _run_model(args) if args.model is not None else _run_split(args)
+    if args.threshold is not None and args.predictions is None:
+        raise ConfigError("--threshold belongs to --predictions: leave it out.")
+    if args.events is not None and args.model is None:
+        raise ConfigError("--events belongs to --model: leave it out.")
+    if args.split is not None:
+        return _run_split(args)
+    if args.out or args.systems or args.anywhere_pool is not None:
+        raise ConfigError("--out, --systems and --anywhere-pool belong to --split: leave them out, or give --split.")
+    result = _score_model(args) if args.model is not None else _score_predictions(args)
+    emit(args, result, _format_scores(result))
+    return 0
 
 
-def _run_model(args: argparse.Namespace) -> int:
+def _score_model(args: argparse.Namespace) -> dict[str, Any]:
     from plushsense.experiments.streams.run import stream_eval
 
-    if args.out or args.systems or args.anywhere_pool is not None:
-        raise ConfigError("--out, --systems and --anywhere-pool belong to --split: leave them or --model out.")
-    result = stream_eval(
+    return stream_eval(
         args.source,
         args.model,
         subjects=None if args.subjects is None else listed(args.subjects),
         late_s=args.late,
+        events=args.events,
         warn=warn,
     )
-    emit(args, result, _format_model(result))
-    return 0
+
+
+def _score_predictions(args: argparse.Namespace) -> dict[str, Any]:
+    from plushsense.experiments.streams.run import score_predictions
+
+    return score_predictions(
+        args.source,
+        args.predictions,
+        subjects=None if args.subjects is None else listed(args.subjects),
+        classes=settings(args).evaluation.classes,
+        threshold=args.threshold or 0.0,
+        late_s=args.late,
+        warn=warn,
+    )
 
 
 def _run_split(args: argparse.Namespace) -> int:
     from plushsense.experiments.streams.run import PAGE, stream_benchmark
 
     if args.subjects:
-        raise ConfigError("--subjects belongs to --model: a split scores all people.")
+        raise ConfigError("--subjects belongs to --model and --predictions: a split scores all people.")
     config = settings(args, workers=args.workers)
     result = stream_benchmark(
         args.source,
@@ -90,10 +114,16 @@ def _marks(result: dict[str, Any]) -> list[str]:
     return [*marks({**result, "leaky": False}), ""] if result["simulated"] else []
 
 
-def _format_model(result: dict[str, Any]) -> list[str]:
-    """Format the scores of one model as text: a table by person and one by gesture, then false events."""
+def _format_scores(result: dict[str, Any]) -> list[str]:
+    """Format the scores of one system as text: a table by person and one by gesture, then false events."""
+    trained_on = result.get("trained_on", [])
     people = [
-        (person + (" TRAINED ON" if row["trained_on"] else ""), *_row(row)) for person, row in result["people"].items()
+        (person + (" TRAINED ON" if person in trained_on else ""), *_row(row))
+        for person, row in result["people"].items()
+    ]
+    curve = [
+        (f"{p['threshold']:.3g}", _number(p["recall"]), _number(p["f1"]), _rate(p["false_events_per_hour"]))
+        for p in result.get("curve", [])
     ]
     gestures = [(label, *_row(row)) for label, row in result["per_class"].items()]
     place = result["outside"]
@@ -103,13 +133,14 @@ def _format_model(result: dict[str, Any]) -> list[str]:
         "",
         table(("gesture", *_HEAD), gestures),
         "",
+        *([table(("threshold", "recall", "F1", "false/h"), curve), ""] if curve else []),
         f"{result['hours']:.2f} h of streams, {result['uncovered_hours']:.2f} h outside of any true gesture",
         f"false events: {result['confused']} within another gesture; outside {place['all']}, of these "
         f"{place['rest']} at rest ({_rate(result['at_rest_per_hour'])} an hour), {place['other']} in gestures that are "
         "not among the classes",
         f"outside of true gestures {_rate(result['outside_per_uncovered_hour'])} an hour",
         result["note"],
-        *([f"TRAINED ON {', '.join(result['trained_on'])}: no result"] if result["trained_on"] else []),
+        *([f"TRAINED ON {', '.join(trained_on)}: no result"] if trained_on else []),
     ]
 
 
