@@ -240,13 +240,17 @@ def gesture_intervals(events: Sequence[ReportedEvent], gestures: GestureSet) -> 
 
 @dataclass
 class EventCounts:
-    """Counts for curves and tuning: gestures hit and events matched, their totals, and the hours of the streams."""
+    """Counts for curves and tuning: gestures hit and events matched, their totals, and the hours of the streams.
+
+    ``latencies`` are those of `Tally`.
+    """
 
     hits: int = 0
     truths: int = 0
     matched: int = 0
     insertions: int = 0
     hours: float = 0.0
+    latencies: list[float] = field(default_factory=list)
 
     @property
     def recall(self) -> float:
@@ -292,7 +296,12 @@ def count_matches(
     same = over & (np.array([number[t.label] for t in truths], dtype=np.int64)[:, None] == predicted)
     matched = same.any(axis=0)
     insertions = ~matched & ~((predicted < 0) & over.any(axis=0))
-    return EventCounts(int(same.any(axis=1).sum()), len(truths), int(matched.sum()), int(insertions.sum()), truth.hours)
+    latencies = []
+    for true, mine in zip(truths, same, strict=True):
+        if mine.any():
+            first = min(intervals[j].start_s for j in np.flatnonzero(mine).tolist())
+            latencies.append(max(0.0, first - true.start_s))
+    return EventCounts(len(latencies), len(truths), int(matched.sum()), int(insertions.sum()), truth.hours, latencies)
 
 
 def score(

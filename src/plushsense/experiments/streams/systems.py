@@ -1,7 +1,8 @@
 """The systems of the continuous benchmark, the decision settings to try, and the choice among them.
 
 Settings are chosen on people who are not scored: for each target recall, the setting that reaches it with the fewest
-false events; for single figures, the setting of highest F1 and the one whose errors cost least.
+false events; for single figures, the setting of highest F1, the quickest one whose F1 is nearly as high, and the one
+whose errors cost least.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from plushsense.core.gestures import GestureSet
 from plushsense.experiments.streams.replay import StreamScore, StreamTrace, count_events, score
@@ -20,6 +23,8 @@ from plushsense.scoring.events import LATE_S, ErrorCosts, front
 WINDOWS, ANYWHERE = "windows", "anywhere"
 ENTERS = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98)
 SMOOTHINGS = (0.15, 0.3, 0.6, 1.0)
+# The quickest setting may have an F1 that is lower than the highest by at most this.
+PROMPT_F1 = 0.05
 # Recalls to reach on the tuning people; the recall on the scored people may differ.
 TARGETS = tuple(round(0.2 + 0.05 * n, 2) for n in range(16))
 
@@ -105,12 +110,13 @@ REFERENCE = "smoothed"
 
 @dataclass(frozen=True)
 class TunedPoint:
-    """A setting with its recall, false events per hour and F1 on the tuning people."""
+    """A setting with its recall, false events per hour, F1 and median latency (0 without hits) on the tuning people."""
 
     spec: DecideSpec
     recall: float
     false_per_hour: float
     f1: float = 0.0
+    latency_s: float = 0.0
 
 
 def tried(streams: Sequence[StreamTrace], specs: Sequence[DecideSpec], late_s: float = LATE_S) -> list[TunedPoint]:
@@ -120,7 +126,8 @@ def tried(streams: Sequence[StreamTrace], specs: Sequence[DecideSpec], late_s: f
     for _, group in itertools.groupby(order, key=lambda i: specs[i].smoothing_s):
         for i in group:
             n = count_events(streams, specs[i], late_s)
-            points[i] = TunedPoint(specs[i], n.recall, n.false_per_hour, n.f1)
+            latency_s = float(np.median(n.latencies)) if n.latencies else 0.0
+            points[i] = TunedPoint(specs[i], n.recall, n.false_per_hour, n.f1, latency_s)
         for stream in streams:
             stream.replayer.clear_cache()
     return [points[i] for i in range(len(specs))]
@@ -187,6 +194,12 @@ def cheapest(
 def balanced(points: Sequence[TunedPoint]) -> TunedPoint:
     """Return the setting of the highest F1; of equal ones, that of higher recall."""
     return max(points, key=lambda p: (p.f1, p.recall))
+
+
+def prompt(points: Sequence[TunedPoint]) -> TunedPoint:
+    """Return the setting of the shortest median latency among those whose F1 is within `PROMPT_F1` of the highest."""
+    least = balanced(points).f1 - PROMPT_F1
+    return min((p for p in points if p.f1 >= least), key=lambda p: (p.latency_s, -p.f1))
 
 
 def total(
