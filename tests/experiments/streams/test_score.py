@@ -48,6 +48,7 @@ from plushsense.experiments.streams.systems import (
     cheapest,
     fewest,
     gated,
+    prompt,
     searched,
     tried,
 )
@@ -253,6 +254,7 @@ def test_the_quick_counts_are_those_of_the_whole_score(seed: int) -> None:
         assert (n.hits, n.truths, n.matched, n.insertions) == (
             whole.hits, whole.truths, whole.matched, whole.insertions,
         )  # fmt: skip
+        assert sorted(n.latencies) == pytest.approx(sorted(whole.latencies), abs=1e-4)
 
 
 def test_settings_are_chosen_on_those_who_tune() -> None:
@@ -273,6 +275,8 @@ def test_settings_are_chosen_on_those_who_tune() -> None:
     several = [TunedPoint(argmax_spec(), r, f, 0.0) for r, f in ((0.5, 4.0), (0.8, 9.0), (0.8, 8.0), (0.6, 10.0))]
     assert best_of(several) == [several[0], several[2]]
     assert fewest(several, 0.55) == several[2] and fewest(several, 0.9) == several[2]
+    quick = [TunedPoint(argmax_spec(), 0.5, 4.0, f1, s) for f1, s in ((0.6, 1.5), (0.56, 1.0), (0.5, 0.2), (0.58, 1.0))]
+    assert prompt(quick) == quick[3]
 
 
 # --- a data set -----------------------------------------------------------------------------------------------------

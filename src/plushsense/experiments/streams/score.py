@@ -322,11 +322,7 @@ def summed(folds: Folds) -> dict[str, Any]:
         "at_recall": _at_recall(counts) if REFERENCE in names else [],
         "folds": [
             {k: v for k, v in fold.items() if k != "systems"}
-            | {
-                "settings": {
-                    n: {how: fold["systems"][n][how]["tuned"] for how in CHOICES} for n in names
-                }
-            }
+            | {"settings": {n: {how: fold["systems"][n][how]["tuned"] for how in CHOICES} for n in names}}
             for fold in folds
         ],
     }
