@@ -168,8 +168,8 @@ def _format_systems(result: dict[str, Any]) -> list[str]:
         "",
         table(("system", "setting", *_HEAD), rows),
         "",
-        "plain: no threshold; on the people used for fitting, balanced: highest F1; prompt: shortest latency with an F1 "
-        "at most 0.05 lower; cheapest: lowest cost",
+        "plain: no threshold; on the people used for fitting, balanced: highest F1; prompt: shortest latency with an "
+        "F1 at most 0.05 lower; cheapest: lowest cost",
         "",
         *(["false events an hour at equal recall:", "", table(("recall", *names), equal), ""] if equal else []),
         result["note"],

@@ -304,8 +304,9 @@ def summed(folds: Folds) -> dict[str, Any]:
 
     Each of ``systems`` has a ``curve`` (for each target, recall and false events per hour over all test people) and the
     figures of the settings ``balanced`` (highest F1 on the tuning people), ``prompt`` (shortest median latency, at
-    nearly the highest F1), ``cheapest`` (lowest cost) and perhaps ``plain`` (no threshold). ``at_recall`` has the false events per hour of all systems at equal recall, and their
-    ratio to the reference with a 95 % bootstrap interval over people.
+    nearly the highest F1), ``cheapest`` (lowest cost) and perhaps ``plain`` (no threshold). ``at_recall`` has the false
+    events per hour of all systems at equal recall, and their ratio to the reference with a 95 % bootstrap interval over
+    people.
     """
     names = [n for n in SYSTEMS if all(n in fold["systems"] for fold in folds)]
     counts = {n: _counts(folds, n) for n in names}
