@@ -24,7 +24,16 @@ from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import HEAD, Dataset
 from plushsense.deploy.quantize import calibration, integer_network, integer_probabilities, refuse_undeployable
 from plushsense.evaluation.crossval import context_of, fold_fingerprint, fold_windows, windows_fingerprint
-from plushsense.live.adaptation import Personal, PersonalSpec, RecordingScores, judge, personalise, restore_original
+from plushsense.live.adaptation import (
+    Examples,
+    Personal,
+    PersonalSpec,
+    RecordingScores,
+    judge,
+    personalise,
+    restore_original,
+)
+from plushsense.live.feedback import Corrected, correct, read_corrections
 from plushsense.models.bundle import Bundle
 from plushsense.scoring import metrics
 from plushsense.scoring.splits import Fold, parse_split, purge
@@ -221,7 +230,8 @@ class Adapted:
     """The outcome of `adapt`.
 
     ``tested``: with ``use``, the scores on the other recordings, before and after; None where all were used.
-    ``left_out`` maps each label to the reason why recordings could not be used.
+    ``left_out`` maps each label to the reason why recordings could not be used. ``corrected`` is the outcome of the
+    corrections, if some were given.
     """
 
     personal: Personal
@@ -230,11 +240,17 @@ class Adapted:
     tested: tuple[RecordingScores, RecordingScores] | None
     left_out: dict[str, str]
     simulated: bool
+    corrected: Corrected | None = None
+
+    @property
+    def accepted(self) -> bool:
+        """Whether recordings or corrections changed the bundle."""
+        return self.personal.accepted or (self.corrected is not None and self.corrected.accepted)
 
     @property
     def bundle(self) -> Bundle:
         """The adapted bundle, or the given one where it was left as it is."""
-        return self.personal.bundle
+        return self.personal.bundle if self.corrected is None else self.corrected.bundle
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Save the adapted bundle.
@@ -242,7 +258,7 @@ class Adapted:
         Raises:
             BundleError: when the bundle was left as it is: there is nothing new to save.
         """
-        if not self.personal.accepted:
+        if not self.accepted:
             raise BundleError(f"The bundle was left as it is: {self.personal.reason}.")
         return self.bundle.save(Path(path))
 
@@ -250,7 +266,7 @@ class Adapted:
         """Return plain values, ready for JSON."""
         done = self.personal
         return {
-            "adapted": done.accepted,
+            "adapted": self.accepted,
             "subject": self.subject,
             "reason": done.reason,
             "strength": done.strength,
@@ -262,11 +278,12 @@ class Adapted:
             "tested": None
             if self.tested is None
             else {"before": self.tested[0].to_dict(), "after": self.tested[1].to_dict()},
+            "corrections": None if self.corrected is None else self.corrected.to_dict(),
             "simulated": self.simulated,
         }
 
     def __repr__(self) -> str:
-        return f"Adapted(to {self.subject}: {'yes' if self.personal.accepted else 'no'}, {self.personal.reason})"
+        return f"Adapted(to {self.subject}: {'yes' if self.accepted else 'no'}, {self.personal.reason})"
 
 
 def adapt(
@@ -275,6 +292,7 @@ def adapt(
     *,
     subject: str | None = None,
     use: int | None = None,
+    feedback: str | os.PathLike[str] | None = None,
     spec: PersonalSpec | None = None,
     warn: Warn = silent,
 ) -> Adapted:
@@ -282,6 +300,8 @@ def adapt(
 
     Args:
         recordings: a data set, or the folder of a recorder.
+        feedback: a file of corrections of this person (`plushsense.live.feedback`), to which the layer is fitted after
+            the recordings. They are refused if fewer of these recordings are then read right.
         subject: the person; may be left out where there is only one.
         use: number of recordings of each gesture to adapt to, the first ones; the rest are scored before and after.
         warn: called with what was left out, and what limits the meaning of the scores.
@@ -322,8 +342,12 @@ def adapt(
         predictors = (_float_predictor(original), _float_predictor(done.bundle if done.accepted else original))
         one, other = (judge(predict(test), test.y, test.recording).scores for predict in predictors)
         tested = (one, other)
+    corrected = None
+    if feedback is not None:
+        features = done.bundle.network().features(done.bundle.scaler.apply(adapting.x))
+        corrected = correct(done.bundle, read_corrections(feedback), Examples(features, adapting.y, adapting.recording))
     dataset.generation.check()
-    return Adapted(done, person, use, tested, left_out, dataset.head.simulated)
+    return Adapted(done, person, use, tested, left_out, dataset.head.simulated, corrected)
 
 
 def _dataset(recordings: Dataset | str | os.PathLike[str], bundle: Bundle, place: Path) -> Dataset:

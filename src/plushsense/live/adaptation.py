@@ -30,7 +30,7 @@ from plushsense.models.reference import softmax
 Floats = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_DENSE = ("dense.weight", "dense.bias")
+DENSE = ("dense.weight", "dense.bias")
 _LEAST_PROBABILITY = 1e-9
 _ITERATIONS = 320  # logits are then within 1e-4 of the optimum on makeability, with the smallest strength
 
@@ -138,7 +138,7 @@ def personalise(
     spec = spec or PersonalSpec()
     original = restore_original(bundle) if bundle.personal else bundle
     examples = Examples(original.network().features(original.scaler.apply(x)), y, recording)
-    weight, bias = (np.asarray(original.weights[name], dtype=np.float64) for name in _DENSE)
+    weight, bias = (np.asarray(original.weights[name], dtype=np.float64) for name in DENSE)
     recorded = [k for k in np.unique(y) if len(np.unique(recording[y == k])) >= spec.least]
     used_examples = examples.take(np.isin(y, recorded))
     labels = original.gestures.labels
@@ -170,14 +170,14 @@ def personalise(
     if fell.mean() <= needed_fall or after.right <= before.right:
         reason = f"it would not clearly help: {figures}"
         return Personal(bundle, False, reason, strength, before, after, used, without)
-    dense = dict(zip(_DENSE, fit_dense(weight, bias, used_examples, strength), strict=True))
+    dense = dict(zip(DENSE, fit_dense(weight, bias, used_examples, strength), strict=True))
     table = {
         "subject": subject,
         "recordings": before.recordings,
         "gestures": list(used),
         "strength": strength,
         "leave_one_recording_out": {"before": before.to_dict(), "after": after.to_dict()},
-        "original": {name: np.asarray(original.weights[name]).tolist() for name in _DENSE},
+        "original": {name: np.asarray(original.weights[name]).tolist() for name in DENSE},
     }
     weights = {**original.weights, **{name: part.astype(np.float32) for name, part in dense.items()}}
     adapted = replace(original, weights=weights, personal=table)
@@ -218,7 +218,7 @@ def _cross_validate(weight: Floats, bias: Floats, examples: Examples, strength: 
     start, moved = _fit_rows(weight, bias, examples, weights, strength)
     layers = np.repeat(start[None], len(ids), axis=0)
     layers[:, np.unique(examples.y)] = moved
-    logits = np.einsum("nd,nkd->nk", _with_one(examples.features), layers[place])
+    logits = np.einsum("nd,nkd->nk", with_one(examples.features), layers[place])
     return judge(softmax(logits), examples.y, examples.recording)
 
 
@@ -233,7 +233,8 @@ def _weights(examples: Examples, without: int | None = None) -> Floats:
     return weights
 
 
-def _with_one(features: Floats) -> Floats:
+def with_one(features: Floats) -> Floats:
+    """Return features (N, F) with a column of ones for the bias, (N, F + 1)."""
     return np.concatenate([features, np.ones((len(features), 1))], axis=1)
 
 
@@ -247,7 +248,7 @@ def _fit_rows(
     """
     start = np.concatenate([weight, bias[:, None]], axis=1)
     present, y = np.unique(examples.y, return_inverse=True)
-    x, truth = _with_one(examples.features), np.eye(len(present))[y]
+    x, truth = with_one(examples.features), np.eye(len(present))[y]
     bound = 0.5 * np.einsum("jn,nd,ne->jde", weights, x, x, optimize=True) + strength * np.eye(x.shape[1])
     inverse = np.linalg.inv(bound)
     rows = ahead = np.repeat(start[present][None], len(weights), axis=0)
@@ -283,7 +284,7 @@ def restore_original(bundle: Bundle) -> Bundle:
         raise BundleError("The bundle was not adapted to anybody: there is nothing to undo.")
     before = bundle.personal.get("original")
     try:
-        dense = {name: np.array(before[name], dtype=np.float32) for name in _DENSE}  # type: ignore[index]
+        dense = {name: np.array(before[name], dtype=np.float32) for name in DENSE}  # type: ignore[index]
     except (TypeError, KeyError, ValueError):
         raise BundleError(
             "The bundle does not hold what it was before it was adapted (an export leaves that out): give the bundle "

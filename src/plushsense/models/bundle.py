@@ -95,7 +95,9 @@ class Bundle:
 
     def without_people(self) -> Bundle:
         """Return the bundle for an export: without people's codes and the weights before an adaptation; idempotent."""
-        personal = {key: value for key, value in self.personal.items() if key not in ("subject", "original")}
+        personal = {
+            key: value for key, value in self.personal.items() if key not in ("subject", "original", "uncorrected")
+        }
         return replace(self, provenance=_without_people(self.provenance), personal=personal)
 
     def save(self, path: str | Path) -> Path:
