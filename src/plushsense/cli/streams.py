@@ -32,6 +32,7 @@ def _run_model(args: argparse.Namespace) -> int:
         args.model,
         subjects=None if args.subjects is None else listed(args.subjects),
         late_s=args.late,
+        labels=args.labels == "use",
         warn=warn,
     )
     emit(args, result, _format_model(result))
@@ -52,6 +53,7 @@ def _run_split(args: argparse.Namespace) -> int:
         out=args.out,
         overwrite=args.force,
         late_s=args.late,
+        labels=args.labels == "use",
         anywhere_pool_s=args.anywhere_pool,
         progress=report_jobs("streams"),
         warn=warn,
@@ -106,10 +108,22 @@ def _format_model(result: dict[str, Any]) -> list[str]:
         f"{result['hours']:.2f} h of streams, {result['uncovered_hours']:.2f} h outside of any true gesture",
         f"false events: {result['confused']} within another gesture; outside {place['all']}, of these "
         f"{place['rest']} at rest ({_rate(result['at_rest_per_hour'])} an hour), {place['other']} in gestures that are "
-        "not among the classes",
+        f"not among the classes, {place['handling']} while the toy was handled",
+        *_format_labels(result),
         f"outside of true gestures {_rate(result['outside_per_uncovered_hour'])} an hour",
         result["note"],
         *([f"TRAINED ON {', '.join(result['trained_on'])}: no result"] if result["trained_on"] else []),
+    ]
+
+
+def _format_labels(result: dict[str, Any]) -> list[str]:
+    """Format what the labels between recordings tell; no lines without labels."""
+    if not result["labelled_stretches"]:
+        return []
+    return [
+        f"{result['practised']} events named a gesture that was being practised: right, but no hits",
+        f"where a recording or a label says what happened ({result['known_hours']:.2f} h): "
+        f"{_rate(result['false_events_per_known_hour'])} false events an hour",
     ]
 
 

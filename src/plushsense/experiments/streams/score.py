@@ -51,7 +51,7 @@ from plushsense.scoring.metrics import BOOTSTRAP_SEED, summary
 from plushsense.scoring.splits import make_folds, parse_split
 
 # Part of every job's id: increase it when the meaning of a stored fold changes.
-_VERSION = 2
+_VERSION = 3
 SMOOTHING_S = 0.3
 
 
