@@ -182,7 +182,7 @@ SIMULATED_RATES = (
 
 
 LABELLED_RATES = (
-    "In {labelled} of {streams} streams, stretches between the recordings are labelled: an event that names a practised "
+    "In {labelled} of {streams} streams, stretches between recordings are labelled: an event that names a practised "
     "gesture is right, and one at rest or while the toy is handled is certainly false. Where there is no label, people "
     "may have practised, so the rate is still an upper bound."
 )

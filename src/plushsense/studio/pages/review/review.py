@@ -26,7 +26,7 @@ from plushsense.dataset import trimming as trim
 from plushsense.dataset.files import current_stamp
 from plushsense.dataset.index import apply_marks, open_dataset
 from plushsense.dataset.marks import SUGGESTED as BY_SUGGESTION
-from plushsense.dataset.marks import Mark, MarksFollower, MarkState, append_marks, inverse_mark
+from plushsense.dataset.marks import Mark, MarksFollower, MarkState, append_marks, inverse_marks
 from plushsense.dataset.onset import Suggestion
 from plushsense.dataset.quality.findings import SEVERITIES, Finding
 from plushsense.dataset.store import Dataset, RecordingInfo
@@ -430,7 +430,7 @@ class Review:
                     f"'{last.recording}' has been changed in another window or program since then: nothing is undone."
                 )
             mark = Mark(last.recording, last.action, who, check=last.check)
-            append_marks(self.path, [inverse_mark(mark, last.before, who, why)])
+            append_marks(self.path, inverse_marks(mark, last.before, who, why))
             history.pop()
             self._standing = self._marks.states()
         self._changed()
