@@ -127,7 +127,7 @@ def label_stretches(
         if not 0 <= s.start < s.stop <= stream.rows:
             raise DatasetError(f"'{s.stream}' has rows 0 to {stream.rows}: {s.start} to {s.stop} cannot be labelled.")
         checked.append(LabelledStretch(s.stream, s.start, s.stop, check_label(dataset, s.label)))
-    name, now = author_name(who), read_marks(dataset.path)
+    name, now = author_name(who), dict(read_marks(dataset.path))
     marks, new = [], []
     for s in checked:
         before = now.get(s.stream, MarkState())
