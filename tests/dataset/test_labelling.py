@@ -140,3 +140,18 @@ def test_labels_of_a_removed_person_go_and_of_a_pseudonym_stay(dataset: Dataset,
     forget(dataset.path, "P1")
     assert set(read_marks(dataset.path)) == {P2}
     assert {s.stream for s in open_dataset(dataset.path).stretches} == {P2}
+
+
+def test_the_labels_of_the_example_fit_the_data(real_data: Path, tmp_path: Path) -> None:
+    made = import_recordings(real_data / "makeability-gestures", tmp_path / "DS", layout="accel-3").dataset
+    file = Path(__file__).parents[2] / "examples" / "makeability-stretches.csv"
+    done = decide_labels(made.path, file=file, who="a language model", why="seen in plots of the signals")
+    assert len({s.stream for s in done.stretches}) == 11 and done.labelled == len(read_stretches(made, file))
+    practised = [s for s in done.stretches if s.label.startswith("practice:")]
+    assert len(practised) == 40, "none of them is in a recording"
+    # What is labelled as rest moves less than the rest of the same stream.
+    stream = next(s for s in made.streams if s.subject == "P07")
+    values = made.read_stream(stream.id).values
+    steps = np.abs(np.diff(values, axis=0)).max(axis=1)
+    still = [steps[s.start : s.stop - 1] for s in done.dataset.stretches if s.stream == stream.id and s.label == "rest"]
+    assert np.percentile(np.concatenate(still), 99) < np.percentile(steps, 90)

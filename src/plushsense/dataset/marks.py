@@ -135,6 +135,12 @@ def match_ids(pattern: str, known: Iterable[str], kind: str) -> list[str]:
     return matched
 
 
+def mark_line(mark: Mark) -> str:
+    """Return a mark as a line of ``marks.jsonl``; only marks with a label have that key, as in older versions."""
+    table = {key: value for key, value in asdict(mark).items() if key != "label" or value}
+    return json.dumps(table, ensure_ascii=False) + "\n"
+
+
 def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
     """Append marks under a file lock, so that several programs can write marks at the same time.
 
@@ -145,7 +151,7 @@ def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
     for mark in marks:
         _refuse_contradictions(mark, f"The mark of '{mark.recording}'")
         when = mark.when or datetime.now(timezone.utc).isoformat(timespec="seconds")
-        lines.append(json.dumps(asdict(mark) | {"when": when}, ensure_ascii=False) + "\n")
+        lines.append(mark_line(replace(mark, when=when)))
     if not lines:
         return
     path = folder / MARKS

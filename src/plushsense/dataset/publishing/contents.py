@@ -8,10 +8,9 @@ author, reason and time.
 from __future__ import annotations
 
 import hmac
-import json
 import re
 import secrets
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +29,7 @@ from plushsense.core.recorder_csv import (
     recording_filename,
 )
 from plushsense.dataset.index import DUPLICATE_FOLDER, build_index
-from plushsense.dataset.marks import MARKS, Mark, MarkState, read_marks
+from plushsense.dataset.marks import MARKS, Mark, MarkState, mark_line, read_marks
 from plushsense.dataset.store import (
     HEAD,
     PEOPLE,
@@ -341,8 +340,7 @@ class ContentsWriter:
             stretches = states.get(stream.id, MarkState()).stretches
             marks += [Mark(identity, "label", "", start=s.start, stop=s.stop, label=s.label) for s in stretches]
         if marks:
-            lines = "".join(json.dumps(asdict(mark), ensure_ascii=False) + "\n" for mark in marks)
-            (self.folder / MARKS).write_text(lines, encoding="utf-8", newline="\n")
+            (self.folder / MARKS).write_text("".join(map(mark_line, marks)), encoding="utf-8", newline="\n")
 
     def _note_changes(self, published: Dataset, origin: dict[str, RecordingInfo]) -> None:
         out = [r for r in self.source.recordings if r.excluded]
