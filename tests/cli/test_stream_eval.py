@@ -46,6 +46,31 @@ def test_one_bundle_on_whole_streams(cli: Cli, dataset: Dataset, bundle: Path) -
     assert shown.status == 0 and "false/h" in shown.out and "upper bound" in shown.out
 
 
+def test_labels_between_recordings_are_used_or_ignored(
+    cli: Cli, dataset: Dataset, bundle: Path, tmp_path: Path
+) -> None:
+    before = cli("stream-eval", dataset.path, "--model", bundle, "--json").json
+    labelled = tmp_path / "labelled"
+    shutil.copytree(dataset.path, labelled)
+    stream = next(s for s in dataset.streams if s.subject == "P4")
+    done = cli(
+        "label", labelled, stream.id, "--from", 0, "--to", stream.seconds, "--as", "rest", "--who", "K", "--json"
+    )
+    assert done.json["labelled"] == 1 and done.json["seconds"]["rest"] > 0
+    used = cli("stream-eval", labelled, "--model", bundle, "--json").json
+    assert used["rest_hours"] > before["rest_hours"] and used["hits"] == before["hits"]
+    assert used["labelled_stretches"] == len(done.json["stretches"]) and "labelled" in used["note"]
+    shown = cli("stream-eval", labelled, "--model", bundle)
+    assert "where a recording or a label says what happened" in shown.out
+    assert cli("stream-eval", labelled, "--model", bundle, "--labels", "ignore", "--json").json == before
+    assert "--as handling" in cli("label", labelled, stream.id, "--from", 3).err
+    text = cli("label", labelled, "--export", tmp_path / "labels.csv").out
+    assert "labelled stretches; rest" in text
+    assert cli("label", labelled, stream.id, "--undo", "--json").json["stretches"] == []
+    again = cli("label", labelled, "--import", tmp_path / "labels.csv", "--json").json
+    assert again["labelled"] == len(done.json["stretches"]) and again["stretches"] == done.json["stretches"]
+
+
 def test_somebody_it_was_trained_on_is_marked_loudly(cli: Cli, dataset: Dataset, bundle: Path) -> None:
     met = sorted(trained_people(Bundle.load(bundle), dataset))[0]
     ran = cli("stream-eval", dataset.path, "--model", bundle, "--subjects", met)

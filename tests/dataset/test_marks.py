@@ -1,3 +1,6 @@
+import functools
+import json
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -5,12 +8,13 @@ import pytest
 from plushsense.core.errors import DatasetError
 from plushsense.dataset.marks import (
     MARKS,
+    LabelledStretch,
     Mark,
     MarksFollower,
     MarkState,
     append_marks,
     apply_mark,
-    inverse_mark,
+    inverse_marks,
     read_marks,
 )
 
@@ -130,7 +134,13 @@ def test_followed_marks_name_the_line_that_is_none(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "before", [MarkState(), MarkState(start=3, stop=9, how="hand"), MarkState(True, accepted=frozenset({"gaps"}))]
+    "before",
+    [
+        MarkState(),
+        MarkState(start=3, stop=9, how="hand"),
+        MarkState(True, accepted=frozenset({"gaps"})),
+        MarkState(stretches=(LabelledStretch("a", 2, 8, "rest"), LabelledStretch("a", 11, 12, "practice:Hug"))),
+    ],
 )
 @pytest.mark.parametrize(
     "mark",
@@ -141,7 +151,57 @@ def test_followed_marks_name_the_line_that_is_none(tmp_path: Path) -> None:
         Mark("a", "include", "x"),
         Mark("a", "accept", "x", check="gaps"),
         Mark("a", "unaccept", "x", check="gaps"),
+        Mark("a", "label", "x", start=4, stop=6, label="handling"),
+        Mark("a", "label", "x", start=0, stop=20, label="handling"),
+        Mark("a", "unlabel", "x", start=3),
     ],
 )
 def test_a_mark_taken_back_leaves_what_was_before(before: MarkState, mark: Mark) -> None:
-    assert apply_mark(apply_mark(before, mark), inverse_mark(mark, before, "y")) == before
+    assert functools.reduce(apply_mark, [mark, *inverse_marks(mark, before, "y")], before) == before
+
+
+def test_labels_replace_earlier_ones_of_the_same_rows(tmp_path: Path) -> None:
+    append_marks(
+        tmp_path,
+        [
+            Mark("P1/s", "label", "x", start=10, stop=90, label="rest"),
+            Mark("P1/s", "label", "x", "held it", start=40, stop=50, label="practice:Big hug"),
+            Mark("P1/s", "label", "x", start=85, stop=100, label="handling"),
+            Mark("P1/s", "exclude", "x"),
+        ],
+    )
+    state = read_marks(tmp_path)["P1/s"]
+    assert state.excluded
+    assert [(s.start, s.stop, s.label, s.gesture) for s in state.stretches] == [
+        (10, 40, "rest", ""),
+        (40, 50, "practice:Big hug", "Big hug"),
+        (50, 85, "rest", ""),
+        (85, 100, "handling", ""),
+    ]
+    append_marks(tmp_path, [Mark("P1/s", "unlabel", "x", start=45)])
+    assert [(s.start, s.stop) for s in read_marks(tmp_path)["P1/s"].stretches] == [(10, 40), (40, 45)]
+
+
+@pytest.mark.parametrize(
+    ("mark", "said"),
+    [
+        (Mark("s", "label", "x", start=1, stop=2), "mark 'label' with label ''"),
+        (Mark("s", "label", "x", start=1, stop=2, label="practice:"), "with label 'practice:'"),
+        (Mark("s", "label", "x", start=1, stop=2, label="Hug"), "with label 'Hug'.* practice: and a gesture"),
+        (Mark("s", "unlabel", "x", label="rest"), "only the action label has one"),
+        (Mark("s", "trim", "x", label="Hug"), "only the action label has one"),
+        (Mark("s", "label", "x", start=1, label="rest"), "without stop"),
+        (Mark("s", "label", "x", start=3, stop=3, label="rest"), "stop must be above start"),
+    ],
+)
+def test_a_label_that_cannot_be_is_one_sentence(tmp_path: Path, mark: Mark, said: str) -> None:
+    with pytest.raises(DatasetError, match=said):
+        append_marks(tmp_path, [mark])
+    (tmp_path / MARKS).write_text(json.dumps(asdict(mark)) + "\n")
+    with pytest.raises(DatasetError, match=f"line 1: .*{said}"):
+        read_marks(tmp_path)
+
+
+def test_marks_of_older_versions_are_read(tmp_path: Path) -> None:
+    (tmp_path / MARKS).write_text('{"recording": "a", "action": "trim", "who": "x", "start": 3, "stop": -1}\n')
+    assert read_marks(tmp_path) == {"a": MarkState(start=3)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,7 @@ from plushsense.dataset.trimming import row_times_s, suggest_trims
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.review.review import Reviews
 from support.browsing import DESK, TABLET, axe, connected, marked
-from support.reviewed import ROW_S, made, marks, raw_hash
+from support.reviewed import ROW_S, made, marks, raw_hash, streamed
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -524,6 +525,84 @@ def test_labelled_recordings_need_no_trimming(real_data: Path, tmp_path: Path, s
     assert [(m["recording"], m["action"], m["why"]) for m in marks(place)] == [(second, "exclude", "sensor fault")]
     assert first != second
     assert axe(page) == []
+    assert browser.complaints == []
+
+
+STREAM = "[data-test=stream-plot]"
+
+
+def test_a_stretch_of_a_stream_is_labelled_by_mouse_and_keys(
+    tmp_path: Path, studio: Fixture, look: Fixture, shots: Fixture
+) -> None:
+    place = streamed(tmp_path / "home" / "datasets" / "streams")
+    browser = look()
+    page = browser.open(studio(home=tmp_path / "home").url + "/review?view=stream")
+    page.wait_for_function(
+        f"() => document.querySelector('{STREAM}')?.psPlot?.u && document.querySelector('{STREAM}').dataset.recording"
+    )
+    checked(page)
+    assert "20 s, 0 labelled" in marked(page, "stream-about").inner_text()
+    marked(page, "label-rest").click()
+    page.get_by_text("Select a stretch first").wait_for()
+    low, high = page.evaluate(
+        f"() => {{ const s = document.querySelector('{STREAM}').psPlot.u.scales.x; return [s.min, s.max] }}"
+    )
+
+    def at(second: float) -> tuple[float, float]:
+        """Where in the window a second of the plot is; the page may have scrolled."""
+        box = page.locator(f"{STREAM} .u-over").bounding_box()
+        assert box is not None
+        return box["x"] + box["width"] * (second - low) / (high - low), box["y"] + 60
+
+    def drag(first: float, last: float) -> None:
+        page.mouse.move(*at(first))
+        page.mouse.down()
+        page.mouse.move(*at((first + last) / 2))
+        page.mouse.move(*at(last))
+        page.mouse.up()
+        page.wait_for_selector("[data-test=stream-about]:has-text('selected')")
+
+    drag(1.0, 4.0)
+    marked(page, "label-rest").click()
+    page.wait_for_selector("[data-test=stretches] :text('Rest')")
+    drag(8.0, 10.0)
+    page.keyboard.press("p")
+    page.wait_for_selector("[data-test=stretches] :text('Practised gesture: Wave')")
+    # By clicks: the beginning, and with Shift the end.
+    page.mouse.click(*at(14.0))
+    page.keyboard.down("Shift")
+    page.mouse.click(*at(16.0))
+    page.keyboard.up("Shift")
+    page.get_by_text(re.compile(r"selected 1[34][.][0-9]+ to 1[56][.]")).wait_for()
+    page.keyboard.press("h")
+    page.wait_for_selector("[data-test=stretches] :text('Handling')")
+    assert axe(page) == []
+    shots(page, "review-stream-en-light")
+    lines = [(m["recording"], m["action"], m["label"]) for m in marks(place)]
+    assert lines == [("P1/fulldatastream", "label", k) for k in ("rest", "practice:Wave", "handling")]
+    assert [(m["start"], m["stop"]) for m in marks(place)] == [
+        (pytest.approx(first, abs=5), pytest.approx(last, abs=5))
+        for first, last in ((100, 400), (800, 1000), (1400, 1600))
+    ]
+    assert "3 labelled" in marked(page, "stream-about").inner_text()
+    page.keyboard.press("u")
+    page.wait_for_selector("[data-test=stretches] :text('Handling')", state="detached")
+    drag(2.0, 3.0)
+    page.keyboard.press("d")
+    page.wait_for_function("() => document.querySelectorAll('[data-test=stretches] button').length === 3")
+    page.keyboard.press("u")
+    page.wait_for_function("() => document.querySelectorAll('[data-test=stretches] button').length === 2")
+    stretches = [s.label for s in open_dataset(place).stretches]
+    assert stretches == ["rest", "practice:Wave"]
+    # Labels of other programs are seen, and the address opens the same stream.
+    append_marks(place, [Mark("P2/fulldatastream", "label", "cli", start=1700, stop=1800, label="rest")])
+    marked(page, "stream-choice").click()
+    page.get_by_role("option", name="P2/fulldatastream").click()
+    page.wait_for_selector("[data-test=stretches] :text('17')")
+    page.wait_for_function("() => location.search.includes('P2')")
+    page.reload()
+    connected(page)
+    page.wait_for_function(f"() => document.querySelector('{STREAM}')?.dataset.recording === 'P2/fulldatastream'")
     assert browser.complaints == []
 
 

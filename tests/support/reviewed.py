@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from plushsense.core.layouts import load_layout
-from plushsense.core.recorder_csv import Frames, recording_filename, write_recording
+from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
 
@@ -47,6 +47,23 @@ def made(place: Path, people: int = 3, waves: int = 7) -> Dataset:
     made = import_recordings(raw, place, layout="accel-3").dataset
     shutil.rmtree(raw)
     return made
+
+
+def streamed(place: Path) -> Path:
+    """Two people with a stream of 20 s, in which a wave was recorded from 5 to 7.5 s."""
+    raw = place.parent / f"{place.name}-raw"
+    for person in (1, 2):
+        folder = raw / f"P{person}"
+        folder.mkdir(parents=True)
+        frames = recording(person, 6000, 5.5, rows=2000)
+        (folder / "fulldatastream.csv").write_text(format_rows(frames, ACCEL))
+        part = frames.slice(500, 750)
+        assert part.host_ms is not None
+        write_recording(folder / recording_filename("Wave", int(part.host_ms[-1]), 250), part, ACCEL)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    import_recordings(raw, place, layout="accel-3")
+    shutil.rmtree(raw)
+    return place
 
 
 def marks(place: Path) -> list[dict[str, Any]]:

@@ -120,6 +120,32 @@ def test_the_liveliest_unmarked_stretches_are_left_out(tmp_path: Path) -> None:
     assert len(kept) == pytest.approx(0.8 * len(everything), abs=1)
 
 
+def test_labels_say_what_is_idle_and_what_is_practice(tmp_path: Path) -> None:
+    still = ramp(0, 3000)
+    values = still.values.copy()
+    values[1500:1800, 1] = 1 + 500 * (np.arange(300) // 7 % 2)  # the toy is picked up
+    person(tmp_path / "src" / "ana", {(500, 200): "Wave"}, stream=Frames(values, still.device_ms, still.host_ms))
+    data = made(tmp_path)
+    stream = data.streams[0].id
+    marks = [
+        Mark(stream, "label", "x", start=1500, stop=1900, label="handling"),
+        Mark(stream, "label", "x", start=2200, stop=2500, label="practice:Wave"),
+        Mark(stream, "label", "x", start=2550, stop=2700, label="rest"),
+        Mark(stream, "label", "x", start=450, stop=500, label="practice:Wave"),
+    ]
+    append_marks(data.path, marks)
+    labelled = open_dataset(data.path)
+    w = cut_anywhere(labelled, SPEC, labelled.gestures, EVERY)
+    assert newest(w, "Wave") == list(range(529, 720)), "practice just before a recording takes nothing away from it"
+    idle = newest(w, "Still")
+    assert idle == [*range(99, 450), *range(800, 2200), *range(2600, 3000)], "practice settles, too"
+    # The share that is left out concerns only what has no label.
+    kept = newest(cut_anywhere(labelled, SPEC, labelled.gestures, replace(EVERY, busy_share=1.0)), "Still")
+    assert kept == [*range(1500, 1900), *range(2600, 2700)]
+    plain = data.without_stretches()
+    assert set(range(2200, 2600)) <= set(newest(cut_anywhere(plain, SPEC, plain.gestures, EVERY), "Still"))
+
+
 def test_no_window_reaches_over_a_break_of_the_clock(tmp_path: Path) -> None:
     stream = ramp(0, 2000)
     clock = stream.device_ms + np.where(np.arange(2000) >= 1200, 500, 0)

@@ -44,6 +44,7 @@ def _score_model(args: argparse.Namespace) -> dict[str, Any]:
         subjects=None if args.subjects is None else listed(args.subjects),
         late_s=args.late,
         events=args.events,
+        labels=args.labels == "use",
         warn=warn,
     )
 
@@ -58,6 +59,7 @@ def _score_predictions(args: argparse.Namespace) -> dict[str, Any]:
         classes=settings(args).evaluation.classes,
         threshold=args.threshold or 0.0,
         late_s=args.late,
+        labels=args.labels == "use",
         warn=warn,
     )
 
@@ -76,6 +78,7 @@ def _run_split(args: argparse.Namespace) -> int:
         out=args.out,
         overwrite=args.force,
         late_s=args.late,
+        labels=args.labels == "use",
         anywhere_pool_s=args.anywhere_pool,
         progress=report_jobs("streams"),
         warn=warn,
@@ -137,10 +140,22 @@ def _format_scores(result: dict[str, Any]) -> list[str]:
         f"{result['hours']:.2f} h of streams, {result['uncovered_hours']:.2f} h outside of any true gesture",
         f"false events: {result['confused']} within another gesture; outside {place['all']}, of these "
         f"{place['rest']} at rest ({_rate(result['at_rest_per_hour'])} an hour), {place['other']} in gestures that are "
-        "not among the classes",
+        f"not among the classes, {place['handling']} while the toy was handled",
+        *_format_labels(result),
         f"outside of true gestures {_rate(result['outside_per_uncovered_hour'])} an hour",
         result["note"],
         *([f"TRAINED ON {', '.join(trained_on)}: no result"] if trained_on else []),
+    ]
+
+
+def _format_labels(result: dict[str, Any]) -> list[str]:
+    """Format what the labels between recordings tell; no lines without labels."""
+    if not result["labelled_stretches"]:
+        return []
+    return [
+        f"{result['practised']} events named a gesture that was being practised: right, but no hits",
+        f"where a recording or a label says what happened ({result['known_hours']:.2f} h): "
+        f"{_rate(result['false_events_per_known_hour'])} false events an hour",
     ]
 
 

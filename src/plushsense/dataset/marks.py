@@ -1,4 +1,4 @@
-"""Marks: decisions of people about recordings, appended to ``marks.jsonl``. Raw files are never changed."""
+"""Marks: decisions of people about recordings and streams, appended to ``marks.jsonl``. Raw files are never changed."""
 
 from __future__ import annotations
 
@@ -19,16 +19,21 @@ from plushsense.core.toml import load_table
 MARKS = "marks.jsonl"
 BY_HAND, SUGGESTED = "hand", "suggested"
 _LOCK_S = 30.0
-ACTIONS = ("trim", "untrim", "exclude", "include", "accept", "unaccept")
+ACTIONS = ("trim", "untrim", "exclude", "include", "accept", "unaccept", "label", "unlabel")
+HANDLING, REST, PRACTICE = "handling", "rest", "practice:"
+"""Labels of a stretch; the name of a gesture follows `PRACTICE`."""
 
 
 @dataclass(frozen=True)
 class Mark:
-    """Decision about a recording.
+    """Decision about a recording or a stream.
 
     The action ``trim`` keeps the rows from ``start`` to before ``stop`` (-1: the end), ``exclude`` removes the
     recording from use, ``accept`` states that the findings of ``check`` are known and no fault; ``untrim``, ``include``
-    and ``unaccept`` undo them. ``recording`` is the id of a recording, stream or person, or "" for the whole data set.
+    and ``unaccept`` undo them. ``label`` states what happens in the rows from ``start`` to before ``stop`` of a stream,
+    and replaces earlier labels of these rows; ``unlabel`` removes labels. ``recording`` is the id of a recording,
+    stream or person, or "" for the whole data set. The attribute ``label`` is `HANDLING` (the toy is picked up, turned
+    or put down), `REST` (nobody touches it), or `PRACTICE` and a gesture.
     ``how`` is the origin of a trim: "hand" (set by a person) or "suggested" (a suggestion that was accepted); "" in
     older marks counts as "hand".
     """
@@ -42,13 +47,35 @@ class Mark:
     when: str = ""
     check: str = ""
     how: str = ""
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class LabelledStretch:
+    """The rows from ``start`` to before ``stop`` of a stream, with the label of a `Mark`."""
+
+    stream: str
+    start: int
+    stop: int
+    label: str
+
+    @property
+    def gesture(self) -> str:
+        """Gesture that is practised; "" if the stretch is no practice."""
+        return self.label.removeprefix(PRACTICE) if self.label.startswith(PRACTICE) else ""
+
+    def outside(self, start: int, stop: int) -> list[LabelledStretch]:
+        """Return what remains without the rows from ``start`` to before ``stop`` (-1: the end)."""
+        ends = [(self.start, min(self.stop, start)), (max(self.start, stop) if stop >= 0 else self.stop, self.stop)]
+        return [replace(self, start=a, stop=b) for a, b in ends if a < b]
 
 
 @dataclass(frozen=True)
 class MarkState:
-    """State of a recording after all its marks.
+    """State of a recording or a stream after all its marks.
 
-    ``accepted`` holds the checks whose findings are accepted; ``how`` is that of the current trim.
+    ``accepted`` holds the checks whose findings are accepted; ``how`` is that of the current trim. ``stretches`` of a
+    stream are ordered and do not overlap.
     """
 
     excluded: bool = False
@@ -56,6 +83,7 @@ class MarkState:
     stop: int = -1
     accepted: frozenset[str] = frozenset()
     how: str = ""
+    stretches: tuple[LabelledStretch, ...] = ()
 
     @property
     def trimmed(self) -> bool:
@@ -82,6 +110,14 @@ def _refuse_contradictions(mark: Mark, where: str) -> None:
         )
     if 0 <= mark.stop <= mark.start:
         raise DatasetError(f"{where}: rows {mark.start} to {mark.stop} keep nothing; stop must be above start, or -1.")
+    is_label = mark.label in (HANDLING, REST) or (mark.label.startswith(PRACTICE) and mark.label != PRACTICE)
+    if is_label != (mark.action == "label") or (mark.label and not is_label):
+        raise DatasetError(
+            f"{where}: a mark '{mark.action}' with label '{mark.label}'; only the action label has one: {HANDLING}, "
+            f"{REST}, or {PRACTICE} and a gesture."
+        )
+    if mark.action == "label" and mark.stop < 0:
+        raise DatasetError(f"{where}: a mark 'label' without stop; it needs the row after its last one.")
 
 
 def match_ids(pattern: str, known: Iterable[str], kind: str) -> list[str]:
@@ -99,6 +135,12 @@ def match_ids(pattern: str, known: Iterable[str], kind: str) -> list[str]:
     return matched
 
 
+def mark_line(mark: Mark) -> str:
+    """Return a mark as a line of ``marks.jsonl``; only marks with a label have that key, as in older versions."""
+    table = {key: value for key, value in asdict(mark).items() if key != "label" or value}
+    return json.dumps(table, ensure_ascii=False) + "\n"
+
+
 def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
     """Append marks under a file lock, so that several programs can write marks at the same time.
 
@@ -109,7 +151,7 @@ def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
     for mark in marks:
         _refuse_contradictions(mark, f"The mark of '{mark.recording}'")
         when = mark.when or datetime.now(timezone.utc).isoformat(timespec="seconds")
-        lines.append(json.dumps(asdict(mark) | {"when": when}, ensure_ascii=False) + "\n")
+        lines.append(mark_line(replace(mark, when=when)))
     if not lines:
         return
     path = folder / MARKS
@@ -220,19 +262,30 @@ def apply_mark(now: MarkState, mark: Mark) -> MarkState:
             return replace(now, excluded=False)
         case "accept":
             return replace(now, accepted=now.accepted | {mark.check})
+        case "label" | "unlabel":
+            pieces = [piece for s in now.stretches for piece in s.outside(mark.start, mark.stop)]
+            if mark.action == "label":
+                pieces.append(LabelledStretch(mark.recording, mark.start, mark.stop, mark.label))
+            return replace(now, stretches=tuple(sorted(pieces, key=lambda s: s.start)))
         case _:
             return replace(now, accepted=now.accepted - {mark.check})
 
 
-def inverse_mark(mark: Mark, before: MarkState, who: str, why: str = "") -> Mark:
-    """Return the mark that undoes ``mark`` on a recording whose state was ``before``."""
+def inverse_marks(mark: Mark, before: MarkState, who: str, why: str = "") -> list[Mark]:
+    """Return the marks that undo ``mark`` on a recording or stream whose state was ``before``."""
     match mark.action:
         case "trim" | "untrim" if before.trimmed:
-            return Mark(mark.recording, "trim", who, why, start=before.start, stop=before.stop, how=before.how)
+            return [Mark(mark.recording, "trim", who, why, start=before.start, stop=before.stop, how=before.how)]
         case "trim" | "untrim":
-            return Mark(mark.recording, "untrim", who, why)
+            return [Mark(mark.recording, "untrim", who, why)]
         case "exclude" | "include":
-            return Mark(mark.recording, "exclude" if before.excluded else "include", who, why)
+            return [Mark(mark.recording, "exclude" if before.excluded else "include", who, why)]
+        case "label" | "unlabel":
+            replaced = [s for s in before.stretches if s.outside(mark.start, mark.stop) != [s]]
+            return [
+                Mark(mark.recording, "unlabel", who, why, start=mark.start, stop=mark.stop),
+                *(Mark(s.stream, "label", who, why, start=s.start, stop=s.stop, label=s.label) for s in replaced),
+            ]
         case _:
             action = "accept" if mark.check in before.accepted else "unaccept"
-            return Mark(mark.recording, action, who, why, check=mark.check)
+            return [Mark(mark.recording, action, who, why, check=mark.check)]

@@ -35,7 +35,7 @@ from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames, ReadResult, read_recording, read_stream
 from plushsense.core.toml import load_table, read_toml
 from plushsense.dataset.about import About
-from plushsense.dataset.marks import MARKS
+from plushsense.dataset.marks import MARKS, LabelledStretch, MarkState, read_marks
 
 FORMAT_VERSION = 1
 HEAD = "dataset.toml"
@@ -291,6 +291,7 @@ class Dataset:
         self.recordings = recordings
         self.streams = streams
         self._stored_layout = head.layout
+        self._with_stretches = True
 
     def with_inputs(self, layout: Layout) -> Dataset:
         """Return this data set with the network inputs of ``layout``; itself if the measured channels differ."""
@@ -298,9 +299,7 @@ class Dataset:
         if own.channels != layout.channels or (own.inputs, own.derived) == (layout.inputs, layout.derived):
             return self
         head = replace(self.head, layout=replace(own, inputs=layout.inputs, derived=layout.derived))
-        other = Dataset(self.path, head, self.recordings, self.streams, self.generation)
-        other._stored_layout = self._stored_layout
-        return other
+        return self._copy(head, self.recordings)
 
     def with_gestures(self, gestures: GestureSet) -> Dataset:
         """Return this data set with recordings named by a set of merged gestures; itself if none of them is merged."""
@@ -310,8 +309,17 @@ class Dataset:
         others = tuple(g for g in self.gestures.gestures if g.label not in names)
         head = replace(self.head, gestures=GestureSet(gestures.name, (*gestures.gestures, *others)))
         recordings = [replace(r, gesture=names.get(r.gesture, r.gesture)) for r in self.recordings]
+        return self._copy(head, recordings)
+
+    def without_stretches(self) -> Dataset:
+        """Return this data set without the labels of `stretches`, as if no stream had any."""
+        other = self._copy(self.head, self.recordings)
+        other._with_stretches = False
+        return other
+
+    def _copy(self, head: DatasetHead, recordings: list[RecordingInfo]) -> Dataset:
         other = Dataset(self.path, head, recordings, self.streams, self.generation)
-        other._stored_layout = self._stored_layout
+        other._stored_layout, other._with_stretches = self._stored_layout, self._with_stretches
         return other
 
     @property
@@ -333,6 +341,25 @@ class Dataset:
     def used(self) -> list[RecordingInfo]:
         """Recordings that are not excluded by a mark."""
         return [r for r in self.recordings if not r.excluded]
+
+    @cached_property
+    def stretches(self) -> tuple[LabelledStretch, ...]:
+        """Stretches of the streams that marks label, by stream and row, without the rows of located recordings.
+
+        They are read from the marks at the first use.
+        """
+        marks = read_marks(self.path) if self._with_stretches and self.streams else {}
+        return tuple(
+            s for stream in self.streams for s in self._stretches_in(stream, marks.get(stream.id, MarkState()))
+        )
+
+    def _stretches_in(self, stream: StreamInfo, marks: MarkState) -> list[LabelledStretch]:
+        pieces = [piece for s in marks.stretches for piece in s.outside(stream.rows, -1)]
+        for r in self.recordings:
+            if pieces and r.stream == stream.id and r.stream_row >= 0:
+                first, last = r.stream_row + r.start, r.stream_row + r.stop
+                pieces = [rest for piece in pieces for rest in piece.outside(first, last)]
+        return pieces
 
     def read(self, recording: RecordingInfo) -> Frames:
         """Read the rows of one recording that remain after trimming."""
@@ -372,7 +399,7 @@ class Dataset:
 
     @cached_property
     def hash(self) -> str:
-        """SHA-256 of the layout, the streams and all used recordings: content, person, gesture, trimming."""
+        """SHA-256 of the layout, the streams, their labels and all used recordings with person, gesture, trimming."""
         digest = hashlib.sha256(json.dumps(self._stored_layout.to_dict(), sort_keys=True).encode())
         for r in sorted(self.used, key=lambda r: r.id):
             digest.update(
@@ -380,6 +407,8 @@ class Dataset:
             )
         for s in sorted(self.streams, key=lambda s: s.id):
             digest.update(repr((s.id, s.sha256)).encode())
+        for stretch in sorted(self.stretches, key=lambda s: (s.stream, s.start)):
+            digest.update(repr((stretch.stream, stretch.start, stretch.stop, stretch.label)).encode())
         return digest.hexdigest()
 
     def summary(self) -> dict[str, Any]:

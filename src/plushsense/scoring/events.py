@@ -27,6 +27,10 @@ event with a wrong label is an insertion, and its truth is a deletion if it has 
 that belongs to the time of a truth with another label is ``confused``, any other is ``outside``. An event without a
 label (as when gestures are scored and the gate reported only an affect) is ``unnamed`` if it belongs to the time of a
 truth; it is then neither right nor wrong.
+
+*Practice* is an interval in which a gesture was practised, perhaps several times. An event that would be an insertion
+but belongs to a practice of its label is ``matched`` and ``practised``. With another label it is ``confused``. A
+practice is no truth: it is neither a hit nor a deletion.
 """
 
 from __future__ import annotations
@@ -67,6 +71,7 @@ class Tally:
     fragmented_merged: int = 0
     events: int = 0
     matched: int = 0
+    practised: int = 0
     insertions: int = 0
     confused: int = 0
     unnamed: int = 0
@@ -168,21 +173,29 @@ def _until(truths: Sequence[Interval], late_s: float) -> NDArray[np.float64]:
     return until
 
 
-def tally(truths: Sequence[Interval], events: Sequence[Interval], late_s: float = LATE_S) -> Tallies:
+def tally(
+    truths: Sequence[Interval],
+    events: Sequence[Interval],
+    late_s: float = LATE_S,
+    practice: Sequence[Interval] = (),
+) -> Tallies:
     """Count the categories of each label in one stream; `pooled` adds the labels up.
 
     Args:
-        truths, events: in any order; the label of an event may be "".
+        truths, events, practice: in any order; the label of an event may be "".
     """
     over = overlaps(truths, events, late_s)
+    in_practice = overlaps(practice, events, late_s)
     of_truth = np.array([t.label for t in truths], dtype=np.str_)
     of_event = np.array([e.label for e in events], dtype=np.str_)
+    of_practice = np.array([p.label for p in practice], dtype=np.str_)
+    practised = (in_practice & (of_practice[:, None] == of_event[None, :])).any(axis=0)
     same = over & (of_truth[:, None] == of_event[None, :]) & (of_event != UNNAMED)[None, :]
     per_truth, per_event = same.sum(axis=1), same.sum(axis=0)
     # A truth is merged if one of its events has another truth; an event is fragmenting if its truth has another event.
     merged: list[bool] = (same & (per_event > 1)[None, :]).any(axis=1).tolist()
     fragmenting: list[bool] = (same & (per_truth > 1)[:, None]).any(axis=0).tolist()
-    anything = [bool(n) for n in over.sum(axis=0)]
+    anything = [bool(n) for n in over.sum(axis=0) + in_practice.sum(axis=0)]
     tallies: Tallies = {}
 
     def at(label: str) -> Tally:
@@ -207,6 +220,9 @@ def tally(truths: Sequence[Interval], events: Sequence[Interval], late_s: float 
         row.events += 1
         if event.label == UNNAMED and anything[j]:
             row.unnamed += 1
+        elif not per_event[j] and practised[j]:
+            row.matched += 1
+            row.practised += 1
         elif not per_event[j]:
             row.insertions += 1
             row.confused += anything[j]
@@ -256,17 +272,19 @@ def cost(
     affect_of: Mapping[str, str],
     weights: ErrorCosts | None = None,
     late_s: float = LATE_S,
+    practice: Sequence[Interval] = (),
 ) -> float:
     """Return the total cost of the errors in one stream.
 
     Args:
-        truths, events: with gestures as labels; the label of an event may be "".
+        truths, events, practice: with gestures as labels; the label of an event may be "".
         affects: affect of each event (E,); "none" if unknown.
         families, affect_of: family and affect of each gesture; the affect "none" means unknown.
     """
     weights = weights or ErrorCosts()
-    over = overlaps(truths, events, late_s)
-    total = float(weights.missed * (len(truths) - int(over.any(axis=1).sum() if len(events) else 0)))
+    over = np.vstack([overlaps(truths, events, late_s), overlaps(practice, events, late_s)])
+    total = float(weights.missed * (len(truths) - int(over[: len(truths)].any(axis=1).sum() if len(events) else 0)))
+    labelled = [*truths, *practice]
     right: set[int] = set()
     order = sorted(range(len(events)), key=lambda j: (events[j].start_s, events[j].stop_s, events[j].label))
     for j in order:
@@ -276,7 +294,7 @@ def cost(
             continue
         charges = []
         for i in there.tolist():
-            truth, event = truths[i], events[j]
+            truth, event = labelled[i], events[j]
             if event.label == truth.label:
                 charges.append((weights.again if i in right else 0.0, i))
             elif event.label != UNNAMED and families[event.label] == families[truth.label]:
@@ -289,7 +307,7 @@ def cost(
                 charges.append((weights.family if event.label == UNNAMED else weights.confused, -1))
         least, hit = min(charges)
         total += least
-        if hit >= 0:
+        if 0 <= hit < len(truths):
             right.add(hit)
     return total
 

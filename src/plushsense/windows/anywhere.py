@@ -9,8 +9,10 @@ data set. The label of a position is
   class, not stopped in time), and where two recordings overlap. Such positions are left out.
 
 People also practise between recordings, which is not idle time. Therefore the share ``busy_share`` of a stream's
-positions outside recordings, those with the most movement in the last second, is left out too. Of the remaining idle
-positions, evenly spaced ones are taken, so that ``idle_share`` of all windows are idle.
+positions outside recordings, those with the most movement in the last second, is left out too. Labels of stretches
+replace this guess: positions in a practised gesture, and up to ``settle_s`` after it, are left out, and those at rest
+or where the toy is picked up, turned or put down are idle however much it moves. Of the remaining idle positions,
+evenly spaced ones are taken, so that ``idle_share`` of all windows are idle.
 
 A recording that is in no stream (or has no position there) is cut as in `plushsense.windows.cut`, and marked. If a
 recording of a session has no place in the stream, the session gives no idle positions outside recordings, since its
@@ -27,6 +29,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import Gesture, GestureSet
+from plushsense.dataset.marks import LabelledStretch
 from plushsense.dataset.store import Dataset, Progress, RecordingInfo, StreamInfo
 from plushsense.windows.clock import Segment, resample
 from plushsense.windows.cut import (
@@ -42,7 +45,7 @@ from plushsense.windows.features import network_inputs
 
 IDLE_LABEL = "Idle"
 _LIVELY_S = 1.0
-NOTHING, FREE = -1, -2
+NOTHING, FREE, IDLE = -1, -2, -3
 
 
 @dataclass(frozen=True)
@@ -177,6 +180,7 @@ def _positions(
     mine = [r for r in used if r.stream == stream.id and r.stream_row >= 0]
     chosen = {r.id for r in mine}
     barred = [r for r in dataset.recordings if r.stream == stream.id and r.stream_row >= 0 and r.id not in chosen]
+    stretches = [s for s in dataset.stretches if s.stream == stream.id]
     held: list[tuple[RecordingInfo, _Place]] = []
     free: list[_Place] = []
     lively: list[float] = []
@@ -186,15 +190,17 @@ def _positions(
     for segment, x in zip(segments, whole, strict=True):
         if len(segment) < reach:
             continue
-        labels = position_labels(segment, mine, barred, dataset.layout.rate_hz, spec)
+        labels = position_labels(segment, mine, barred, dataset.layout.rate_hz, spec, stretches)
         moved = _moved(x, dataset.layout.samples(_LIVELY_S), spread)
         for at in range(reach, len(x) + 1, dataset.layout.samples(spec.every_s)):
             if labels[at] >= 0:
                 held.append((mine[labels[at]], _Place(x, segment, at)))
-            elif labels[at] == FREE:
+            elif labels[at] in (FREE, IDLE):
                 free.append(_Place(x, segment, at))
-                lively.append(float(moved[at - 1]))
-    quietest = np.sort(np.argsort(lively, kind="stable")[: len(free) - round(spec.busy_share * len(free))])
+                # Positions that are labelled as idle are kept, however much the signals move.
+                lively.append(float(moved[at - 1]) if labels[at] == FREE else -np.inf)
+    unsure = int(np.isfinite(lively).sum())
+    quietest = np.sort(np.argsort(lively, kind="stable")[: len(free) - round(spec.busy_share * unsure)])
     return held, [free[at] for at in quietest.tolist()]
 
 
@@ -204,12 +210,15 @@ def position_labels(
     barred: Sequence[RecordingInfo],
     rate_hz: float,
     spec: AnywhereSpec,
+    stretches: Sequence[LabelledStretch] = (),
 ) -> NDArray[np.int64]:
-    """Return the label of each position of a segment, (n + 1,): an index into ``used``, `FREE` or `NOTHING`.
+    """Return the label of each position of a segment, (n + 1,): an index into ``used``, `FREE`, `IDLE` or `NOTHING`.
 
     Args:
         used: recordings of the stream whose gesture is a class; only their rows after trimming are labelled.
         barred: the other recordings of the stream; all their rows become `NOTHING`.
+        stretches: labelled stretches of the stream; `FREE` positions become `NOTHING` in practised gestures and until
+            they have settled, and `IDLE` in the others.
     """
     labels = np.full(len(segment) + 1, FREE, dtype=np.int64)
     onset, after, settle = (round(s * rate_hz) for s in (spec.onset_s, spec.after_s, spec.settle_s))
@@ -241,6 +250,12 @@ def position_labels(
         begin, end = samples(r.stream_row, r.stream_row + r.rows)
         if end > begin:
             labels[begin + 1 : end + settle + 1] = NOTHING
+    # The last pass is for practice, since a gesture may still be settling where a stretch at rest begins.
+    for stretch in sorted(stretches, key=lambda s: bool(s.gesture)):
+        begin, end = samples(stretch.start, stretch.stop)
+        if end > begin:
+            positions = labels[begin + 1 : end + (settle if stretch.gesture else 0) + 1]
+            positions[positions < NOTHING] = NOTHING if stretch.gesture else IDLE
     return labels
 
 

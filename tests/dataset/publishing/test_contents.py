@@ -82,9 +82,12 @@ def test_delays_of_old_firmware_become_the_stream_s_clock(tmp_path: Path) -> Non
     )
     dataset = bring(tmp_path / "src", tmp_path / "DS", "plush-14")
     assert "integrated" in dataset.recordings[0].flags[0]
+    append_marks(dataset.path, [Mark(dataset.streams[0].id, "label", "me", "seen", start=210, stop=390, label="rest")])
+    dataset = open_dataset(dataset.path)
     back = sound(made_of(dataset, tmp_path / "out"))
     assert back.recordings[0].stream_row == dataset.recordings[0].stream_row == 100
     assert np.array_equal(back.read(back.recordings[0]).values, values[100:200])
+    assert [(s.stream, s.start, s.stop, s.label) for s in back.stretches] == [(back.streams[0].id, 210, 390, "rest")]
     assert np.array_equal(np.diff(back.read(back.recordings[0]).device_ms), delays[101:200])
 
 

@@ -61,7 +61,7 @@ from plushsense.runtime.events import ONE, EventSettings
 from plushsense.runtime.fixed import smoothing_weight
 from plushsense.runtime.gate import JERK, GateSettings, Rule, Signal, Term
 from plushsense.runtime.trace import Part, Trace, TraceReplayer, replay, reported_events, trace_of
-from plushsense.scoring.events import Interval
+from plushsense.scoring.events import ErrorCosts, Interval
 from plushsense.windows.clock import row_times_us
 from plushsense.windows.features import Scaler
 
@@ -181,7 +181,7 @@ def truth_with(
     doubtful: tuple[tuple[float, float], ...] = (),
     hours: float = 1.0,
 ) -> StreamTruth:
-    return StreamTruth("P1/s", "P1", False, truths, rest, other, doubtful, 3600 * hours, hours, 0.8 * hours, 0.0)
+    return StreamTruth("P1/s", "P1", False, truths, rest, other, doubtful, 3600 * hours, hours, 0.8 * hours, 0.0, 0.0)
 
 
 def when(step: int) -> float:
@@ -209,7 +209,7 @@ def test_every_count_of_one_stream_by_hand() -> None:
     assert (gesture.truths, gesture.hits, gesture.deletions) == (3, 1, 2)
     # The last hit begins in the doubtful stretch and is not counted.
     assert (gesture.events, gesture.matched, gesture.insertions, gesture.confused) == (5, 1, 4, 1)
-    assert found.places == {"rest": 1, "other": 1, "unmarked": 1}
+    assert found.places == {"rest": 1, "handling": 0, "other": 1, "unmarked": 1}
     assert gesture.latencies == pytest.approx([6 * STEP_S])
     # A squeeze where a blow was is another affect; nothing was said of the second hug.
     assert found.cost == 5.0 + 3 * 3.0 + 2.0
@@ -222,6 +222,25 @@ def test_every_count_of_one_stream_by_hand() -> None:
     assert StreamScore.from_journal(found.to_journal()).to_dict() == shown
     n = count_events([h], argmax_spec())
     assert (n.hits, n.truths, n.insertions) == (1, 3, 4) and n.f1 == pytest.approx(gesture.f1)
+
+
+def test_practice_is_right_but_no_hit() -> None:
+    truth = truth_with((Interval(when(10), when(30), "Hug"),))
+    practice = (Interval(when(58), when(95), "Hug"), Interval(when(300), when(320), "Hit"))
+    labelled = replace(truth, practice=practice, handling=((when(150), when(170)),))
+    pieces = ((REST, 16), (HUG, 10), (REST, 34), (HUG, 10), (REST, 10), (HUG, 10), (REST, 60), (HIT, 10), (REST, 200))
+    for spec in (argmax_spec(), argmax_spec(0.15)):
+        alone, found = (score(stream_trace(t, *pieces), spec) for t in (truth, labelled))
+        counts = found.total()
+        assert (counts.truths, counts.hits, counts.deletions, counts.events) == (1, 1, 0, 4)
+        assert (counts.matched, counts.practised, counts.insertions, counts.outside) == (3, 2, 1, 1)
+        assert found.places == {"rest": 0, "handling": 1, "other": 0, "unmarked": 0}
+        assert alone.total().insertions == 3 and alone.total().recall == counts.recall
+        # Neither a practice that is named nor one that is missed costs anything.
+        assert (alone.cost, found.cost) == (3 * ErrorCosts().outside, ErrorCosts().outside)
+    wrong = score(stream_trace(replace(truth, practice=(replace(practice[0], label="Hit"),)), *pieces), argmax_spec())
+    assert wrong.total().confused == 2 and wrong.places["unmarked"] == 1
+    assert wrong.total("anything").practised == 2 and wrong.total("affect").practised == 0
 
 
 def test_a_gate_is_heard_at_once_and_named_by_the_network() -> None:
@@ -248,7 +267,9 @@ def test_the_quick_counts_are_those_of_the_whole_score(seed: int) -> None:
     starts = np.sort(draw.uniform(0, 20, 8))
     labels = draw.choice(["Hug", "Squeeze", "Hit"], 8)
     truths = tuple(Interval(float(s), float(s + 1), str(k)) for s, k in zip(starts, labels, strict=True))
-    h = StreamTrace(truth_with(truths, doubtful=((3.0, 4.0),), hours=0.5), TraceReplayer(trace))
+    practice = tuple(Interval(t.start_s + 1.2, t.stop_s + 0.9, t.label) for t in truths[::2])
+    truth = replace(truth_with(truths, doubtful=((3.0, 4.0),), hours=0.5), practice=practice)
+    h = StreamTrace(truth, TraceReplayer(trace))
     for spec in (argmax_spec(), argmax_spec(0.3), DecideSpec(enter=0.5), DecideSpec(gate=GATE)):
         n, whole = count_events([h], spec), score(h, spec).total()
         assert (n.hits, n.truths, n.matched, n.insertions) == (
@@ -327,6 +348,33 @@ def test_truth_lies_where_it_was_recorded(dataset: Dataset) -> None:
     excluded = open_dataset(dataset.path)
     left = truth_of(excluded, stream, frames, GESTURES)
     assert [t.label for t in left.truths] == ["Hit"] and left.doubtful == (pytest.approx((1.3, 2.49)),)
+
+
+def test_labels_between_recordings_are_truth(dataset: Dataset) -> None:
+    stream = next(s for s in dataset.streams if s.subject == "P1")
+    frames = dataset.read_stream(stream.id)
+    before = truth_of(dataset, stream, frames, GESTURES)
+    marks = [
+        Mark(stream.id, "label", "K", start=10, stop=130, label="practice:Hug"),  # its end is in a recording
+        Mark(stream.id, "label", "K", start=260, stop=290, label="practice:Wave"),  # no class
+        Mark(stream.id, "label", "K", start=410, stop=440, label="rest"),
+        Mark(stream.id, "label", "K", start=450, stop=480, label="handling"),
+        Mark("P1/nothing", "label", "K", start=450, stop=480, label="handling"),
+    ]
+    append_marks(dataset.path, marks)
+    labelled = open_dataset(dataset.path)
+    found = truth_of(labelled, stream, frames, GESTURES)
+    assert found.practice == (Interval(pytest.approx(0.1), pytest.approx(0.99), "Hug"),)
+    assert found.handling == (pytest.approx((4.5, 4.79)),)
+    assert found.rest == (*before.rest, pytest.approx((4.1, 4.39)))
+    assert found.other == (*before.other, pytest.approx((2.6, 2.89)))
+    assert found.truths == before.truths and found.doubtful == ()
+    assert labelled.hash != dataset.hash
+    ignored = labelled.without_stretches().with_inputs(labelled.layout)
+    assert truth_of(ignored, stream, frames, GESTURES) == before and ignored.hash == dataset.hash
+    (h,) = read_streams(labelled, bundle(), ["P1"])
+    assert 3600 * h.truth.free_hours == pytest.approx(16.0 - 1.49 - 0.59 - 0.89, abs=0.1)
+    assert 3600 * h.truth.known_hours == pytest.approx(1.49 + 0.59 + 0.99 * 2 + 0.89 + 3 * 0.29, abs=0.1)
 
 
 def test_time_that_was_heard_and_time_without_truth(dataset: Dataset) -> None:

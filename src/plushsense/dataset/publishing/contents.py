@@ -8,10 +8,9 @@ author, reason and time.
 from __future__ import annotations
 
 import hmac
-import json
 import re
 import secrets
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +29,7 @@ from plushsense.core.recorder_csv import (
     recording_filename,
 )
 from plushsense.dataset.index import DUPLICATE_FOLDER, build_index
-from plushsense.dataset.marks import MARKS, Mark, MarkState, read_marks
+from plushsense.dataset.marks import MARKS, Mark, MarkState, mark_line, read_marks
 from plushsense.dataset.store import (
     HEAD,
     PEOPLE,
@@ -174,7 +173,7 @@ class ContentsWriter:
             self.progress(done, len(infos))
         people = self._write_people()
         ids = {r.id: self._id(r, files) for r in self.kept}
-        self._write_marks(ids)
+        self._write_marks(ids, files)
         (self.folder / HEAD).write_text(self.head.to_toml(), encoding="utf-8", newline="\n")
         built = build_index(self.folder, self.head)
         published = {r.id: r for r in built.dataset.recordings}
@@ -324,7 +323,7 @@ class ContentsWriter:
             self.notes.append(f"Left out: {_count(left_out, 'column')} of the people's table.")
         return people
 
-    def _write_marks(self, ids: dict[str, str]) -> None:
+    def _write_marks(self, ids: dict[str, str], files: dict[str, str]) -> None:
         states = read_marks(self.source.path)
         marks = []
         for recording in self.kept:
@@ -335,9 +334,13 @@ class ContentsWriter:
             if mark.excluded:
                 marks.append(Mark(identity, "exclude", ""))
             marks += [Mark(identity, "accept", "", check=check) for check in sorted(mark.accepted)]
+        for stream in self.streams:
+            # The rows of a stream are those of the source, so the rows of its labels are, too.
+            identity = Path(files[stream.file]).relative_to(STREAMS).with_suffix("").as_posix()
+            stretches = states.get(stream.id, MarkState()).stretches
+            marks += [Mark(identity, "label", "", start=s.start, stop=s.stop, label=s.label) for s in stretches]
         if marks:
-            lines = "".join(json.dumps(asdict(mark), ensure_ascii=False) + "\n" for mark in marks)
-            (self.folder / MARKS).write_text(lines, encoding="utf-8", newline="\n")
+            (self.folder / MARKS).write_text("".join(map(mark_line, marks)), encoding="utf-8", newline="\n")
 
     def _note_changes(self, published: Dataset, origin: dict[str, RecordingInfo]) -> None:
         out = [r for r in self.source.recordings if r.excluded]

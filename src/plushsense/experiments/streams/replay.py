@@ -14,6 +14,7 @@ import numpy as np
 
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.recorder_csv import Frames
+from plushsense.dataset.marks import HANDLING, REST
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo, StreamInfo
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.decisions import DecideSpec
@@ -47,8 +48,11 @@ class StreamTruth:
     ``truths`` are gestures that are classes, ``rest`` idle ones, ``other`` gestures that are not among the classes.
     ``doubtful`` are excluded recordings and those not stopped in time; events there are not counted. ``labelled`` tells
     whether every sample of the stream has a label. ``stop_s`` is the time of the last frame. ``hours`` are those
-    without gaps and doubtful stretches, ``free_hours`` without true gestures as well, and ``rest_hours`` those in
-    recordings at rest.
+    without gaps and doubtful stretches, ``free_hours`` without true and practised gestures as well, ``rest_hours``
+    those at rest, and ``known_hours`` those with a recording or a label.
+
+    From the labels of stretches between recordings, ``practice`` are gestures that are classes, and ``handling`` is
+    where the toy was picked up, turned or put down; rest and other gestures are in ``rest`` and ``other``.
     """
 
     stream: str
@@ -62,6 +66,9 @@ class StreamTruth:
     hours: float
     free_hours: float
     rest_hours: float
+    known_hours: float
+    practice: tuple[Interval, ...] = ()
+    handling: tuple[Stretch, ...] = ()
 
 
 def truth_of(dataset: Dataset, stream: StreamInfo, frames: Frames, gestures: GestureSet) -> StreamTruth:
@@ -72,6 +79,8 @@ def truth_of(dataset: Dataset, stream: StreamInfo, frames: Frames, gestures: Ges
     rest: list[Stretch] = []
     other: list[Stretch] = []
     doubtful: list[Stretch] = []
+    practice: list[Interval] = []
+    handling: list[Stretch] = []
     for r in located(dataset, stream):
         first = r.stream_row + r.start
         last = min(r.stream_row + r.stop, len(times)) - 1
@@ -81,15 +90,26 @@ def truth_of(dataset: Dataset, stream: StreamInfo, frames: Frames, gestures: Ges
         gesture = gestures.find(r.gesture)
         if r.id not in in_time:
             doubtful.append(stretch)
-        elif gesture is None:
-            known = dataset.gestures.find(r.gesture)
-            (rest if known is not None and known.idle else other).append(stretch)
-        elif gesture.idle:
+        elif _is_idle(r.gesture, gestures, dataset.gestures):
             rest.append(stretch)
+        elif gesture is None:
+            other.append(stretch)
         else:
             truths.append(Interval(*stretch, gesture.label))
+    for labelled in (s for s in dataset.stretches if s.stream == stream.id and s.stop - s.start > 1):
+        stretch = (float(times[labelled.start]), float(times[labelled.stop - 1]))
+        gesture = gestures.find(labelled.gesture)
+        if labelled.label == HANDLING:
+            handling.append(stretch)
+        elif labelled.label == REST or _is_idle(labelled.gesture, gestures, dataset.gestures):
+            rest.append(stretch)
+        elif gesture is None:
+            other.append(stretch)
+        else:
+            practice.append(Interval(*stretch, gesture.label))
     parts = [(float(times[s.first_row]), float(times[s.last_row - 1])) for s in resample(frames, dataset.layout)]
-    seconds = uncovered_s(parts, [])
+    marked = [(t.start_s, t.stop_s) for t in (*truths, *practice)]
+    seconds, left = uncovered_s(parts, []), uncovered_s(parts, doubtful)
     return StreamTruth(
         stream.id,
         stream.subject,
@@ -99,10 +119,19 @@ def truth_of(dataset: Dataset, stream: StreamInfo, frames: Frames, gestures: Ges
         tuple(other),
         tuple(doubtful),
         stop_s=float(times[-1]) if len(times) else 0.0,
-        hours=uncovered_s(parts, doubtful) / 3600,
-        free_hours=uncovered_s(parts, [*((t.start_s, t.stop_s) for t in truths), *doubtful]) / 3600,
+        hours=left / 3600,
+        free_hours=uncovered_s(parts, [*marked, *doubtful]) / 3600,
         rest_hours=(seconds - uncovered_s(parts, rest)) / 3600,
+        known_hours=(left - uncovered_s(parts, [*marked, *rest, *other, *handling, *doubtful])) / 3600,
+        practice=tuple(practice),
+        handling=tuple(handling),
     )
+
+
+def _is_idle(label: str, gestures: GestureSet, others: GestureSet) -> bool:
+    """Return whether a gesture of a model, or else of the data set, is idle."""
+    gesture = gestures.find(label) or others.find(label)
+    return gesture is not None and gesture.idle
 
 
 def located(dataset: Dataset, stream: StreamInfo) -> list[RecordingInfo]:
@@ -124,7 +153,7 @@ def people_with_streams(dataset: Dataset) -> list[str]:
 
 # What an event is compared by: its gesture, the family, the affect, or only that there is an event.
 LEVELS = ("gesture", "family", "affect", "anything")
-PLACES = ("rest", "other", "unmarked")
+PLACES = ("rest", "handling", "other", "unmarked")
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,9 +190,9 @@ def model_events(
 class StreamScore:
     """Scores of one setting on some streams.
 
-    ``levels`` holds the tallies of each of `LEVELS` by label. ``places`` counts the events outside true gestures: in
-    recordings at rest (``rest``), in recordings of gestures that are not classes of the model (``other``), and
-    elsewhere (``unmarked``, where people may have practised).
+    ``levels`` holds the tallies of each of `LEVELS` by label. ``places`` counts the events outside true and practised
+    gestures: at rest (``rest``), where the toy is picked up, turned or put down (``handling``), in gestures that are
+    not classes of the model (``other``), and elsewhere (``unmarked``, where people may have practised).
     """
 
     levels: dict[str, Tallies] = field(default_factory=lambda: {level: {} for level in LEVELS})
@@ -172,6 +201,7 @@ class StreamScore:
     hours: float = 0.0
     free_hours: float = 0.0
     rest_hours: float = 0.0
+    known_hours: float = 0.0
     gate_events: int = 0
 
     def add(self, other: StreamScore) -> None:
@@ -181,7 +211,7 @@ class StreamScore:
                 self.levels[level].setdefault(label, Tally()).add(counts)
         for place, n in other.places.items():
             self.places[place] += n
-        for name in ("cost", "hours", "free_hours", "rest_hours", "gate_events"):
+        for name in ("cost", "hours", "free_hours", "rest_hours", "known_hours", "gate_events"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
     def total(self, level: str = "gesture") -> Tally:
@@ -211,9 +241,12 @@ class StreamScore:
             "false_events_per_hour": rate(gesture.insertions, self.hours),
             "outside_per_uncovered_hour": rate(gesture.outside, self.free_hours),
             "at_rest_per_hour": rate(self.places["rest"], self.rest_hours),
+            "practised": gesture.practised,
+            "false_events_per_known_hour": rate(gesture.insertions - self.places["unmarked"], self.known_hours),
             "hours": round(self.hours, 4),
             "uncovered_hours": round(self.free_hours, 4),
             "rest_hours": round(self.rest_hours, 4),
+            "known_hours": round(self.known_hours, 4),
             "latency_s": counts["latency_s"],
             "cost_per_truth": self.cost / gesture.truths if gesture.truths else None,
             "gate_events": self.gate_events,
@@ -294,8 +327,11 @@ def count_matches(
     number = {label: n for n, label in enumerate(gestures.labels)}
     predicted = np.array([number.get(e.label, -1) for e in intervals], dtype=np.int64)
     same = over & (np.array([number[t.label] for t in truths], dtype=np.int64)[:, None] == predicted)
-    matched = same.any(axis=0)
-    insertions = ~matched & ~((predicted < 0) & over.any(axis=0))
+    over_practice = overlaps(truth.practice, intervals, late_s)
+    practised = np.array([number[p.label] for p in truth.practice], dtype=np.int64)[:, None] == predicted
+    matched = same.any(axis=0) | (over_practice & practised).any(axis=0)
+    anything = over.any(axis=0) | over_practice.any(axis=0)
+    insertions = ~matched & ~((predicted < 0) & anything)
     latencies = []
     for true, mine in zip(truths, same, strict=True):
         if mine.any():
@@ -323,23 +359,28 @@ def score_events(
     families = dict(zip(gestures.labels, gestures.families, strict=True))
     affects = dict(zip(gestures.labels, gestures.affects, strict=True))
     by_gesture = gesture_intervals(events, gestures)
-    truths = truth.truths
+    truths, practice = truth.truths, truth.practice
     out = StreamScore(hours=truth.hours, free_hours=truth.free_hours, rest_hours=truth.rest_hours)
+    out.known_hours = truth.known_hours
     out.gate_events = sum(bool(e.source) for e in events)
-    out.levels["gesture"] = tally(truths, by_gesture, late_s)
-    out.levels["family"] = tally(_called(truths, families), _called(by_gesture, families), late_s)
+
+    def tallied(names: Mapping[str, str], named: Sequence[Interval]) -> Tallies:
+        return tally(_called(truths, names), named, late_s, _called(practice, names))
+
+    out.levels["gesture"] = tally(truths, by_gesture, late_s, practice)
+    out.levels["family"] = tallied(families, _called(by_gesture, families))
     if gestures.has_affect:
         by_affect = [
             Interval(e.start_s, e.stop_s, AFFECTS[e.affect] if e.affect or e.gesture != NO_GESTURE else UNNAMED)
             for e in events
         ]
-        out.levels["affect"] = tally(_called(truths, affects), by_affect, late_s)
+        out.levels["affect"] = tallied(affects, by_affect)
     whole = [Interval(e.start_s, e.stop_s, "anything") for e in events]
-    out.levels["anything"] = tally([Interval(t.start_s, t.stop_s, "anything") for t in truths], whole, late_s)
-    for event in outside_insertions(truths, by_gesture, late_s):
+    out.levels["anything"] = tallied(dict.fromkeys(gestures.labels, "anything"), whole)
+    for event in outside_insertions((*truths, *practice), by_gesture, late_s):
         out.places[_place(event, truth)] += 1
     named_affects = [AFFECTS[e.affect] for e in events]
-    out.cost = cost(truths, by_gesture, named_affects, families, affects, weights, late_s)
+    out.cost = cost(truths, by_gesture, named_affects, families, affects, weights, late_s, practice)
     return out
 
 
@@ -362,7 +403,7 @@ def _called(intervals: Sequence[Interval], names: Mapping[str, str]) -> list[Int
 
 
 def _place(event: Interval, truth: StreamTruth) -> str:
-    for name, stretches in (("rest", truth.rest), ("other", truth.other)):
+    for name, stretches in (("rest", truth.rest), ("handling", truth.handling), ("other", truth.other)):
         if any(a <= event.start_s < b for a, b in stretches):
             return name
     return "unmarked"

@@ -204,9 +204,21 @@ _UNKNOWN_TRAINING = (
 )
 
 
+LABELLED_RATES = (
+    "In {labelled} of {streams} streams, stretches between recordings are labelled: an event that names a practised "
+    "gesture is right, and one at rest or while the toy is handled is certainly false. Where there is no label, people "
+    "may have practised, so the rate is still an upper bound."
+)
+
+
 def describe_false_events(dataset: Dataset) -> str:
     """Return a sentence that explains how to read the false events on this data."""
-    return TRUE_RATES if dataset.layout.is_labelled else SIMULATED_RATES if dataset.head.simulated else UPPER_BOUND
+    if dataset.layout.is_labelled:
+        return TRUE_RATES
+    if dataset.head.simulated:
+        return SIMULATED_RATES
+    labelled = {s.stream for s in dataset.stretches}
+    return LABELLED_RATES.format(labelled=len(labelled), streams=len(dataset.streams)) if labelled else UPPER_BOUND
 
 
 @contextmanager
@@ -247,6 +259,7 @@ def stream_eval(
     subjects: Sequence[str] | None = None,
     late_s: float = LATE_S,
     events: str | os.PathLike[str] | None = None,
+    labels: bool = True,
     warn: Warn = silent,
 ) -> dict[str, Any]:
     """Replay whole streams through one bundle with its own decision settings, and score its events.
@@ -257,6 +270,7 @@ def stream_eval(
             scored only if named here, and is marked in the result.
         late_s: longest time in seconds after a gesture's end at which an event still counts as its answer.
         events: a CSV file to write the events to, which `score_predictions` reads.
+        labels: whether to use the labels of stretches between recordings (`Dataset.stretches`).
         warn: called with a sentence on the people who are left out or were trained on.
 
     Returns:
@@ -269,6 +283,7 @@ def stream_eval(
     """
     bundle = model if isinstance(model, Bundle) else Bundle.load(Path(model))
     with streams_at(path, bundle) as dataset:
+        dataset = dataset if labels else dataset.without_stretches()
         dataset = dataset.with_inputs(bundle.layout).with_gestures(bundle.gestures)
         if dataset.layout.inputs != bundle.layout.inputs:
             raise BundleError(
@@ -313,6 +328,7 @@ def stream_eval(
             "settings": {k: v for k, v in spec.to_dict().items() if k not in ("gate", "health", "fitted")},
             "gate_rules": len(spec.gate.rules),
             "late_s": late_s,
+            "labelled_stretches": len(dataset.stretches),
             "note": describe_false_events(dataset),
         }
 
@@ -325,6 +341,7 @@ def score_predictions(
     classes: str | Sequence[str] = SHARED,
     threshold: float = 0.0,
     late_s: float = LATE_S,
+    labels: bool = True,
     warn: Warn = silent,
 ) -> dict[str, Any]:
     """Score the predictions of any system against the true gestures of whole streams.
@@ -337,6 +354,7 @@ def score_predictions(
         classes: gestures to score, as for `train`: "shared", "all", labels, or the TOML file of a gesture set.
         threshold: lowest score of a prediction that counts.
         late_s: longest time in seconds after a gesture's end at which an event still counts as its answer.
+        labels: whether to use the labels of stretches between recordings (`Dataset.stretches`).
         warn: called with a sentence on streams and gestures that are left out.
 
     Returns:
@@ -350,7 +368,7 @@ def score_predictions(
     if not 0.0 <= threshold <= 1.0:
         raise ConfigError(f"The threshold is {threshold:g}: accepted are 0 to 1, as for scores.")
     with streams_at(path) as dataset:
-        dataset, classes = named_classes(dataset, classes)
+        dataset, classes = named_classes(dataset if labels else dataset.without_stretches(), classes)
         gestures = choose_classes(dataset, classes, warn)
         there = scored_streams(dataset, _people_of(dataset, path, subjects))
         wanted = [s for s in there if subjects is None or s.subject in subjects]
@@ -389,6 +407,7 @@ def score_predictions(
             "classes": list(gestures.labels),
             "streams": [truth.stream for truth in truths],
             "late_s": late_s,
+            "labelled_stretches": len(dataset.stretches),
             "note": f"{describe_false_events(dataset)} {_UNKNOWN_TRAINING}",
         }
 
@@ -402,6 +421,7 @@ def stream_benchmark(
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     late_s: float = LATE_S,
+    labels: bool = True,
     anywhere_pool_s: float | None = None,
     progress: Callable[[JobProgress], None] | None = None,
     warn: Warn = silent,
@@ -418,12 +438,14 @@ def stream_benchmark(
         systems: names of `plushsense.experiments.streams.systems.SYSTEMS`; by default all.
         out: a folder for the table as JSON and CSV, a page, and its figures.
         late_s: longest time in seconds after a gesture's end at which an event still counts as its answer.
+        labels: whether to train and score with the labels of stretches between recordings (`Dataset.stretches`).
         anywhere_pool_s: pooling time in seconds of the networks of stream training (default: that of the others).
 
     Returns:
         what `score.summed` returns, with ``dataset``, ``simulated``, ``split``, ``note`` and the settings.
     """
     dataset, config = network_inputs_of(as_dataset(dataset), config or from_settings(**settings))
+    dataset = dataset if labels else dataset.without_stretches()
     names = _named(systems)
     if out is not None:
         need("matplotlib", extra="reports")
@@ -452,6 +474,7 @@ def stream_benchmark(
         "labelled": dataset.layout.is_labelled,
         "note": describe_false_events(dataset),
         "late_s": late_s,
+        "labelled_stretches": len(dataset.stretches),
         "subjects": sorted({person for fold in folds for person in fold["test"]} & set(people_with_streams(dataset))),
         "code_version": __version__,
         **summed(folds),

@@ -19,8 +19,8 @@ from plushsense.dataset.quality.findings import SEVERITIES
 from plushsense.studio.app.shell import Page, address, on_change, set_address, tag
 from plushsense.studio.pages.review.review import EXCLUDED, LABELLED, LOOKING, STATES, Review, ReviewedRecording
 
-TABLE, ONE, OVERLAY = "table", "one", "overlay"
-VIEWS = (TABLE, ONE, OVERLAY)
+TABLE, ONE, OVERLAY, STREAM = "table", "one", "overlay", "stream"
+VIEWS = (TABLE, ONE, OVERLAY, STREAM)
 WHO_COOKIE = "plushsense_who"
 _AHEAD = 4
 _LOOK_S = 1.5
@@ -112,7 +112,7 @@ def filter_and_sort(
 
 
 class ReviewView(Protocol):
-    """Interface of the views of the page: the table, one recording, and the overlay of a gesture."""
+    """Interface of the views of the page: the table, one recording, the overlay of a gesture, and one stream."""
 
     @property
     def place(self) -> ui.element:
@@ -131,6 +131,7 @@ class ReviewController:
     Attributes:
         visit: id of the browser tab, whose decisions can be undone one by one, even after a reload.
         current: id of the displayed recording, "" for none.
+        stream: id of the displayed stream, "" for none.
         order: sorted ids that passed the filter when it was set; `next` skips those that no longer pass.
         first_row: index in ``order`` of the first row on the current page of the table.
         ends: whether accepting a suggestion also accepts the suggested stop.
@@ -144,6 +145,11 @@ class ReviewController:
         self.by, self.down = "recording", False
         self.view = query["view"] if query.get("view") in VIEWS else ONE if query.get("recording") else TABLE
         self.current = ""
+        streams = () if review.is_labelled else (s.id for s in review.dataset.streams)
+        self.streams = sorted(streams)
+        self.stream = query.get("stream", "") if query.get("stream") in self.streams else next(iter(self.streams), "")
+        if self.view == STREAM and not self.streams:
+            self.view = TABLE
         self.order: list[str] = []
         self.trail: list[str] = []
         self.first_row = 0
@@ -168,7 +174,7 @@ class ReviewController:
     # Building -----------------------------------------------------------------------------------------------------
 
     def build(self, views: Mapping[str, Callable[[ReviewController], ReviewView]]) -> None:
-        """Build the header, the filters, and the views `TABLE`, `ONE` and `OVERLAY`."""
+        """Build the header, the filters, and the views of `VIEWS`; `STREAM` can only be chosen if there are streams."""
         words, review = self.words, self.review
         with ui.row().classes("w-full items-center ps-small-gap"):
             tag(ui.label(review.dataset.head.name).classes("text-lg text-bold"), "name")
@@ -184,7 +190,8 @@ class ReviewController:
         if review.is_labelled:
             tag(ui.label(words("review.labelled")).classes("ps-message ps-message-info w-full"), "labelled")
         with ui.row().classes("w-full items-center ps-small-gap"):
-            toggle = ui.toggle({v: words(f"review.view_{v}") for v in VIEWS}, value=self.view)
+            shown = [v for v in VIEWS if v != STREAM or self.streams]
+            toggle = ui.toggle({v: words(f"review.view_{v}") for v in shown}, value=self.view)
             toggle.props(f'no-caps unelevated aria-label="{words("review.view")}"').classes("ps-toggle")
             self.toggle = tag(toggle, "view")
             self.toggle.on_value_change(lambda e: self.turn_to(str(e.value)))
@@ -289,7 +296,7 @@ class ReviewController:
         if view == TABLE:
             self.arrange()
         self.views[view].draw()
-        self._update_address()
+        self.update_address()
 
     async def open(self, identity: str) -> None:
         """Switch to the view of one recording and display ``identity``."""
@@ -306,7 +313,7 @@ class ReviewController:
             self.current = identity
             self.views[ONE].draw()
         self._update_counts()
-        self._update_address()
+        self.update_address()
         ahead = [i for i in self.following(_AHEAD) if not self.review.is_read(i)]
         if ahead:
             background_tasks.create(run.io_bound(self._read_ahead, ahead), name="review: neighbours")
@@ -375,6 +382,15 @@ class ReviewController:
                     return
             self.views[ONE].refresh()
 
+    async def mark(self, decision: Callable[[], Any]) -> bool:
+        """Call ``decision``, which is about no recording; return whether it succeeded."""
+        async with self._turn:
+            with self.page.show_errors():
+                await run.io_bound(decision)
+                self.page.say("")
+                return True
+        return False
+
     async def undo(self) -> None:
         """Discard the draft of the displayed recording; if there is none, undo this tab's last decision."""
         async with self._turn:
@@ -424,10 +440,13 @@ class ReviewController:
         self.making.set_text(text)
         self.making.set_visibility(bool(text))
 
-    def _update_address(self) -> None:
+    def update_address(self) -> None:
+        """Store the state of the page in its address."""
         query = {**self._query, "dataset": str(self.review.path), **self.filter.query(), "view": self.view}
         if self.view == ONE:
             query["recording"] = self.current
+        if self.view == STREAM:
+            query["stream"] = self.stream
         pairs = list(query.items())
         if self.only is not None and not query.get("selection"):
             pairs += [("recordings", i) for i in self.only]

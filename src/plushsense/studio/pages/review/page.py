@@ -1,4 +1,4 @@
-"""Build the review page, which shows the recordings of a data set as a table, one by one, and as overlays.
+"""Build the review page: the recordings of a data set as a table, one by one, and as overlays, and its streams.
 
 The query parameters of the address contain the state of the page, for links and reloads:
 
@@ -10,7 +10,7 @@ The query parameters of the address contain the state of the page, for links and
     the same, but stored under a key. `plushsense.studio.pages.review.review.Reviews.address` chooses one of these.
 ``person, gesture, state, severity, check, text``
     the filters (`plushsense.studio.pages.review.controller.RecordingFilter`).
-``view=table | one | overlay``, ``recording=ID``
+``view=table | one | overlay | stream``, ``recording=ID``, ``stream=ID``
     the open view; ``recording`` alone opens that recording.
 """
 
@@ -22,9 +22,10 @@ from pathlib import Path
 from nicegui import context, run, ui
 
 from plushsense.studio.app.shell import Page, address, query, tag
-from plushsense.studio.pages.review.controller import ONE, OVERLAY, TABLE, ReviewController
+from plushsense.studio.pages.review.controller import ONE, OVERLAY, STREAM, TABLE, ReviewController
 from plushsense.studio.pages.review.recording_view import GestureOverlayView, RecordingView
 from plushsense.studio.pages.review.review import Review, Reviews
+from plushsense.studio.pages.review.stream_view import StreamView
 from plushsense.studio.pages.review.table_view import RecordingTableView
 
 _CSS = Path(__file__).with_name("review.css")
@@ -59,7 +60,9 @@ async def show(page: Page) -> None:
             title, recordings = selection
         controller = ReviewController(page, review, values)
         controller.limit(title, recordings)
-        controller.build({TABLE: RecordingTableView, ONE: RecordingView, OVERLAY: GestureOverlayView})
+        controller.build(
+            {TABLE: RecordingTableView, ONE: RecordingView, OVERLAY: GestureOverlayView, STREAM: StreamView}
+        )
         await controller.begin(values.get("recording", ""))
     opening.delete()
 

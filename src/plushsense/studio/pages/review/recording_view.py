@@ -26,6 +26,7 @@ class ReviewPlot(Element, component="review_plot.js"):
         on_pick: called on a click with {x, y, button ("left" or "right"), shift, recording (id of the plotted one)}.
         on_key: called with {key, shift, recording}, except for keys typed into a field or a dialog.
         on_zoom: called with {low, high, recording} after zooming into thinned curves.
+        on_select: called with {low, high, recording} after dragging over a range; without it, nothing can be selected.
     """
 
     def __init__(
@@ -37,12 +38,14 @@ class ReviewPlot(Element, component="review_plot.js"):
         on_pick: Callable[[dict[str, Any]], Any],
         on_key: Callable[[dict[str, Any]], Any] | None = None,
         on_zoom: Callable[[dict[str, Any]], Any] | None = None,
+        on_select: Callable[[dict[str, Any]], Any] | None = None,
     ) -> None:
         super().__init__()
         self.add_resource(_VENDOR)
         self._props.update({"label": label, "height": height, "legend": legend, "keyed": on_key is not None})
+        self._props["selects"] = on_select is not None
         self.classes("w-full")
-        for event, handler in (("pick", on_pick), ("key", on_key), ("zoomed", on_zoom)):
+        for event, handler in (("pick", on_pick), ("key", on_key), ("zoomed", on_zoom), ("selected", on_select)):
             if handler is not None:
                 self.on(event, lambda e, handler=handler: handler(dict(e.args)))
 
@@ -59,7 +62,7 @@ class ReviewPlot(Element, component="review_plot.js"):
         lanes: Sequence[tuple[float, str]] = (),
         limits: tuple[float, float] | None = None,
         marks: Sequence[dict[str, Any]] = (),
-        cut: Sequence[tuple[float, float]] = (),
+        cut: Sequence[tuple[Any, ...]] = (),
         thinned: bool = False,
         keep: bool = False,
     ) -> None:
@@ -71,7 +74,7 @@ class ReviewPlot(Element, component="review_plot.js"):
             lanes: pairs (position, name) that replace the numbers of the y-axis.
             limits: range of the y-axis.
             marks: vertical lines with ``x``, ``label``, ``stroke`` and ``dash``.
-            cut: ranges (from, to) to shade because they are trimmed off.
+            cut: ranges (from, to) to shade because they are trimmed off, or (from, to, CSS colour, name).
             keep: whether to keep the zoom if the recording is the same.
         """
         plot = {"id": identity, "label": label, "data": [x, *curves], "series": series, "from": x[0] if x else 0.0}
@@ -79,7 +82,7 @@ class ReviewPlot(Element, component="review_plot.js"):
         self.run_method("show", plot | {"thinned": thinned, "keep": keep})
 
     def remark(
-        self, identity: str, marks: Sequence[dict[str, Any]], cut: Sequence[tuple[float, float]], label: str
+        self, identity: str, marks: Sequence[dict[str, Any]], cut: Sequence[tuple[Any, ...]], label: str
     ) -> None:
         """Replace the marks, shaded ranges and text alternative of the plotted recording."""
         self.run_method("remark", identity, marks, cut, label)
@@ -87,6 +90,14 @@ class ReviewPlot(Element, component="review_plot.js"):
     def zoom(self, factor: float) -> None:
         """Scale the visible range by ``factor`` around the first mark; 0 displays the whole recording."""
         self.run_method("zoom", factor)
+
+    def look(self, low: float, high: float) -> None:
+        """Display the range from ``low`` to ``high`` seconds."""
+        self.run_method("look", low, high)
+
+    def pan(self, share: float) -> None:
+        """Move the visible range by a share of its length."""
+        self.run_method("pan", share)
 
 
 _MAX_OUTLIERS = 30
@@ -208,6 +219,14 @@ _ZOOMS = {"zoom_in": ("zoom_in", 0.5), "zoom_out": ("zoom_out", 2.0), "zoom_all"
 _DASHES: tuple[list[int], ...] = ([], [7, 4], [2, 3])
 
 
+def curve_styles(names: Sequence[str]) -> list[dict[str, Any]]:
+    """Return label, colour and dashes of each curve, as `ReviewPlot.show` takes them."""
+    return [
+        {"label": n, "stroke": LINES[i % len(LINES)], "dash": _DASHES[i // len(LINES) % len(_DASHES)]}
+        for i, n in enumerate(names)
+    ]
+
+
 class RecordingView:
     """View of one recording: its signals, marks, findings and actions."""
 
@@ -297,11 +316,7 @@ class RecordingView:
             self.heading.set_text(words("review.none_fit"))
             return
         plotted = desk.review.signals(identity).curves(self.group, low, high)
-        names = [self._kind(n) if n == ACTIVITY else n for n in plotted["names"]]
-        series = [
-            {"label": n, "stroke": LINES[i % len(LINES)], "dash": _DASHES[i // len(LINES) % len(_DASHES)]}
-            for i, n in enumerate(names)
-        ]
+        series = curve_styles([self._kind(n) if n == ACTIVITY else n for n in plotted["names"]])
         y_title = words("review.y_axis", unit=words.unit(plotted["unit"])) if plotted["unit"] else ""
         lanes = [(at, self._kind(kind)) for at, kind in plotted["lanes"]]
         self.plot.show(

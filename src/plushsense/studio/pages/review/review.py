@@ -22,11 +22,12 @@ import numpy as np
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.files import write_file
+from plushsense.dataset import labelling
 from plushsense.dataset import trimming as trim
 from plushsense.dataset.files import current_stamp
 from plushsense.dataset.index import apply_marks, open_dataset
 from plushsense.dataset.marks import SUGGESTED as BY_SUGGESTION
-from plushsense.dataset.marks import Mark, MarksFollower, MarkState, append_marks, inverse_mark
+from plushsense.dataset.marks import LabelledStretch, Mark, MarksFollower, MarkState, append_marks, inverse_marks
 from plushsense.dataset.onset import Suggestion
 from plushsense.dataset.quality.findings import SEVERITIES, Finding
 from plushsense.dataset.store import Dataset, RecordingInfo
@@ -37,6 +38,7 @@ from plushsense.studio.pages.review.signals import (
     ReviewPreparation,
     build_overlay,
     read_signals,
+    read_stream_signals,
     trimmed_curve,
 )
 
@@ -87,6 +89,7 @@ class ReviewDecision:
     before: MarkState
     after: MarkState
     check: str = ""
+    rows: tuple[int, int] = (0, -1)
 
     def changed_part(self, marks: MarkState) -> Any:
         """Return the part of a mark state that the decision changes."""
@@ -94,6 +97,8 @@ class ReviewDecision:
             return self.check in marks.accepted
         if self.action in ("exclude", "include"):
             return marks.excluded
+        if self.action in ("label", "unlabel"):
+            return marks.stretches
         return marks.start, marks.stop, marks.how
 
 
@@ -119,6 +124,8 @@ class Review:
         self._histories: OrderedDict[str, list[ReviewDecision]] = OrderedDict()
         self._drafts: dict[str, tuple[int, int]] = {}
         self._read: OrderedDict[str, RecordingSignals] = OrderedDict()
+        self._stream: RecordingSignals | None = None
+        self._marked_source: Any = None
         self._rows: dict[str, ReviewedRecording] = {}
         self._marks = MarksFollower(path)
         self._open()
@@ -145,6 +152,7 @@ class Review:
             if new:
                 self._open()
                 self._read.clear()
+                self._stream = None
         self.look()
         if new or self.unchecked:
             self.check()
@@ -273,6 +281,34 @@ class Review:
                 self._read.popitem(last=False)
         return signals
 
+    def stream_signals(self, stream: str) -> RecordingSignals:
+        """Return the signals of a stream; those of the last one are cached."""
+        if self._stream is None or self._stream.info.id != stream:
+            (found,) = labelling.find_streams(self.dataset, stream)
+            with self._reading:
+                self._stream = read_stream_signals(self.dataset, found)
+        return self._stream
+
+    def stream_if_read(self, stream: str) -> RecordingSignals | None:
+        """Return the signals of a stream if they are cached."""
+        return self._stream if self._stream is not None and self._stream.info.id == stream else None
+
+    def recordings_in(self, stream: str) -> list[RecordingInfo]:
+        """Return the recordings that lie in a stream and are not excluded, as the marks trim them."""
+        return [r for r in self._marked().used if r.stream == stream and r.stream_row >= 0]
+
+    def stretches(self, stream: str) -> list[LabelledStretch]:
+        """Return the labelled stretches of a stream."""
+        return [s for s in self._marked().stretches if s.stream == stream]
+
+    def _marked(self) -> Dataset:
+        """Return `as_marked`, computed again only after a change."""
+        with self._lock:
+            source = (self.version, id(self._standing), id(self.dataset))
+            if self._marked_source != source:
+                self._marked_source, self._marked_dataset = source, self.as_marked()
+            return self._marked_dataset
+
     def is_read(self, identity: str) -> bool:
         """Return whether the signals of a recording are cached."""
         return identity in self._read
@@ -326,7 +362,15 @@ class Review:
 
     # Decisions ----------------------------------------------------------------------------------------------------
 
-    def _decide(self, visit: str, about: str, action: str, make: Callable[[], object], check: str = "") -> bool:
+    def _decide(
+        self,
+        visit: str,
+        about: str,
+        action: str,
+        make: Callable[[], object],
+        check: str = "",
+        rows: tuple[int, int] = (0, -1),
+    ) -> bool:
         """Call ``make`` to write marks, store how to undo them, and return whether the state changed."""
         with self._lock:
             self._standing = self._marks.states()
@@ -336,7 +380,7 @@ class Review:
             now = self.standing(about)
             if now != before:
                 history = self._histories.setdefault(visit, [])
-                history.append(ReviewDecision(about, action, before, now, check))
+                history.append(ReviewDecision(about, action, before, now, check, rows))
                 self._histories.move_to_end(visit)
                 while len(self._histories) > _MAX_VISITS:
                     self._histories.popitem(last=False)
@@ -396,6 +440,22 @@ class Review:
         """Reopen an accepted finding."""
         return self._mark(visit, Mark(finding.about, "unaccept", who, check=finding.check))
 
+    def label(self, visit: str, stream: str, rows: tuple[int, int], label: str, who: str) -> bool:
+        """Label rows of a stream, or with the label "" remove their labels; return whether the marks changed.
+
+        Raises:
+            DatasetError: for an unknown stream or label, or rows that do not exist.
+        """
+        (found,) = labelling.find_streams(self.dataset, stream)
+        if label:
+            new = [LabelledStretch(stream, *rows, label)]
+            return self._decide(
+                visit, stream, "label", partial(labelling.label_stretches, self.dataset, new, who), rows=rows
+            )
+        return self._decide(
+            visit, stream, "unlabel", partial(labelling.unlabel, self.dataset, found, *rows, who), rows=rows
+        )
+
     def _mark(self, visit: str, mark: Mark) -> bool:
         before = self.standing(mark.recording)
         if {
@@ -429,8 +489,9 @@ class Review:
                 raise DatasetError(
                     f"'{last.recording}' has been changed in another window or program since then: nothing is undone."
                 )
-            mark = Mark(last.recording, last.action, who, check=last.check)
-            append_marks(self.path, [inverse_mark(mark, last.before, who, why)])
+            start, stop = last.rows
+            mark = Mark(last.recording, last.action, who, start=start, stop=stop, check=last.check)
+            append_marks(self.path, inverse_marks(mark, last.before, who, why))
             history.pop()
             self._standing = self._marks.states()
         self._changed()

@@ -4,12 +4,12 @@ import { loadResource } from "../../static/utils/resources.js";
 
 const colour = (name) => getComputedStyle(document.body).getPropertyValue(name).trim() || "#555";
 const OURS = ["Enter", "Backspace", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End", "Escape"];
-const LETTERS = ["x", "u", "s", "i", "+", "-", "0", ",", ".", ";", ":", "<", ">"];
+const LETTERS = ["x", "u", "s", "i", "p", "h", "r", "d", "+", "-", "0", ",", ".", ";", ":", "<", ">"];
 const REPEATED = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", ",", ".", "<", ">", ";", ":"];
 
 export default {
   template: '<div role="img" :aria-label="text" tabindex="-1" :data-recording="recording"><div ref="place"></div></div>',
-  props: { label: String, height: Number, legend: Boolean, keyed: Boolean, resourcePath: String },
+  props: { label: String, height: Number, legend: Boolean, keyed: Boolean, selects: Boolean, resourcePath: String },
   data() {
     return { text: this.label, recording: "" };
   },
@@ -84,17 +84,18 @@ export default {
         width: this.$el.clientWidth || 600,
         height: this.height,
         legend: { show: this.legend, live: false },
-        cursor: { drag: { x: false, y: false }, points: { show: false } },
+        cursor: { drag: { x: this.selects, y: false, setScale: false, dist: 4 }, points: { show: false } },
         scales: { x: { time: false }, y: p.range ? { range: p.range } : {} },
         axes: [{ stroke: ink, grid, ticks: grid, label: p.xTitle, labelSize: 22, size: 44 }, y],
         series: [{ label: p.xTitle }, ...p.series.map((s) => ({ width: 1.4, points: { show: false }, ...s }))],
-        hooks: { drawClear: [(u) => this.drawBehind(u)], draw: [(u) => this.drawMarks(u)] },
+        hooks: { drawClear: [(u) => this.drawBehind(u)], draw: [(u) => this.drawMarks(u)], setSelect: [(u) => this.select(u)] },
       };
       this.u = new uPlot(options, p.data, this.$refs.place);
       const over = this.u.over;
       over.style.cursor = "crosshair";
       const pick = (event, button) => {
         event.preventDefault();
+        if (performance.now() - (this.selected || -1000) < 100) return;
         const box = over.getBoundingClientRect();
         const x = this.u.posToVal(event.clientX - box.left, "x"), v = this.u.posToVal(event.clientY - box.top, "y");
         this.$emit("pick", { x, y: v, button, shift: event.shiftKey, recording: this.recording });
@@ -108,18 +109,33 @@ export default {
         this.zoom(event.deltaY < 0 ? 0.7 : 1.4, x);
       }, { passive: false });
     },
+    select(u) {
+      const { left, width } = u.select;
+      if (width < 1) return;
+      // The click that ends the drag is no click into the plot.
+      this.selected = performance.now();
+      this.$emit("selected", { low: u.posToVal(left, "x"), high: u.posToVal(left + width, "x"), recording: this.recording });
+      u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
+    },
     drawBehind(u) {
-      // Shade the parts that are cut off, and the part of the stream before the recording.
+      // Shade ranges with their names, if these fit in, and the part of the stream before the recording.
       const { ctx } = u, { left, top, width, height } = u.bbox, x = (v) => u.valToPos(v, "x", true);
-      const fill = (from, to, style) => {
+      const fill = (from, to, style, name) => {
         const a = Math.max(left, from), b = Math.min(left + width, to);
         if (b <= a) return;
         ctx.fillStyle = style;
         ctx.fillRect(a, top, b - a, height);
+        if (!name) return;
+        ctx.font = `${12 * devicePixelRatio}px sans-serif`;
+        if (ctx.measureText(name).width > b - a - 4) return;
+        ctx.fillStyle = colour("--ps-ink");
+        ctx.textAlign = "left";
+        ctx.textBaseline = "alphabetic";
+        ctx.fillText(name, a + 2, top + height - 6 * devicePixelRatio);
       };
       ctx.save();
       if (this.p.from < 0) fill(x(this.p.from), x(0), "rgba(128,128,128,0.28)");
-      for (const [from, to] of this.cut || []) fill(x(from), x(to), "rgba(213,94,0,0.16)");
+      for (const [from, to, style, name] of this.cut || []) fill(x(from), x(to), style || "rgba(213,94,0,0.16)", name);
       ctx.restore();
     },
     drawMarks(u) {
@@ -184,6 +200,19 @@ export default {
       this.cut = cut;
       this.text = label;
       this.u?.redraw(false);
+    },
+    look(low, high) {
+      const xs = this.p?.data[0];
+      if (!this.u || high - low < 0.02) return;
+      const first = xs[0], last = xs[xs.length - 1], width = Math.min(high - low, last - first);
+      const from = Math.min(Math.max(first, low), last - width);
+      this.u.setScale("x", { min: from, max: from + width });
+      if (this.p.thinned) this.$emit("zoomed", { low: from, high: from + width, recording: this.recording });
+    },
+    pan(share) {
+      if (!this.u) return;
+      const { min, max } = this.u.scales.x;
+      this.look(min + share * (max - min), max + share * (max - min));
     },
     zoom(factor, at) {
       if (!this.u) return;

@@ -28,7 +28,7 @@ from plushsense.core.version import __version__
 from plushsense.dataset.files import CACHE
 from plushsense.dataset.onset import SPEC, Suggestion
 from plushsense.dataset.quality.checking import CheckReport, check
-from plushsense.dataset.store import Dataset, RecordingInfo
+from plushsense.dataset.store import Dataset, RecordingInfo, StreamInfo
 from plushsense.dataset.trimming import row_times_s, suggest_trims
 from plushsense.reports.quality import scale_of
 from plushsense.reports.quality_figures import deviation, line
@@ -116,7 +116,8 @@ class RecordingSignals:
 def read_signals(dataset: Dataset, info: RecordingInfo, scale: NDArray[np.float64]) -> RecordingSignals:
     """Read a recording and the part of its stream just before it."""
     layout = dataset.layout
-    frames = dataset.read(replace(info, start=0, stop=info.rows))
+    whole = info.id == info.stream
+    frames = dataset.read_stream(info.stream) if whole else dataset.read(replace(info, start=0, stop=info.rows))
     before, before_at = _before(dataset, info, frames)
     seconds = row_times_s(frames)
     raw = np.concatenate([before, frames.values])
@@ -131,6 +132,13 @@ def read_signals(dataset: Dataset, info: RecordingInfo, scale: NDArray[np.float6
         np.where(bad, np.nan, raw * steps),
         np.round(active, 4),
     )
+
+
+def read_stream_signals(dataset: Dataset, stream: StreamInfo) -> RecordingSignals:
+    """Read a stream as if it were one recording, without activity."""
+    key = (stream.id, stream.subject, stream.session, "", stream.file)
+    info = RecordingInfo(*key, 0, stream.rows, 0, stream.rows, stream.id, 0, 0, 0, 0.0, False, stream.flags, "")
+    return read_signals(dataset, info, np.empty(0))
 
 
 def _before(dataset: Dataset, info: RecordingInfo, frames: Frames) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -1,0 +1,46 @@
+"""Implement ``plushsense label DATASET [STREAM] [--from S --to S --as LABEL | --undo | --import FILE]``."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+
+from plushsense.cli.options import options
+from plushsense.cli.output import emit, say, table
+
+_LINES = 40
+
+
+def run(args: argparse.Namespace) -> int:
+    from plushsense.dataset.labelling import decide_labels, write_stretches
+
+    done = decide_labels(
+        args.dataset,
+        args.stream,
+        start_s=getattr(args, "from"),
+        stop_s=args.to,
+        label=getattr(args, "as"),
+        file=getattr(args, "import"),
+        **options(args, "undo", "who", "why"),
+    )
+    if args.export:
+        write_stretches(args.export, done.stretches)
+        say(f"written: {args.export}")
+    seconds: dict[str, float] = {}
+    for s in done.stretches:
+        seconds[s.label] = seconds.get(s.label, 0.0) + s.stop_s - s.start_s
+    result = {
+        "stretches": [asdict(s) for s in done.stretches],
+        "seconds": {label: round(total, 1) for label, total in sorted(seconds.items())},
+        "labelled": done.labelled,
+        "undone": done.undone,
+    }
+    if getattr(args, "as") or getattr(args, "import"):
+        say(f"labelled {done.labelled}")
+    if args.undo:
+        say(f"undone {done.undone}")
+    rows = [(s.stream, f"{s.start_s:.2f}", f"{s.stop_s:.2f}", s.label) for s in done.stretches]
+    listing = [table(("stream", "start s", "stop s", "label"), rows), ""] if 0 < len(rows) <= _LINES else []
+    totals = "".join(f"; {label} {total:.0f} s" for label, total in sorted(seconds.items()))
+    emit(args, result, [*listing, f"{len(rows)} labelled stretches{totals}"])
+    return 0

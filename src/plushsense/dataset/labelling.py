@@ -1,0 +1,255 @@
+"""Label stretches of streams by marks: practised gestures, handling of the toy, and rest; read and write them as CSV.
+
+Times are in seconds of the device clock since the first frame of the stream (`row_times_s`). Rows of located recordings
+need no label: they keep the gesture of the recording, whatever the marks say (`Dataset.stretches`).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from plushsense.core.errors import ConfigError, DatasetError, nearest
+from plushsense.core.files import write_file
+from plushsense.dataset.index import as_dataset
+from plushsense.dataset.marks import (
+    HANDLING,
+    PRACTICE,
+    REST,
+    LabelledStretch,
+    Mark,
+    MarkState,
+    append_marks,
+    apply_mark,
+    match_ids,
+    read_marks,
+)
+from plushsense.dataset.quality.checking import author_name
+from plushsense.dataset.store import Dataset, StreamInfo, read_csv_rows
+from plushsense.dataset.trimming import row_times_s
+
+COLUMNS = ("stream", "start_s", "stop_s", "label")
+
+
+@dataclass(frozen=True)
+class TimedStretch:
+    """A labelled stretch in seconds since the first frame of its stream."""
+
+    stream: str
+    start_s: float
+    stop_s: float
+    label: str
+
+
+def check_label(dataset: Dataset, label: str) -> str:
+    """Return ``label`` with the gesture as the data set writes it.
+
+    Raises:
+        DatasetError: for a label that is not handling, rest, or practice: and a gesture of the data set.
+    """
+    word, colon, gesture = label.strip().partition(":")
+    kind = word.strip().casefold()
+    if kind in (HANDLING, REST) and not colon:
+        return kind
+    if kind + colon == PRACTICE and (found := dataset.gestures.find(gesture.strip())) is not None:
+        return PRACTICE + found.label
+    known = [HANDLING, REST, *(PRACTICE + each for each in dataset.gestures.labels)]
+    raise DatasetError(
+        f"The label '{label}' is unknown: accepted are {HANDLING}, {REST}, and {PRACTICE} with a gesture of "
+        f"'{dataset.head.name}', such as '{known[-1]}'.{nearest(label, known)}"
+    )
+
+
+def find_streams(dataset: Dataset, pattern: str = "*") -> list[StreamInfo]:
+    """Return the streams that ``pattern`` (an id, or with ``*`` and ``?``) matches.
+
+    Raises:
+        DatasetError: if there is none, or every row of the streams already has a label.
+    """
+    if dataset.layout.is_labelled:
+        raise DatasetError(
+            f"The streams of '{dataset.head.name}' have a label on every row (layout '{dataset.layout.name}'): nothing "
+            "between the recordings is left to label."
+        )
+    if not dataset.streams:
+        raise DatasetError(f"'{dataset.head.name}' has no streams: labels are for streams, between the recordings.")
+    ids = {s.id: s for s in dataset.streams}
+    return [ids[identity] for identity in match_ids(pattern, ids, "stream")]
+
+
+def rows_between(dataset: Dataset, stream: StreamInfo, start_s: float, stop_s: float) -> tuple[int, int]:
+    """Return the rows of a stream from ``start_s`` to before ``stop_s``.
+
+    Raises:
+        DatasetError: for times outside the stream, or without a row between them.
+    """
+    seconds = row_times_s(dataset.read_stream(stream.id))
+    for value in (start_s, stop_s):
+        if not 0.0 <= value <= seconds[-1] + 0.01:
+            raise DatasetError(f"'{stream.id}' has no {value:g} s: it runs from 0 to {seconds[-1]:.3f} s.")
+    # Allow half a millisecond, since displayed times are rounded to milliseconds.
+    start, stop = (int(row) for row in np.searchsorted(seconds, (start_s - 5e-4, stop_s - 5e-4)))
+    stop = min(stop, stream.rows)
+    if stop <= start:
+        raise DatasetError(f"'{stream.id}' has no row from {start_s:g} to {stop_s:g} s: label more.")
+    return start, stop
+
+
+def timed_stretches(dataset: Dataset, streams: Iterable[StreamInfo]) -> list[TimedStretch]:
+    """Return the labelled stretches of ``streams`` in seconds."""
+    out = []
+    for stream in streams:
+        if mine := [s for s in dataset.stretches if s.stream == stream.id]:
+            seconds = row_times_s(dataset.read_stream(stream.id)).round(3)
+            out += [TimedStretch(s.stream, float(seconds[s.start]), float(seconds[s.stop]), s.label) for s in mine]
+    return out
+
+
+def label_stretches(
+    dataset: Dataset, stretches: Iterable[LabelledStretch], who: str | None = None, why: str = ""
+) -> list[LabelledStretch]:
+    """Label stretches by marks, in their order; return those that the marks did not state already.
+
+    Earlier labels of the same rows are replaced. ``dataset`` is not updated: open it again.
+
+    Raises:
+        DatasetError: for an unknown label or stream, or rows that do not exist. No mark is written then.
+    """
+    checked = []
+    for s in stretches:
+        (stream,) = find_streams(dataset, s.stream)
+        if not 0 <= s.start < s.stop <= stream.rows:
+            raise DatasetError(f"'{s.stream}' has rows 0 to {stream.rows}: {s.start} to {s.stop} cannot be labelled.")
+        checked.append(LabelledStretch(s.stream, s.start, s.stop, check_label(dataset, s.label)))
+    name, now = author_name(who), dict(read_marks(dataset.path))
+    marks, new = [], []
+    for s in checked:
+        before = now.get(s.stream, MarkState())
+        mark = Mark(s.stream, "label", name, why, start=s.start, stop=s.stop, label=s.label)
+        if (after := apply_mark(before, mark)) != before:
+            now[s.stream] = after
+            marks.append(mark)
+            new.append(s)
+    append_marks(dataset.path, marks)
+    return new
+
+
+def unlabel(
+    dataset: Dataset, stream: StreamInfo, start: int = 0, stop: int = -1, who: str | None = None, why: str = ""
+) -> int:
+    """Remove the labels of rows of a stream, by default of all; return the number of stretches that change."""
+    standing = read_marks(dataset.path).get(stream.id, MarkState()).stretches
+    changed = sum(s.outside(start, stop) != [s] for s in standing)
+    if changed:
+        append_marks(dataset.path, [Mark(stream.id, "unlabel", author_name(who), why, start=start, stop=stop)])
+    return changed
+
+
+def read_stretches(dataset: Dataset, path: str | os.PathLike[str]) -> list[LabelledStretch]:
+    """Read a CSV file with the columns `COLUMNS`.
+
+    Raises:
+        DatasetError: for a missing file or column, or a line with an unknown stream, label or time.
+    """
+    try:
+        columns, rows = read_csv_rows(Path(path), "file of labels")
+    except FileNotFoundError:
+        raise DatasetError(f"There is no file '{path}': give a CSV file with {', '.join(COLUMNS)}.") from None
+    if missing := [c for c in COLUMNS if c not in columns]:
+        raise DatasetError(f"The file of labels '{path}' lacks {', '.join(missing)}: it needs {', '.join(COLUMNS)}.")
+    out = []
+    for line, cells in rows:
+        try:
+            (stream, *others) = find_streams(dataset, cells["stream"])
+            if others:
+                raise DatasetError(f"'{cells['stream']}' names {1 + len(others)} streams: give one.")
+            start, stop = rows_between(dataset, stream, _seconds(cells["start_s"]), _seconds(cells["stop_s"]))
+            out.append(LabelledStretch(stream.id, start, stop, check_label(dataset, cells["label"])))
+        except DatasetError as cause:
+            raise DatasetError(f"The file of labels '{path}' line {line}: {cause}") from None
+    return out
+
+
+def _seconds(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise DatasetError(f"'{text}' is no time: seconds are accepted, such as 12.5.") from None
+
+
+def write_stretches(path: str | os.PathLike[str], stretches: Sequence[TimedStretch]) -> None:
+    """Write stretches as CSV with the columns `COLUMNS`, as `read_stretches` reads it."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows((s.stream, f"{s.start_s:.3f}", f"{s.stop_s:.3f}", s.label) for s in stretches)
+    write_file(Path(path), out.getvalue())
+
+
+@dataclass(frozen=True)
+class LabelResult:
+    """Result of `decide_labels`: the labelled stretches afterwards, and the numbers of new and changed ones."""
+
+    dataset: Dataset
+    stretches: tuple[TimedStretch, ...]
+    labelled: int = 0
+    undone: int = 0
+
+
+def decide_labels(
+    dataset: Dataset | str | os.PathLike[str],
+    stream: str = "*",
+    *,
+    start_s: float | None = None,
+    stop_s: float | None = None,
+    label: str | None = None,
+    undo: bool = False,
+    file: str | os.PathLike[str] | None = None,
+    who: str | None = None,
+    why: str = "",
+) -> LabelResult:
+    """Write marks for the given decision, and return the labelled stretches.
+
+    Args:
+        stream: id of a stream; to list stretches, also a pattern.
+        start_s, stop_s: stretch to label, or whose labels to remove (default: the beginning and the end).
+        label: handling, rest, or practice: and a gesture.
+        undo: whether to remove labels instead.
+        file: a CSV file of stretches to label, see `read_stretches`.
+        who, why: name (by default the login name) and reason for the marks.
+
+    Raises:
+        ConfigError: for decisions that exclude each other, or lack a time.
+        DatasetError: for an unknown stream or label, or times outside the stream.
+    """
+    if sum((label is not None, undo, file is not None)) > 1:
+        raise ConfigError("Label a stretch, import a file, or undo labels: one of these at a time.")
+    timed = start_s is not None or stop_s is not None
+    if (label is not None and (start_s is None or stop_s is None)) or (timed and label is None and not undo):
+        raise ConfigError("A stretch needs its two times and a label: --from S --to S --as handling.")
+    dataset = as_dataset(dataset)
+    streams = find_streams(dataset, stream)
+    if (label is not None or timed) and len(streams) > 1:
+        raise ConfigError(f"One stream is labelled at a time, and '{stream}' names {len(streams)}: give an id.")
+    labelled = undone = 0
+    if file is not None:
+        labelled = len(label_stretches(dataset, read_stretches(dataset, file), who, why))
+    elif label is not None or timed:
+        first = 0.0 if start_s is None else start_s
+        last = float(row_times_s(dataset.read_stream(streams[0].id))[-1]) if stop_s is None else stop_s
+        start, stop = rows_between(dataset, streams[0], first, last)
+        if undo:
+            undone = unlabel(dataset, streams[0], start, stop, who, why)
+        else:
+            new = [LabelledStretch(streams[0].id, start, stop, label or "")]
+            labelled = len(label_stretches(dataset, new, who, why))
+    elif undo:
+        undone = sum(unlabel(dataset, each, who=who, why=why) for each in streams)
+    again = as_dataset(dataset.path)
+    return LabelResult(again, tuple(timed_stretches(again, streams)), labelled, undone)
