@@ -58,6 +58,7 @@ class AnywhereSpec:
     settle_s: float = 1.0
     idle_share: float = 0.3
     busy_share: float = 0.3
+    hard_share: float = 0.15
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -91,6 +92,11 @@ def add_idle_gesture(gestures: GestureSet, dataset: Dataset) -> GestureSet:
             "set  idle = true  in its gesture set, or rename it."
         )
     return GestureSet(gestures.name, (*gestures.gestures, idle), gestures.inferred)
+
+
+def idle_candidates(spec: AnywhereSpec) -> AnywhereSpec:
+    """Return the settings with which `cut_anywhere` also returns (nearly) all idle positions that may be used."""
+    return replace(spec, idle_share=0.95)
 
 
 @dataclass(frozen=True, eq=False)

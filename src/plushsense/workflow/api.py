@@ -46,6 +46,7 @@ from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.preparation import (
     WHOLE_PEOPLE,
     Warn,
+    add_hard_negatives,
     classes_for,
     divide,
     network_inputs_of,
@@ -219,6 +220,11 @@ def train(
     from plushsense.training.fit import fit, predict
 
     train_on, watched = windows.take(train_at), scored.take(division.watch)
+    if division.kind == WHOLE_PEOPLE:
+        train_on = add_hard_negatives(
+            train_on, dataset, network, config.windows, config.anywhere, gestures, config.training,
+            division.fold.subjects, progress,
+        )  # fmt: skip
     state = None if journal is None else ResumableTraining(journal, network, config.training, train_on, watched)
     start = state.load() if state else None
     if start is not None and progress is not None:

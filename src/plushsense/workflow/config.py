@@ -1,7 +1,7 @@
 """Settings of one run, which a TOML file can contain: network, training, windows and split.
 
     [windows]     window_s, step_s, context, longest_factor
-    [anywhere]    every_s, onset_s, after_s, settle_s, idle_share, busy_share
+    [anywhere]    every_s, onset_s, after_s, settle_s, idle_share, busy_share, hard_share
     [model]       arch, filters, padding, norm, step_s, pool_s
     [training]    preset, epochs, batch, learning_rate, halve_every, patience, stop_on, augment, seed, device, threads
     [evaluation]  split, classes, train_context, workers, seed
@@ -249,7 +249,7 @@ _SETTINGS: dict[str, tuple[str, ...]] = {
     ),
     "evaluation": ("classes", "train_context", "workers"),
     "live": ("smoothing_s",),
-    "anywhere": ("every_s", "onset_s", "after_s", "settle_s", "idle_share", "busy_share"),
+    "anywhere": ("every_s", "onset_s", "after_s", "settle_s", "idle_share", "busy_share", "hard_share"),
 }
 
 

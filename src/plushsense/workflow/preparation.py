@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,8 @@ from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
 from plushsense.evaluation.crossval import fold_windows
 from plushsense.models.arch import Arch, parse_symbol
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
-from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere
+from plushsense.training.spec import TrainSpec
+from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere, idle_candidates
 from plushsense.windows.cut import ANYWHERE, WindowSet, WindowSpec, cut_windows, shared_gestures
 from plushsense.workflow.config import ALL, SHARED, RunConfig
 
@@ -97,6 +99,38 @@ def windows_for(
     for line in cut.left_out:
         warn(f"left out: {line}")
     return cut
+
+
+def add_hard_negatives(
+    train: WindowSet,
+    dataset: Dataset,
+    arch: Arch,
+    spec: WindowSpec,
+    anywhere: AnywhereSpec | None,
+    gestures: GestureSet,
+    training: TrainSpec,
+    others: Collection[str],
+    progress: Callable[[int, int, dict[str, Any]], None] | None = None,
+) -> WindowSet:
+    """Return training windows of the context "anywhere" with hard negatives (`plushsense.training.negatives`).
+
+    The windows are returned unchanged with another context, without an idle gesture, or with a ``hard_share`` of 0.
+
+    Args:
+        spec, anywhere: the settings with which ``train`` was cut.
+        others: people who must not be used, such as those of validation and test.
+        progress: as for `plushsense.training.fit.fit`, for the training of the first network.
+    """
+    anywhere = anywhere or AnywhereSpec()
+    idle = [k for k, gesture in enumerate(gestures.gestures) if gesture.idle]
+    if spec.context != ANYWHERE or not idle or not anywhere.hard_share:
+        return train
+    from plushsense.training.negatives import with_hard_negatives
+
+    cut = windows_for(dataset, arch, spec, gestures, anywhere=idle_candidates(anywhere))
+    mine = np.isin(cut.subject, np.unique(train.subject)) & outside_streams(cut, dataset, others)
+    candidates = cut.take(np.flatnonzero(mine))
+    return with_hard_negatives(train, candidates, idle[0], arch, training, anywhere.hard_share, progress)
 
 
 def warn_of_single_people(windows: WindowSet, warn: Warn) -> None:

@@ -66,6 +66,7 @@ from plushsense.windows.cut import WindowSpec
 from plushsense.workflow.config import SHARED, RunConfig, from_settings
 from plushsense.workflow.preparation import (
     Warn,
+    add_hard_negatives,
     choose_classes,
     classes_for,
     named_classes,
@@ -127,6 +128,10 @@ class TrainStreams:
         mine = np.isin(cut.subject, [*fold.train, NOBODY])
         train = cut.take(np.flatnonzero(mine & outside_streams(cut, dataset, {*fold.validation, *fold.test})))
         watch = scored.take(np.flatnonzero(np.isin(scored.subject, fold.validation)))
+        train = add_hard_negatives(
+            train, dataset, arch, recipe.windows, recipe.anywhere, gestures, recipe.training,
+            {*fold.validation, *fold.test}, progress,
+        )  # fmt: skip
         fitted = fit(train, watch, arch, recipe.training, progress)
         calibrated = calibration(arch, fitted.weights, fitted.scaler, train.x)
         people = {"subjects": list(fold.train), "validation_subjects": list(fold.validation)}
