@@ -101,7 +101,7 @@ def run_feedback(args: argparse.Namespace) -> int:
     append_corrections(args.out, corrections)
     result = {"events": [], "corrections": len(corrections), "file": args.out}
     told = [f"{c.gesture}: {f'it was {c.right}' if c.right else 'wrong'}" for c in corrections]
-    emit(args, result, [*told, f"{len(corrections)} corrections appended to {args.out}"])
+    emit(args, result, [*told, f"corrections appended to {args.out}: {len(corrections)}"])
     return 0
 
 

@@ -262,7 +262,7 @@ def _subject_of(bundle: Bundle, corrections: Sequence[Correction]) -> str:
                 f"{', '.join(bundle.layout.names)}: give corrections of the same sensors."
             )
         for label in (c.gesture, *([c.right] if c.right else [])):
-            if bundle.gestures.find(label) is None:
+            if label not in bundle.gestures.labels:
                 raise BadInput(
                     f"The bundle has no gesture '{label}', which a correction names; it has "
                     f"{', '.join(bundle.gestures.labels)}.{nearest(label, bundle.gestures.labels)}"

@@ -260,7 +260,7 @@ def rate(count: float, hours: float) -> float | None:
     return count / hours if hours > 0 else None
 
 
-def _counted(truth: StreamTruth, events: Sequence[ReportedEvent]) -> list[ReportedEvent]:
+def counted_events(truth: StreamTruth, events: Sequence[ReportedEvent]) -> list[ReportedEvent]:
     """Return the events that do not begin in a doubtful stretch."""
     return [e for e in events if not any(a <= e.start_s < b for a, b in truth.doubtful)]
 
@@ -322,7 +322,7 @@ def count_matches(
     truth: StreamTruth, events: Sequence[ReportedEvent], gestures: GestureSet, late_s: float = LATE_S
 ) -> EventCounts:
     """Return only the counts of `score_events` at the level of gestures."""
-    truths, intervals = truth.truths, gesture_intervals(_counted(truth, events), gestures)
+    truths, intervals = truth.truths, gesture_intervals(counted_events(truth, events), gestures)
     over = overlaps(truths, intervals, late_s)
     number = {label: n for n, label in enumerate(gestures.labels)}
     predicted = np.array([number.get(e.label, -1) for e in intervals], dtype=np.int64)
@@ -355,7 +355,7 @@ def score_events(
     late_s: float = LATE_S,
 ) -> StreamScore:
     """Return the scores of events in one stream; ``gestures`` are the classes of ``truth`` and of the events."""
-    events = _counted(truth, events)
+    events = counted_events(truth, events)
     families = dict(zip(gestures.labels, gestures.families, strict=True))
     affects = dict(zip(gestures.labels, gestures.affects, strict=True))
     by_gesture = gesture_intervals(events, gestures)
