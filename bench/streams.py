@@ -6,9 +6,9 @@
     python bench/streams.py DS --rows hard,feedback --seeds 0
 
 A seed decides both the folds by person and the training. Finished folds and networks are kept in DS/cache, so that the
-same command resumes. The rows ``feedback`` simulates three corrections ("that was wrong") of a gesture: the first three
-false events of a person's stream that name it are marked, the network is corrected (`plushsense.live.feedback`), and the
-rest of the stream is read again.
+same command resumes. The row ``feedback`` simulates three corrections ("that was wrong") of a gesture: the first three
+false events of a person's stream that name it are marked, the network is corrected (`plushsense.live.feedback`), and
+the rest of the stream is read again.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import plushsense as ps
 from plushsense.dataset.files import CACHE
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.streams.replay import StreamTrace, counted_events, gesture_intervals, read_streams
-from plushsense.experiments.streams.run import SPLIT, TrainStreams, recipes_for, stream_benchmark
+from plushsense.experiments.streams.run import TrainStreams, recipes_for, stream_benchmark
 from plushsense.experiments.streams.score import PeopleFold
 from plushsense.experiments.streams.systems import ANYWHERE
 from plushsense.live.feedback import correct, correction_of
@@ -105,7 +105,7 @@ def spread(values: list[float | None], digits: int) -> str:
 
 
 def line(name: str, row: Row, results: list[dict[str, Any]]) -> str:
-    at = {r["recall"]: [] for r in results[0]["at_recall"]}
+    at: dict[float, list[float | None]] = {r["recall"]: [] for r in results[0]["at_recall"]}
     for result in results:
         for found in result["at_recall"]:
             at[found["recall"]].append(found["systems"][row.system]["false_events_per_hour"])
@@ -120,8 +120,8 @@ def line(name: str, row: Row, results: list[dict[str, Any]]) -> str:
         latency = {k: spread([s["latency_s"][k] for s in scores], 2) for k in ("median", "p90")}
         broken = {k: spread([s[k] for s in scores], 0) for k in ("fragmentations", "merges")}
         parts.append(
-            f"  {how:9} recall {values['recall']}, F1 {values['f1']}, false an hour {false}, median {latency['median']} s, "
-            f"90 % {latency['p90']} s, fragmented {broken['fragmentations']}, merged {broken['merges']}"
+            f"  {how:9} recall {values['recall']}, F1 {values['f1']}, false an hour {false}, "
+            f"median {latency['median']} s, 90 % {latency['p90']} s, fragmented {broken['fragmentations']}, merged {broken['merges']}"
         )
     return "\n".join(parts)
 
@@ -202,8 +202,8 @@ def corrected(dataset: Dataset, bundle: Bundle, spec: DecideSpec, before: Stream
 
 def false_events(stream: StreamTrace, events: list[ReportedEvent], bundle: Bundle) -> list[ReportedEvent]:
     """Return the events with a gesture that match no true gesture."""
-    right = matches(stream, events, bundle).any(axis=0)
-    return [e for e, fits in zip(events, right.tolist(), strict=True) if not fits and e.gesture < len(bundle.gestures)]
+    right: list[bool] = matches(stream, events, bundle).any(axis=0).tolist()
+    return [e for e, fits in zip(events, right, strict=True) if not fits and e.gesture < len(bundle.gestures)]
 
 
 def matches(stream: StreamTrace, events: list[ReportedEvent], bundle: Bundle) -> np.ndarray[Any, np.dtype[np.bool_]]:
