@@ -121,7 +121,8 @@ def line(name: str, row: Row, results: list[dict[str, Any]]) -> str:
         broken = {k: spread([s[k] for s in scores], 0) for k in ("fragmentations", "merges")}
         parts.append(
             f"  {how:9} recall {values['recall']}, F1 {values['f1']}, false an hour {false}, "
-            f"median {latency['median']} s, 90 % {latency['p90']} s, fragmented {broken['fragmentations']}, merged {broken['merges']}"
+            f"median {latency['median']} s, 90 % {latency['p90']} s, "
+            f"fragmented {broken['fragmentations']}, merged {broken['merges']}"
         )
     return "\n".join(parts)
 
@@ -202,8 +203,8 @@ def corrected(dataset: Dataset, bundle: Bundle, spec: DecideSpec, before: Stream
 
 def false_events(stream: StreamTrace, events: list[ReportedEvent], bundle: Bundle) -> list[ReportedEvent]:
     """Return the events with a gesture that match no true gesture."""
-    right: list[bool] = matches(stream, events, bundle).any(axis=0).tolist()
-    return [e for e, fits in zip(events, right, strict=True) if not fits and e.gesture < len(bundle.gestures)]
+    right = np.flatnonzero(matches(stream, events, bundle).any(axis=0)).tolist()
+    return [e for n, e in enumerate(events) if n not in right and e.gesture < len(bundle.gestures)]
 
 
 def matches(stream: StreamTrace, events: list[ReportedEvent], bundle: Bundle) -> np.ndarray[Any, np.dtype[np.bool_]]:
