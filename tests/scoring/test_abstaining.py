@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import BadInput
-from plushsense.scoring.metrics import auroc, confidences, risk_coverage
+from plushsense.scoring.metrics import RelativeMahalanobis, auroc, confidences, risk_coverage
 
 
 def test_a_curve_by_hand():
@@ -72,3 +72,16 @@ def test_confidences_by_hand():
     assert found["energy"] == pytest.approx(np.log([4, 10]))
     empty = confidences(logits, [[0.5, 0.3, 0.2], [0.2, 0.1, 0.7]], [7.0, 8.0], 0.6)
     assert empty["set size"].tolist() == [-4, -1]
+
+
+def test_typical_features_lie_near_a_class_and_not_merely_near_the_mean() -> None:
+    draw = np.random.default_rng(0)
+    y = np.repeat([0, 2], 300)
+    centres = np.array([[4.0, 0.0, 0.0], [np.nan] * 3, [-4.0, 0.0, 0.0]])
+    fitted = RelativeMahalanobis.fit(centres[y] + draw.normal(0, [1, 1, 5], (600, 3)), y)
+    at_class, between, aside = fitted.scores(np.array([[4.0, 0, 0], [0.0, 0, 0], [4.0, 0, 40]])).tolist()
+    assert at_class > between
+    # A direction in which the classes vary as much as everything does says nothing.
+    assert abs(at_class - aside) < 0.5 * (at_class - between)
+    one = RelativeMahalanobis.fit(np.ones((5, 2)), np.zeros(5, dtype=np.int64))
+    assert np.isfinite(one.scores(np.zeros((2, 2)))).all()

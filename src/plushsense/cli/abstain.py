@@ -70,16 +70,28 @@ def lines(result: dict[str, Any]) -> list[str]:
     return out
 
 
+_SHOWN = ("softmax, smoothed", "logit, smoothed", "energy", "relative Mahalanobis")
+
+
 def _unknown(rows: dict[str, Any]) -> list[str]:
     cells = [
         (
             label or "all of these",
             row["recordings"],
-            *(spread(row["auroc"][name]) for name in ("softmax, smoothed", "logit, smoothed", "energy")),
+            *(spread(row["auroc"][name]) for name in _SHOWN),
             spread(row["known_passed"]),
             spread(row["unknown_caught"]),
         )
         for label, row in rows.items()
     ]
-    head = ("gesture", "recordings", "AUROC softmax", "logit", "energy", "known passed", "unknown caught")
+    head = (
+        "gesture",
+        "recordings",
+        "AUROC softmax",
+        "logit",
+        "energy",
+        "Mahalanobis",
+        "known passed",
+        "unknown caught",
+    )
     return [table(head, cells)]

@@ -33,7 +33,7 @@ from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import ONE
 from plushsense.runtime.fixed import smoothing_weight
 from plushsense.runtime.trace import TraceReplayer
-from plushsense.scoring.metrics import RiskCoverage, auroc, confidences, risk_coverage
+from plushsense.scoring.metrics import RelativeMahalanobis, RiskCoverage, auroc, confidences, risk_coverage
 from plushsense.scoring.splits import Fold, parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.tuning.decisions import (
@@ -65,17 +65,27 @@ Floats = NDArray[np.float64]
 
 
 def last_answers(
-    bundle: Bundle, dataset: Dataset, subjects: Iterable[str], spec: DecideSpec, gestures: GestureSet
+    bundle: Bundle,
+    dataset: Dataset,
+    subjects: Iterable[str],
+    spec: DecideSpec,
+    gestures: GestureSet,
+    typical: RelativeMahalanobis,
 ) -> dict[str, NDArray[Any]]:
     """Return the network's last answer in each of the n recordings of ``gestures`` in the streams of ``subjects``.
 
+    Args:
+        typical: fitted to the inputs of the dense layer on training windows.
+
     Returns:
         ``logits`` (n, K) of the last step; smoothed ``shares`` (n, K), the probabilities of the network's K classes;
-        ``highest`` (n,), the highest smoothed logit; ``label`` (n,), the true gesture, which need not be one of the
-        network's classes; ``person`` (n,).
+        ``highest`` (n,), the highest smoothed logit; ``typical`` (n,), the mean score of the steps in the second half
+        of the recording; ``label`` (n,), the true gesture, which need not be one of the network's classes; ``person``
+        (n,).
     """
+    network, arch = bundle.network(), bundle.arch
     weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
-    rows: list[tuple[NDArray[Any], NDArray[Any], Any, str, str]] = []
+    rows: list[tuple[NDArray[Any], NDArray[Any], Any, str, str, float]] = []
     for stream in marked_streams(bundle, dataset, subjects, spec, gestures):
         smoothed = TraceReplayer(stream.trace).smoothed(weight)
         for truth in stream.truths:
@@ -86,7 +96,12 @@ def last_answers(
                 at = int(np.searchsorted(times, truth.stop_us, side="right")) - 1
                 if at >= 0 and times[at] > truth.start_us:
                     label = gestures.labels[truth.gesture]
-                    rows.append((part.logits[at], after.shares[at], after.highest[at], label, stream.person))
+                    first = int(np.searchsorted(times, truth.start_us, side="right"))
+                    steps = range((first + at + 1) // 2, at + 1)
+                    windows = [part.inputs[s * arch.step : s * arch.step + arch.span].T for s in steps]
+                    features = network.features(bundle.scaler.apply(np.stack(windows)))
+                    score = float(typical.scores(features).mean())
+                    rows.append((part.logits[at], after.shares[at], after.highest[at], label, stream.person, score))
     k = len(bundle.gestures)
     return {
         "logits": np.array([r[0] for r in rows], dtype=np.float64).reshape(len(rows), k) / 256,
@@ -94,27 +109,35 @@ def last_answers(
         "highest": np.array([r[2] for r in rows], dtype=np.int64) / 256,
         "label": np.array([r[3] for r in rows], dtype=np.str_),
         "person": np.array([r[4] for r in rows], dtype=np.str_),
+        "typical": np.array([r[5] for r in rows], dtype=np.float64),
     }
 
 
 def fold_answers(
     bundle: Bundle,
     dataset: Dataset,
+    training: WindowSet,
     validation: Sequence[str],
     test: Sequence[str],
     *,
     coverage: float,
     known_share: float,
 ) -> dict[str, Any]:
-    """Return the answers of a fold's network on the test people, and the thresholds fitted to the validation people."""
+    """Return the answers of a fold's network on the test people, and the thresholds fitted to the validation people.
+
+    Args:
+        training: the windows to which the network was fitted.
+    """
     spec = DecideSpec()
     calibration = labelled_steps(bundle, marked_streams(bundle, dataset, validation, spec), spec)
     if not len(calibration.truth):
-        empty = {name: np.zeros(0) for name in ("logits", "shares", "highest", "label", "person")}
+        empty = {name: np.zeros(0) for name in ("logits", "shares", "highest", "label", "person", "typical")}
         return {"people": [], "covered": [], "size": [], "sure": 1.0, "known": None, **empty}
     sure, known = sure_threshold(calibration, coverage), known_threshold(calibration, known_share)
     steps = labelled_steps(bundle, marked_streams(bundle, dataset, test, spec), spec)
     people = sorted(set(steps.person.tolist()))
+    features = bundle.network().features(bundle.scaler.apply(training.x))
+    typical = RelativeMahalanobis.fit(features, training.y)
     each = [steps.take(steps.person == person) for person in people]
     return {
         "people": people,
@@ -122,7 +145,7 @@ def fold_answers(
         "size": [float((mine.shares >= sure * ONE).sum(axis=1).mean()) for mine in each],
         "sure": sure,
         "known": known,
-        **last_answers(bundle, dataset, test, spec, dataset.gestures),
+        **last_answers(bundle, dataset, test, spec, dataset.gestures, typical),
     }
 
 
@@ -139,7 +162,8 @@ class FoldAnswers:
     def scores(self) -> dict[str, Floats]:
         """Each kind of confidence by name, an array (n,) with one value for each recording."""
         r = self.result
-        return confidences(r["logits"], r["shares"], r["highest"], float(r["sure"]))
+        found = confidences(r["logits"], r["shares"], r["highest"], float(r["sure"]))
+        return found | {"relative Mahalanobis": np.asarray(r["typical"], dtype=np.float64)}
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -258,6 +282,7 @@ _STYLES = (
     ("#e69f00", "-"),
     ("#56b4e9", "--"),
     ("#000000", "-."),
+    ("#999999", "--"),
 )
 
 
@@ -293,7 +318,7 @@ def curves(measured: Mapping[str, RiskCoverage], *, title: str = "") -> Figure:
 
 
 # Increase it when the meaning of a stored fold changes, also when the default smoothing does.
-_VERSION = 1
+_VERSION = 2
 FIGURE, TABLE = "risk-coverage.png", "abstaining.json"
 
 
@@ -323,7 +348,7 @@ class _AnswerWork:
             sorted(set(shared.subject[at].tolist()) - {NOBODY, UNKNOWN_SUBJECT}) for at in (fold.validation, fold.test)
         )
         return fold_answers(
-            bundle, dataset, validation_people, test_people, coverage=self.coverage, known_share=self.known_share
+            bundle, dataset, train, validation_people, test_people, coverage=self.coverage, known_share=self.known_share
         )
 
 
