@@ -112,9 +112,9 @@ def add_hard_negatives(
     others: Collection[str],
     progress: Callable[[int, int, dict[str, Any]], None] | None = None,
 ) -> WindowSet:
-    """Return training windows of the context "anywhere" with hard negatives (`plushsense.training.negatives`).
+    """Return training windows of the context "anywhere" with hard negatives.
 
-    The windows are returned unchanged with another context, without an idle gesture, or with a ``hard_share`` of 0.
+    `plushsense.training.fit.with_hard_negatives` explains them. The windows are returned unchanged with another context, without an idle gesture, or with a ``hard_share`` of 0.
 
     Args:
         spec, anywhere: the settings with which ``train`` was cut.
@@ -125,7 +125,7 @@ def add_hard_negatives(
     idle = [k for k, gesture in enumerate(gestures.gestures) if gesture.idle]
     if spec.context != ANYWHERE or not idle or not anywhere.hard_share:
         return train
-    from plushsense.training.negatives import with_hard_negatives
+    from plushsense.training.fit import with_hard_negatives
 
     cut = windows_for(dataset, arch, spec, gestures, anywhere=idle_candidates(anywhere))
     mine = np.isin(cut.subject, np.unique(train.subject)) & outside_streams(cut, dataset, others)
