@@ -252,8 +252,8 @@ def _subject_of(bundle: Bundle, corrections: Sequence[Correction]) -> str:
         raise BadInput(f"The corrections are of {', '.join(people) or 'nobody'}: give those of one person.")
     if bundle.adapted_to not in (None, people[0]):
         raise BundleError(
-            f"The bundle was adapted to {bundle.adapted_to}, the corrections are of {people[0]}: give a bundle that was "
-            "not adapted, or undo it first (plushsense adapt BUNDLE --undo)."
+            f"The bundle was adapted to {bundle.adapted_to}, the corrections are of {people[0]}: give a bundle that "
+            "was not adapted, or undo it first (plushsense adapt BUNDLE --undo)."
         )
     for c in corrections:
         if c.channels != bundle.layout.names:
