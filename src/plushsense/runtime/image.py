@@ -289,7 +289,7 @@ def patch_bytes(original: bytes | IntegerModel, adapted: IntegerModel) -> bytes:
         elif image[at : at + len(piece)] != piece:
             raise BundleError(
                 f"The adapted model differs from the image in more than the dense layer, first in '{title}': adapt the "
-                "bundle from which the image was exported."
+                "bundle from which the image was exported (model.plush beside it)."
             )
         at += len(piece)
     return image_head(body, PATCH_MAGIC) + body
