@@ -56,6 +56,18 @@ def test_before_and_after_on_other_recordings(cli: Cli, bundle: Path, stranger: 
     assert "S99" in said.out and "original" not in said.out
 
 
+def test_the_bundle_of_an_export_can_be_adapted_for_its_toy(
+    cli: Cli, bundle: Path, stranger: Path, tmp_path: Path
+) -> None:
+    """By a patch: quantized, only the dense layer of the adapted bundle differs from the export."""
+    out, mine, patch = (tmp_path / name for name in ("out", "mine.plush", "patch.bin"))
+    assert cli("export", bundle, out).status == 0
+    assert cli("adapt", out / "model.plush", stranger, "--out", mine).status == 0
+    ran = cli("export", mine, patch, "--patch-for", out, "--json")
+    assert ran.status == 0 and ran.json["bytes"] == len(patch.read_bytes()) < 500, ran.err
+    assert cli("export", bundle, tmp_path / "no.bin", "--patch-for", out).status == 2
+
+
 def test_all_adapt_and_each_is_read_without_it(cli: Cli, bundle: Path, stranger: Path, tmp_path: Path) -> None:
     ran = cli("adapt", bundle, stranger, "--out", tmp_path / "mine.plush")
     assert ran.status == 0 and "of 18 own recordings, each left out once" in ran.out

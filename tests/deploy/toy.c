@@ -9,7 +9,7 @@
 
 typedef struct {
     plush_toy toy;
-    uint8_t *model;
+    uint8_t *model, *patch;
     uint32_t *memory, memory_bytes;
     int32_t *rows;
     uint32_t frame, made, most;
@@ -108,6 +108,7 @@ void seat_free(void *p)
     seat *s = (seat *)p;
 
     free(s->model);
+    free(s->patch);
     free(s->memory);
     free(s);
 }
@@ -207,6 +208,8 @@ uint32_t seat_swap(void *p, const uint8_t *model, uint32_t bytes, uint32_t too_f
     if (*status == PLUSH_OK) {
         free(s->model);
         s->model = copy;
+        free(s->patch); /* no longer read */
+        s->patch = NULL;
         if (memory != s->memory) {
             free(s->memory);
             s->memory = memory;
@@ -221,6 +224,33 @@ uint32_t seat_swap(void *p, const uint8_t *model, uint32_t bytes, uint32_t too_f
     free(copy);
     free(before);
     return same && s->made == 0 ? 0 : UINT32_MAX;
+}
+
+/* Offers a patch in the middle of a stream, in an allocation of just its bytes, or none of no bytes. Returns the status,
+ * or -1 when a refusal changed a byte of the toy or its memory. */
+int seat_patch(void *p, const uint8_t *patch, uint32_t bytes)
+{
+    seat *s = (seat *)p;
+    uint8_t *copy = patch == NULL ? NULL : (uint8_t *)malloc(bytes ? bytes : 1);
+    uint8_t *before = (uint8_t *)malloc(s->memory_bytes + 1);
+    plush_toy toy = s->toy;
+    int status, same;
+
+    if (copy != NULL)
+        memcpy(copy, patch, bytes);
+    memcpy(before, s->memory, s->memory_bytes);
+    status = (int)plush_patch(&s->toy, copy, bytes);
+    if (status == PLUSH_OK) {
+        toy.dense = s->toy.dense;
+        toy.dense_weights = s->toy.dense_weights;
+        free(s->patch);
+        s->patch = copy;
+    } else {
+        free(copy);
+    }
+    same = memcmp(&toy, &s->toy, sizeof toy) == 0 && memcmp(before, s->memory, s->memory_bytes) == 0;
+    free(before);
+    return same ? status : -1;
 }
 
 const char *seat_name(void *p, uint8_t gesture)
@@ -259,7 +289,7 @@ static uint32_t word(FILE *f)
 
 /* Cases, one after the other: bytes of the model, the model, frames, columns, the frames. Writes of each: status,
  * answers, and the answers' rows. With a second argument the first toy whose model is good goes on with all further
- * cases, and is offered their models. */
+ * cases, and is offered their models, or with `patch` as the second argument their patches. */
 int main(int argc, char **argv)
 {
     FILE *f = argc > 1 ? fopen(argv[1], "rb") : NULL;
@@ -281,6 +311,8 @@ int main(int argc, char **argv)
             return 2;
         if (s == NULL)
             s = (seat *)seat_new(model, bytes, &status, 0, 0);
+        else if (strcmp(argv[2], "patch") == 0)
+            status = seat_patch(s, model, bytes);
         else if (seat_swap(s, model, bytes, 0, &status, ended, 1) == UINT32_MAX)
             return 3;
         free(model);

@@ -61,6 +61,12 @@ class Seat:
             self.classes = classes
         return status.value, rows[:made]
 
+    def patch(self, patch: bytes | None) -> int:
+        """Offer a patch, or None for the model's own layer: the status. Nothing but the layer may have changed."""
+        status = self.library.seat_patch(self.toy, patch, len(patch or b""))
+        assert status >= 0, "nothing but the layer changes"
+        return int(status)
+
     def __del__(self) -> None:
         self.library.seat_free(self.toy)
 

@@ -110,3 +110,64 @@ def test_other_formats(tmp_path: Path, bundle: Bundle, onnx_here: None, capsys: 
     assert main(["export", str(tmp_path / "m.plush"), str(tmp_path / "two"), "--also", "onx"]) == 2
     assert "Did you mean 'onnx'" in capsys.readouterr().err
     assert not (tmp_path / "two").exists()
+
+
+def adapted(bundle: Bundle) -> Bundle:
+    weights = {**bundle.weights, "dense.bias": bundle.weights["dense.bias"] + np.float32(0.5)}
+    return replace(bundle, weights=weights, personal={"subject": "Anna", "original": {}})
+
+
+def test_a_patch(tmp_path: Path, bundle: Bundle, capsys: pytest.CaptureFixture[str]) -> None:
+    ps.export(bundle, tmp_path / "out")
+    adapted(bundle).save(tmp_path / "mine.plush")
+    words = [
+        "export",
+        str(tmp_path / "mine.plush"),
+        str(tmp_path / "new" / "p.bin"),
+        "--patch-for",
+        str(tmp_path / "out"),
+    ]
+    assert main([*words, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    patch, image = Path(told["patch"]).read_bytes(), (tmp_path / "out" / "plush_model.bin").read_bytes()
+    assert len(patch) == told["bytes"] == 20 + 18 * (8 + 6) and b"Anna" not in patch
+    assert told["image_check"] == int.from_bytes(image[12:16], "little")
+    ps.export(adapted(bundle), tmp_path / "two")
+    assert patch[20:] in (tmp_path / "two" / "plush_model.bin").read_bytes()
+    assert main(words) == 2
+    assert "nothing is overwritten" in capsys.readouterr().err
+    assert Path(told["patch"]).read_bytes() == patch
+    words[2] = str(tmp_path / "q.bin")
+    assert main(words) == 0
+    assert capsys.readouterr().out == f"{words[2]}: 272 bytes, for plush_patch on a toy with {words[4]}\n"
+
+
+def test_what_cannot_be_a_patch(tmp_path: Path, bundle: Bundle, capsys: pytest.CaptureFixture[str]) -> None:
+    out, bad, none = (tmp_path / name for name in ("out", "bad", "none"))
+    ps.export(bundle, out)
+    ps.export(bundle, bad)
+    (bad / "plush_model.bin").write_bytes(b"PLSH")
+    ps.export(bundle, none)
+    (none / "plush_model.bin").unlink()
+    (tmp_path / "file").touch()
+    other = replace(bundle, calibration=calibrated(bundle, np.arange(9 * 3 * 60).reshape(9, 3, 60)).calibration)
+    cases = [
+        (adapted(bundle), tmp_path, "p.bin", "is no export"),
+        (adapted(bundle), tmp_path / "nowhere", "p.bin", "There is no export"),
+        (adapted(bundle), bad, "p.bin", "damaged, or of another version"),
+        (adapted(bundle), none, "p.bin", "cannot be read"),
+        (adapted(bundle), out, "out", "is already there"),
+        (adapted(bundle), out, "file/p.bin", "cannot be written"),
+        (bundle, out, "p.bin", "was not adapted to anybody"),
+        (adapted(other), out, "p.bin", "in more than the dense layer"),
+        (adapted(bundle_of()), out, "p.bin", "holds no calibration"),
+    ]
+    for given, folder, name, said in cases:
+        given.save(tmp_path / "m.plush")
+        words = ["export", str(tmp_path / "m.plush"), str(tmp_path / name), "--patch-for", str(folder)]
+        assert main(words) == 2
+        told = capsys.readouterr().err
+        assert said in told and told.count("\n") == 1, told
+        assert not (tmp_path / "p.bin").exists()
+    assert main([*words, "--also", "onnx"]) == 2
+    assert "leave out --patch-for" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Implement ``plushsense export BUNDLE OUT``, ``verify OUT [--target …]`` and ``profile OUT [--target …]``."""
+"""Implement ``plushsense export BUNDLE OUT [--patch-for …]``, ``verify OUT`` and ``profile OUT``."""
 
 from __future__ import annotations
 
@@ -38,6 +38,8 @@ def _conversion(entry: dict[str, Any]) -> str:
 def run(args: argparse.Namespace) -> int:
     from plushsense.workflow.export import export
 
+    if args.patch_for is not None:
+        return _patch(args)
     done = export(args.bundle, args.out, dataset=args.dataset, also=listed(args.also), warn=warn)
     facts = done.facts
     simulated = ["  SIMULATION: trained on a virtual toy, not on real touch"] if facts["simulated"] else []
@@ -54,6 +56,16 @@ def run(args: argparse.Namespace) -> int:
             f"  prove it          plushsense verify {args.out}",
         ],
     )
+    return 0
+
+
+def _patch(args: argparse.Namespace) -> int:
+    from plushsense.workflow.export import export_patch
+
+    if args.also:
+        raise ConfigError("--also writes formats of a whole export: leave it out, or leave out --patch-for.")
+    done = export_patch(args.bundle, args.out, export=args.patch_for, dataset=args.dataset, warn=warn)
+    emit(args, done.to_dict(), [f"{done.path}: {done.bytes:,} bytes, for plush_patch on a toy with {args.patch_for}"])
     return 0
 
 

@@ -19,6 +19,7 @@ from plushsense.runtime.events import AFFECT_CODES
 from plushsense.runtime.fixed import InputScale, Ints
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel
+from plushsense.runtime.integer import IntegerDense, IntegerStepper
 from plushsense.runtime.machine import Moment, ToyMachine
 from plushsense.windows.features import Scaler
 
@@ -323,8 +324,31 @@ def answers_over_swaps(parts: Sequence[tuple[IntegerModel, Ints]]) -> list[NDArr
     return tables
 
 
-def _toy(model: IntegerModel) -> ToyMachine:
-    return ToyMachine(model.network.stepper(), model.layout, model.gestures, model.rules, model.smoothing)
+def answers_over_patches(
+    model: IntegerModel, parts: Sequence[tuple[IntegerDense | None, Ints]]
+) -> list[NDArray[np.int32]]:
+    """Compute the toy's rows when the dense layer of its model is replaced during a stream (``plush_patch``).
+
+    Args:
+        parts: each dense layer, None for the model's own, with the frames (n, 1 + C) that are read with it.
+
+    Returns:
+        The rows of each part, as from `answers_of`. The state is kept, so that the next step uses the new layer.
+    """
+    network = model.network.stepper()
+    toy, frame, tables = _toy(model, network), 0, list[NDArray[np.int32]]()
+    for dense, frames in parts:
+        network.patch(dense)
+        table = _RowTable(toy, model, frame)
+        table.read(frames)
+        frame = table.frame
+        tables.append(table.array())
+    return tables
+
+
+def _toy(model: IntegerModel, network: IntegerStepper | None = None) -> ToyMachine:
+    stepper = network or model.network.stepper()
+    return ToyMachine(stepper, model.layout, model.gestures, model.rules, model.smoothing)
 
 
 class _RowTable:

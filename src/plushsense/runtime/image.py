@@ -24,8 +24,12 @@ of everything after the head. The following sections come in this order:
   u8 baseline, u8 noise, u32 floor; for each rule: u8 terms, u8 affect, u8 gesture, u8 within, u16 deaf; then for each
   of its terms: u8 signal, i8 sign, u8 times, u8 0, u32 threshold
 
+A patch replaces the dense layer of one image. Its head is that of an image with ``PLPT`` for ``PLSH``; then come the
+u32 CRC-32 in the head of that image, and the two sections of the new dense layer as in an image.
+
 The C library validates all of it: it refuses an image with an incomplete section, a span that does not fit the layers,
-or a number outside the ranges of `IntegerModel`, `plushsense.runtime.fixed` and `plushsense.runtime.decisions`.
+or a number outside the ranges of `IntegerModel`, `plushsense.runtime.fixed` and `plushsense.runtime.decisions`; of a
+patch also one for another image.
 """
 
 from __future__ import annotations
@@ -50,11 +54,13 @@ from plushsense.runtime.integer import IntegerNetwork
 from plushsense.runtime.vectors import MOST_AXIS_SHIFT, IntegerVectors
 
 MAGIC = b"PLSH"
+PATCH_MAGIC = b"PLPT"
 IMAGE_VERSION = 3  # since 2 with the settings of events, gate and health, since 3 with zeros and the vector layer
 HEAD_BYTES = 16
 IDLE_BIT = 4
 GROUP = 4  # number of filters, and of channels, in a block of weights
 MOST_TAPS = 255  # of a vector layer
+_DENSE = "dense layer"  # how the descriptions of its sections begin
 _INPUT_KINDS = ("channel", "magnitude", "gravity")
 MOST_CLOCK_UNITS = 1 << 22  # limit for gap and period of the clock: interpolation then needs at most 32 bits
 
@@ -189,9 +195,9 @@ class IntegerModel:
                 title = f"layer {n}: weights of filters {GROUP * first + 1} to {last}, tap by tap"
                 sections.append((title, group.tobytes()))
         dense = self.network.dense
-        sections.append(("dense layer: bias, multiplier, shifts of each class", _scales(dense.bias, dense.scale)))
+        sections.append((f"{_DENSE}: bias, multiplier, shifts of each class", _scales(dense.bias, dense.scale)))
         sections.append(
-            ("dense layer: weights of each class", (dense.weights.astype(np.int16) + 128).astype(np.uint8).tobytes())
+            (f"{_DENSE}: weights of each class", (dense.weights.astype(np.int16) + 128).astype(np.uint8).tobytes())
         )
         affects = bytes(AFFECT_CODES[g.affect] + (IDLE_BIT if g.idle else 0) for g in self.gestures.gestures)
         sections.append(("affect of each class, 4 more when it is idle", affects))
@@ -253,9 +259,40 @@ def layout_check(layout: Layout) -> int:
     return zlib.crc32(channels.encode()) & 0xFFFF
 
 
-def image_head(body: bytes) -> bytes:
-    """Return the 16-byte head for the body of an image."""
-    return MAGIC + struct.pack("<HHII", IMAGE_VERSION, 0, len(body) + HEAD_BYTES, zlib.crc32(body))
+def image_head(body: bytes, magic: bytes = MAGIC) -> bytes:
+    """Return the 16-byte head for the body of an image, or of a patch."""
+    return magic + struct.pack("<HHII", IMAGE_VERSION, 0, len(body) + HEAD_BYTES, zlib.crc32(body))
+
+
+def image_check(image: bytes) -> int:
+    """Return the CRC-32 in the head of an image.
+
+    Raises:
+        BundleError: for bytes that are no image of this version.
+    """
+    if image[:HEAD_BYTES] != image_head(image[HEAD_BYTES:]):
+        raise BundleError("The image is damaged, or of another version of PlushSense: export the model again.")
+    return int(struct.unpack_from("<I", image, HEAD_BYTES - 4)[0])
+
+
+def patch_bytes(original: bytes | IntegerModel, adapted: IntegerModel) -> bytes:
+    """Return the patch by which a toy with the image of ``original`` runs the dense layer of ``adapted``.
+
+    Raises:
+        BundleError: for bytes that are no image of this version, or if the two differ in more than the dense layer.
+    """
+    image = original if isinstance(original, bytes) else original.to_bytes()
+    body, at = struct.pack("<I", image_check(image)), HEAD_BYTES
+    for title, piece in adapted.sections():
+        if title.startswith(_DENSE):
+            body += piece
+        elif image[at : at + len(piece)] != piece:
+            raise BundleError(
+                f"The adapted model differs from the image in more than the dense layer, first in '{title}': adapt the "
+                "bundle from which the image was exported (model.plush beside it)."
+            )
+        at += len(piece)
+    return image_head(body, PATCH_MAGIC) + body
 
 
 def memory_bytes(model: IntegerModel) -> int:

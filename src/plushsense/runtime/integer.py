@@ -7,7 +7,7 @@ which is fast and represents all possible sums exactly.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -180,8 +180,16 @@ class IntegerStepper(Stepper):
     """Computes the network sample by sample from raw integers; logits are in steps of 1/256."""
 
     def __init__(self, network: IntegerNetwork) -> None:
-        self.network = network
+        self.network, self._dense = network, network.dense
         super().__init__(network.arch)
+
+    def patch(self, dense: IntegerDense | None) -> None:
+        """Use another dense layer from the next decision on, like ``plush_patch``; None restores the network's own.
+
+        Raises:
+            BundleError: for a layer that does not fit the network.
+        """
+        self._dense = self.network.dense if dense is None else replace(self.network, dense=dense).dense
 
     def _clear(self) -> None:
         self._rings, self._pool = stream_state(self.arch.trunk)
@@ -202,4 +210,4 @@ class IntegerStepper(Stepper):
                 return self.network._none()
             z = part.apply(taps)
         # The pool returns means: multiply by its length and round to get the exact sums.
-        return self.network.dense.apply(np.rint(self._pool.feed(z) * self.arch.pooled))
+        return self._dense.apply(np.rint(self._pool.feed(z) * self.arch.pooled))

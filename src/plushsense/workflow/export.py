@@ -1,25 +1,27 @@
-"""Calibrate a bundle on its training data, and export it."""
+"""Calibrate a bundle on its training data, and export it, or a patch of an export."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import BundleError
+from plushsense.core.errors import BadInput, BundleError
+from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.convert import CONVERTERS, check_format, convert
-from plushsense.deploy.emit import ExportResult, emit
+from plushsense.deploy.emit import IMAGE, ExportResult, emit, read_facts
 from plushsense.deploy.package import package
 from plushsense.deploy.quantize import calibrated, integer_model, refuse_undeployable
 from plushsense.models.bundle import Bundle
+from plushsense.runtime.image import image_check, patch_bytes
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
 from plushsense.workflow.preparation import WHOLE_PEOPLE, Warn, silent, windows_for
@@ -137,3 +139,62 @@ def export(
     for name in also:
         check_format(name)
     return emit(model, given, Path(out), extras=[converted, package])
+
+
+@dataclass(frozen=True)
+class PatchResult:
+    """Result of `export_patch`: the file, its size, and the CRC-32 of the image to which the patch belongs."""
+
+    path: Path
+    bytes: int
+    image_check: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the object that ``plushsense export --patch-for --json`` prints."""
+        return {"patch": str(self.path), "bytes": self.bytes, "image_check": self.image_check}
+
+
+def export_patch(
+    bundle: Bundle | str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    export: str | os.PathLike[str],
+    dataset: Dataset | str | os.PathLike[str] | None = None,
+    warn: Warn = silent,
+) -> PatchResult:
+    """Write the dense layer of an adapted bundle as a patch for a toy that runs an export of the same network.
+
+    Args:
+        bundle: a bundle that was adapted to a person.
+        out: a file that does not exist yet.
+        export: folder of the export that the toy runs.
+        dataset: the data set of the training, to calibrate on; for an export that was made with it.
+        warn: called with a sentence for everything unusual.
+
+    Raises:
+        BundleError: for a bundle that was not adapted, or of another network than the export.
+        BadInput: if the folder is no export, or ``out`` exists or cannot be written.
+        ArchError: for a network that cannot be deployed.
+    """
+    given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
+    out, folder = Path(out), Path(export)
+    if out.exists():
+        raise BadInput(f"'{out}' is already there: nothing is overwritten, give another file.")
+    read_facts(folder)
+    try:
+        original = (folder / IMAGE).read_bytes()
+    except OSError as cause:
+        raise BadInput(f"'{folder / IMAGE}' cannot be read ({cause}): export the model again.") from None
+    if not given.personal:
+        raise BundleError(
+            "The bundle was not adapted to anybody, so there is nothing to patch: give one that plushsense adapt wrote."
+        )
+    if dataset is not None:
+        given = calibrated_on(given, dataset, warn)
+    patch = patch_bytes(original, integer_model(given))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_file(out, patch)
+    except OSError as cause:
+        raise BadInput(f"The patch '{out}' cannot be written ({cause}): choose another place.") from None
+    return PatchResult(out, len(patch), image_check(original))

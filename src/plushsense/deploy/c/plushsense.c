@@ -14,6 +14,7 @@
 
 #define GROUP 4u            /* filters computed together, channels read together */
 #define HEAD_BYTES 16u
+#define SHAPE_BYTES 28u     /* the first section of a model: how many of what */
 #define SCALE_BYTES 8u      /* bias, multiplier and two shifts of one filter */
 #define RANGE_BYTES 12u     /* lowest and highest valid value of a channel, and its zero */
 #define INPUT_BYTES 12u     /* offset, bias, multiplier and two shifts of one channel of the network */
@@ -241,9 +242,11 @@ PLUSH_SMALL static uint32_t checksum(const uint8_t *bytes, uint32_t n) /* CRC-32
     return ~sum;
 }
 
-PLUSH_SMALL static plush_status check(const uint8_t *model, uint32_t bytes)
+/* A model, or a patch of one: they begin with the same head but for its first four bytes. */
+PLUSH_SMALL PLUSH_APART
+static plush_status check(const uint8_t *model, uint32_t bytes, const char *magic)
 {
-    if (model == NULL || bytes < HEAD_BYTES || memcmp(model, "PLSH", 4) != 0)
+    if (model == NULL || bytes < HEAD_BYTES || memcmp(model, magic, 4) != 0)
         return PLUSH_NOT_A_MODEL;
     if (le16(model + 4) != PLUSH_IMAGE_VERSION)
         return PLUSH_OTHER_VERSION;
@@ -304,7 +307,7 @@ PLUSH_SMALL static const uint8_t *next_scales(source *from, uint32_t n)
 
 PLUSH_SMALL static int read_head(plush_toy *toy, source *from)
 {
-    const uint8_t *p = next_bytes(from, 28);
+    const uint8_t *p = next_bytes(from, SHAPE_BYTES);
     uint32_t i;
 
     if (p == NULL)
@@ -837,6 +840,7 @@ static void advance(plush_layer *layer, uint8_t *out)
 }
 
 /* One new sample, whose quantized inputs are in the first ring, through all layers into the pooling. */
+PLUSH_APART
 static void network_sample(plush_toy *toy)
 {
     uint32_t i, f;
@@ -1185,6 +1189,7 @@ static void event_step(plush_toy *toy, uint32_t best, uint32_t ms)
 }
 
 /* A step is complete: the answer, and room for the next block of the pooling. */
+PLUSH_APART
 static void answer(plush_toy *toy, uint32_t ms)
 {
     uint16_t *sums;
@@ -1702,7 +1707,7 @@ PLUSH_SMALL PLUSH_APART
 static plush_status prepare(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                             uint32_t memory_bytes)
 {
-    plush_status status = check(model, model_bytes);
+    plush_status status = check(model, model_bytes, "PLSH");
 
     memset(toy, 0, sizeof *toy);
     if (status != PLUSH_OK)
@@ -1760,6 +1765,34 @@ PLUSH_SMALL plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32
     memcpy(&next, toy, offsetof(plush_toy, layers)); /* answers, events, counts, callbacks */
     *toy = next;
     plush_restart(toy);
+    return PLUSH_OK;
+}
+
+PLUSH_SMALL plush_status plush_patch(plush_toy *toy, const uint8_t *patch, uint32_t patch_bytes)
+{
+    uint32_t scales = SCALE_BYTES * toy->classes, weights = (uint32_t)toy->classes * toy->features;
+    const uint8_t *layer;
+
+    if (toy->memory == NULL)
+        return PLUSH_OTHER_MODEL;
+    layer = toy->classes_told - weights - scales; /* what stands before them in the model */
+    if (patch != NULL) {
+        plush_status status = check(patch, patch_bytes, "PLPT");
+        source from;
+
+        if (status != PLUSH_OK)
+            return status;
+        layer = patch + HEAD_BYTES + 4;
+        from.at = layer;
+        from.left = weights + scales;
+        if (word_at(patch + 8) != HEAD_BYTES + 4 + from.left ||
+            word_at(patch + HEAD_BYTES) != word_at(toy->ranges - SHAPE_BYTES - 4))
+            return PLUSH_OTHER_MODEL;
+        if (next_scales(&from, toy->classes) == NULL)
+            return PLUSH_DAMAGED;
+    }
+    toy->dense = layer;
+    toy->dense_weights = layer + scales;
     return PLUSH_OK;
 }
 

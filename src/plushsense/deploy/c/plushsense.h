@@ -39,14 +39,15 @@ extern "C" {
 #define PLUSH_ONE 32768 /* a confidence or probability of 1 */
 #define PLUSH_NO_GESTURE 255
 
-/* What plush_begin and plush_swap say. */
+/* What plush_begin, plush_swap and plush_patch say. */
 typedef enum {
     PLUSH_OK = 0,
-    PLUSH_NOT_A_MODEL = 1,     /* the bytes do not begin with PLSH */
+    PLUSH_NOT_A_MODEL = 1,     /* the bytes do not begin with PLSH, or those of a patch with PLPT */
     PLUSH_OTHER_VERSION = 2,   /* a model for another version of this library */
     PLUSH_DAMAGED = 3,         /* cut off, its checksum does not match, or what stands in it does not hold together */
     PLUSH_MEMORY_TOO_SMALL = 4, /* give plush_memory_bytes() bytes, aligned for uint32_t */
-    PLUSH_OTHER_LAYOUT = 5      /* plush_swap: a model for other channels, or no model is running */
+    PLUSH_OTHER_LAYOUT = 5,     /* plush_swap: a model for other channels, or no model is running */
+    PLUSH_OTHER_MODEL = 6       /* plush_patch: a patch of another model, or no model is running */
 } plush_status;
 
 /* PLUSH_FAULT: the sensors cannot be believed; there are no answers until they have recovered. */
@@ -128,7 +129,7 @@ typedef struct plush_toy {
 
     /* Called with every answer, and with everything that happens to an event, also when one frame completes several;
      * may be NULL. Set them after plush_begin(). They may read the toy, but call no function that changes it
-     * (plush_push, plush_silence, plush_restart, plush_begin, plush_swap). A step's event comes before its answer. */
+     * (plush_push, plush_silence, plush_restart, plush_begin, plush_swap, plush_patch). A step's event comes before its answer. */
     void (*on_answer)(const struct plush_toy *toy, void *user);
     void (*on_event)(const struct plush_toy *toy, void *user);
     void *user;
@@ -211,6 +212,12 @@ plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_by
  * receive the new ones somewhere else. Needs a plush_toy on the stack. A checksum finds damage, not forgery. */
 plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                         uint32_t memory_bytes);
+
+/* Puts the last layer of a patch, fitted to one person, in the place of the model's own: from the next step on, with all
+ * that is remembered, without warming again. The patch's bytes must stay where they are; they need no alignment. All of
+ * them are looked through first: unless this says PLUSH_OK, nothing has changed. NULL brings the model's own layer back,
+ * as do plush_begin() and plush_swap(); a restart does not. */
+plush_status plush_patch(plush_toy *toy, const uint8_t *patch, uint32_t patch_bytes);
 
 /* Takes the readings of one moment in: `ms` is the toy's own clock, `values` the measured channels in the order of
  * the layout. Returns how many answers fell due, mostly 0 or 1; the newest is in toy->answer. */
