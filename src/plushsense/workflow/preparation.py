@@ -114,8 +114,8 @@ def add_hard_negatives(
 ) -> WindowSet:
     """Return training windows of the context "anywhere" with hard negatives.
 
-    `plushsense.training.fit.with_hard_negatives` explains them. The windows are returned unchanged with another context,
-    without an idle gesture, or with a ``hard_share`` of 0.
+    `plushsense.training.fit.with_hard_negatives` explains them. The windows are returned unchanged with another
+    context, without an idle gesture, or with a ``hard_share`` of 0.
 
     Args:
         spec, anywhere: the settings with which ``train`` was cut.
