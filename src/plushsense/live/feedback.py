@@ -262,7 +262,7 @@ def correct(
     after = float(np.mean([probability(fitted, at) for at in everything]))
     figures = (
         f"the probability of the gestures that were marked as wrong is {after:.2f} instead of {before:.2f} in "
-        f"{len(marks)} events"
+        f"{len(marks)} event{'s' if len(marks) > 1 else ''}"
     )
     refusal = ""
     if len(marks) > 1:

@@ -31,18 +31,19 @@ class _FeedbackPanel:
         self._labels: tuple[str, ...] = ()
         self._busy = False
         words = page.words
-        self._which = tag(ui.label(""), "wrong-event")
+        with ui.row().classes("w-full justify-between ps-small-gap"):
+            self._which = tag(ui.label(""), "wrong-event")
+            self._count = tag(ui.label("").classes("ps-dim"), "marks")
         with ui.row().classes("w-full items-center ps-small-gap"):
             self._wrong = button("wrong", words("live.wrong"), self._mark, "unelevated", icon="thumb_down")
             nothing = {"": words("live.wrong_nothing")}
-            self._right = ui.select(nothing, value="", label=words("live.wrong_really")).classes("ps-wide")
-            tag(self._right, "wrong-really")
+            self._right = ui.select(nothing, value="", label=words("live.wrong_really"))
+            tag(self._right, "wrong-really").style("flex: 1 1 10rem; min-width: 0")
             self._person = ui.input(words("live.wrong_person"), placeholder="S01").props("maxlength=16")
-            tag(self._person.classes("w-36"), "wrong-person").on_value_change(self._update_marks)
+            tag(self._person.style("width: 7rem"), "wrong-person").on_value_change(self._update_marks)
         with ui.row().classes("w-full items-center ps-small-gap"):
             self._improve = button("improve", words("live.improve"), self._fit, icon="auto_fix_high")
             self._undo = button("marks-undo", words("live.marks_undo"), self._remove, "flat", icon="undo")
-            self._count = tag(ui.label("").classes("ps-dim"), "marks")
         # Messages are displayed here, because the top of the page may be out of view.
         self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))
         on_change(reader.changed, self._update_event)
@@ -65,7 +66,7 @@ class _FeedbackPanel:
         with self._page.show_errors():
             n = await asyncio.to_thread(self._feedback.mark, event.number, subject, right)
             self._right.set_value("")
-            values = {"gesture": words.gesture(event.gesture or ""), "s": words.number(event.begin_s, 1)}
+            values = {"gesture": words.gesture(event.gesture or ""), "s": self._begin(event)}
             key = "live.marked_right" if right else "live.marked"
             self._page.say(words(key, **values, right=words.gesture(right), subject=subject, n=n), "good")
 
@@ -94,6 +95,10 @@ class _FeedbackPanel:
             self._busy = False
             self._update_marks()
 
+    def _begin(self, event: EventSpan) -> str:
+        # 8.95 is written as 9.0, as in the list of events.
+        return self._words.number(round(event.begin_s, 2) + 1e-6, 1)
+
     def _update(self) -> None:
         self._update_event()
         self._update_marks()
@@ -107,7 +112,7 @@ class _FeedbackPanel:
             self._which.set_text(words("live.wrong_none"))
         else:
             gesture = words.gesture(event.gesture or "")
-            self._which.set_text(words("live.wrong_event", gesture=gesture, s=words.number(event.begin_s, 1)))
+            self._which.set_text(words("live.wrong_event", gesture=gesture, s=self._begin(event)))
         labels = bundle.gestures.labels if bundle is not None else ()
         if labels != self._labels:
             self._labels = labels
