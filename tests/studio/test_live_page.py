@@ -14,6 +14,7 @@ import pytest
 
 from plushsense.core.recorder_csv import read_recording
 from plushsense.dataset.index import open_dataset
+from plushsense.live.feedback import read_corrections
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.live.clips import Clips
 from support.browsing import DESK, TABLET, Look, Studio, axe, connected, marked
@@ -331,3 +332,73 @@ def test_the_server_is_killed_while_a_clip_is_recorded(studio: Fixture, look: Fi
     assert stream.read_bytes() == whole, "at most a torn last line is gone"
     (made,) = stream.parent.glob("my own_*.csv")
     assert made.read_bytes().count(b"\n") == whole.count(b"\n") + 1
+
+
+def test_an_event_is_marked_as_wrong_and_the_network_improved(
+    studio: Fixture, look: Fixture, shots: Fixture, home: Path
+) -> None:
+    little = home / "bundles" / "little.plush"
+    before, file = little.read_bytes(), home / "feedback" / "S07.jsonl"
+    browser = look()
+    page = live(browser, studio("--device", "virtual://?person=2", "--speed", "4", home=home).url)
+    assert marked(page, "wrong").is_disabled()
+    marked(page, "start").click()
+    page.wait_for_function("!document.querySelector('[data-test=wrong]').disabled")
+    # The last event can be marked after the toy was stopped, too.
+    marked(page, "stop").click()
+    marked(page, "state").get_by_text("Not reading").wait_for()
+    assert axe(page) == []
+    event = marked(page, "wrong-event").inner_text()
+    assert event.startswith("Last event: ")
+    listed = marked(page, "events").locator("li[data-gesture]:not([data-gesture=''])").first
+    assert event.removeprefix("Last event: ").split(" at ")[1] == listed.locator("span").first.inner_text()
+    gesture, begin = event.removeprefix("Last event: ").removesuffix(" s").split(" at ")
+    wrong = page.get_by_role("button", name="That was wrong")
+    wrong.click()
+    marked(page, "message").get_by_text("First enter the code of the person").wait_for()
+    page.wait_for_function("document.activeElement.getAttribute('aria-label') === 'Person (code)'")
+    page.keyboard.type("S07")
+    right = next(g for g in ("Tail pull", "Ear scratch 1") if g != gesture)
+    choose(page, "It really was", right)
+    # By keys, as a person would who cannot use a mouse.
+    wrong.focus()
+    page.keyboard.press("Enter")
+    told = f"Marked: {gesture} at {begin} s was really {right}. Marks of S07: 1."
+    marked(page, "message").get_by_text(told).wait_for()
+    (kept,) = read_corrections(file)
+    assert (kept.subject, kept.gesture, kept.right) == ("S07", gesture, right)
+    assert 0.0 < kept.begun_s <= 8.0 and len(kept.frames) > 100
+    page.wait_for_function("document.querySelector('[data-test=wrong]').disabled")
+    marked(page, "marks-undo").click()
+    marked(page, "message").get_by_text("The last mark was removed. Marks of S07: 0.").wait_for()
+    assert not file.exists()
+    page.wait_for_function("document.querySelector('[data-test=improve]').disabled")
+    wrong.click()
+    marked(page, "message").get_by_text(f"Marked: {gesture} at {begin} s was wrong. Marks of S07: 1.").wait_for()
+    shots(page, "live-marked")
+    marked(page, "improve").click()
+    marked(page, "message").get_by_text("Now in use for S07: little-for-S07 (the probability").wait_for()
+    marked(page, "bundle").get_by_text("little-for-S07").wait_for()
+    assert axe(page) == []
+    assert no_sideways(page)
+    shots(page, "live-improved")
+    for dark, size in ((True, TABLET), (False, DESK)):
+        other = look(size, dark, "lv", touch=size == TABLET)
+        second = live(other, page.url.removesuffix("/live"))
+        marked(second, "wrong-person").fill("S07")
+        marked(second, "marks").get_by_text("S07 atzīmes: 1").wait_for()
+        marked(second, "marks-undo").focus()
+        assert axe(second) == []
+        assert no_sideways(second)
+        shots(second, f"live-marked-lv-{'dark' if dark else 'light'}")
+        assert other.complaints == []
+        second.close()
+    assert little.read_bytes() == before
+    import plushsense as ps
+
+    assert ps.load(home / "bundles" / "little-for-S07.plush").adapted_to == "S07"
+    # The former network again, by its name.
+    choose(page, "Network", "little")
+    marked(page, "start").click()
+    marked(page, "state").get_by_text("Reading", exact=True).wait_for()
+    assert browser.complaints == []

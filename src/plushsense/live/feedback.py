@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from plushsense.core.errors import BadInput, BundleError, DatasetError, nearest
+from plushsense.core.files import write_file
 from plushsense.core.recorder_csv import Frames
 from plushsense.live.adaptation import DENSE, Examples, Floats, judge, with_one
 from plushsense.models.bundle import Bundle
@@ -32,6 +33,8 @@ from plushsense.runtime.events import NO_GESTURE
 from plushsense.runtime.trace import ReportedEvent, TraceReplayer, trace_of
 from plushsense.windows.clock import row_times_us
 
+FOLDER = "feedback"
+"""Name of the folder in the studio's home that holds a file of corrections for each person."""
 LEAD_S = 8.0
 """Seconds kept before an event: the span of the network, and time for the running mean of gravity."""
 STRENGTH = 15.0
@@ -94,24 +97,46 @@ def correction_of(bundle: Bundle, frames: Frames, event: ReportedEvent, *, subje
     Raises:
         BadInput: if the event has no gesture, or ``right`` is no other gesture of the bundle.
     """
-    labels = bundle.gestures.labels
     if event.gesture == NO_GESTURE:
         raise BadInput(
             f"The event at {event.start_s:.1f} s names no gesture, only an affect: there is nothing to correct."
         )
+    gesture = bundle.gestures.labels[event.gesture]
+    return cut_correction(bundle, frames, gesture, event.named_s, event.stop_s, subject=subject, right=right)
+
+
+def cut_correction(
+    bundle: Bundle, frames: Frames, gesture: str, begun_s: float, ended_s: float, *, subject: str, right: str = ""
+) -> Correction:
+    """Cut the rows of an event, and the `LEAD_S` before them, from a stream.
+
+    The event is taken to last at least two steps, so that the network answers in it.
+
+    Args:
+        frames: the stream, or the part of it that is still kept.
+        gesture: label that was reported from ``begun_s`` to ``ended_s``, in seconds since the first of ``frames``.
+        right: as in `correction_of`.
+
+    Raises:
+        BadInput: if ``right`` is no other gesture of the bundle, or no rows are left.
+    """
+    labels = bundle.gestures.labels
     if right and right not in labels:
         raise BadInput(f"The bundle has no gesture '{right}': it has {', '.join(labels)}.{nearest(right, labels)}")
-    if right == labels[event.gesture]:
-        raise BadInput(f"The event at {event.start_s:.1f} s was reported as '{right}' already.")
+    if right == gesture:
+        raise BadInput(f"The event was reported as '{right}' already: choose what it really was.")
+    begun_s = min(begun_s, ended_s - 2 * bundle.arch.step * bundle.layout.period_us / 1e6)
     passed_s = row_times_us(frames, bundle.layout.period_us) / 1e6
-    first, last = np.searchsorted(passed_s, (event.named_s - LEAD_S, event.stop_s + 1e-6)).tolist()
+    first, last = np.searchsorted(passed_s, (begun_s - LEAD_S, ended_s + 1e-6)).tolist()
+    if first == last:
+        raise BadInput(f"The rows of the event '{gesture}' are not kept any more: mark an event soon after it.")
     zero_s = float(passed_s[first])
     return Correction(
         subject,
-        labels[event.gesture],
+        gesture,
         right,
-        round(max(0.0, event.named_s - zero_s), 3),
-        round(max(0.0, event.stop_s - zero_s), 3),
+        round(max(0.0, begun_s - zero_s), 3),
+        round(max(0.0, ended_s - zero_s), 3),
         bundle.layout.names,
         Frames(frames.values[first:last], frames.device_ms[first:last]),
         datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -163,6 +188,25 @@ def read_corrections(path: str | os.PathLike[str]) -> list[Correction]:
     return found
 
 
+def remove_last_correction(path: str | os.PathLike[str]) -> bool:
+    """Remove the last line of a file of corrections, and the file with its only line; return whether there was one.
+
+    Raises:
+        BadInput: if the file cannot be read or written.
+    """
+    try:
+        lines = Path(path).read_bytes().splitlines(keepends=True)
+        if len(lines) > 1:
+            write_file(Path(path), b"".join(lines[:-1]), private=True)
+        else:
+            Path(path).unlink()
+    except FileNotFoundError:
+        return False
+    except OSError as cause:
+        raise BadInput(f"'{path}' cannot be written: {cause.strerror or cause}.") from None
+    return True
+
+
 @dataclass(frozen=True, eq=False)
 class Corrected:
     """Result of `correct`: ``bundle`` is the corrected one, or the given one if ``accepted`` is false.
@@ -206,8 +250,7 @@ def correct(
     weight, bias = (np.array(start[name], dtype=np.float64) for name in DENSE)
     layer = np.concatenate([weight, bias[:, None]], axis=1)
     marks = [with_one(_features(bundle, c)) for c in corrections]
-    labels = bundle.gestures.labels
-    reported = [labels.index(c.gesture) for c in corrections]
+    reported = [bundle.gestures.index(c.gesture) for c in corrections]
     targets = [_target(layer, x, bundle, c) for x, c in zip(marks, corrections, strict=True)]
     fitted = _fit(layer, marks, targets, strength)
 
@@ -219,7 +262,7 @@ def correct(
     after = float(np.mean([probability(fitted, at) for at in everything]))
     figures = (
         f"the probability of the gestures that were marked as wrong is {after:.2f} instead of {before:.2f} in "
-        f"{len(marks)} events"
+        f"{len(marks)} event{'s' if len(marks) > 1 else ''}"
     )
     refusal = ""
     if len(marks) > 1:
@@ -289,11 +332,11 @@ def _features(bundle: Bundle, correction: Correction) -> Floats:
 
 def _target(layer: Floats, x: Floats, bundle: Bundle, correction: Correction) -> Floats:
     """Return the probabilities (n, K) that the corrected layer should give at the steps ``x`` (n, F + 1)."""
-    labels = bundle.gestures.labels
+    gestures = bundle.gestures
     if correction.right:
-        return np.repeat(np.eye(len(labels))[labels.index(correction.right)][None], len(x), axis=0)
+        return np.repeat(np.eye(len(gestures))[gestures.index(correction.right)][None], len(x), axis=0)
     target = softmax(x @ layer.T)
-    target[:, labels.index(correction.gesture)] = 0.0
+    target[:, gestures.index(correction.gesture)] = 0.0
     return np.asarray(target / np.maximum(target.sum(axis=1, keepdims=True), 1e-12))
 
 

@@ -6,7 +6,7 @@ import html
 import os
 import secrets
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ from plushsense.dataset.quality.checking import CheckReport, check
 from plushsense.dataset.quality.findings import CheckLimits
 from plushsense.dataset.store import HEAD, Dataset, DatasetHead, Progress
 from plushsense.evaluation.reidentification import reidentify, report, verdict
+from plushsense.live.feedback import FOLDER
 from plushsense.models.bundle import Bundle
 
 if TYPE_CHECKING:
@@ -252,12 +253,16 @@ class TrainedOn:
 
 @dataclass(frozen=True)
 class Forgotten:
-    """The files that were removed from a data set (``done``) or would be, and the bundles trained on the person."""
+    """The files that were removed from a data set (``done``) or would be, and what else holds the person's data.
+
+    ``bundles`` were trained on the person; ``feedback`` are files of the studio with corrections of this code.
+    """
 
     plan: RemovalPlan
     bundles: list[TrainedOn]
     done: bool
     dataset: str
+    feedback: list[str] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -266,6 +271,7 @@ class Forgotten:
             "done": self.done,
             **self.plan.to_dict(),
             "bundles": [vars(b) for b in self.bundles],
+            "feedback": self.feedback,
         }
 
 
@@ -279,18 +285,22 @@ def forget(
     """Remove a person from a data set permanently; without ``confirm``, only list what would be removed.
 
     Args:
-        bundles: folders or files to search for models trained on the person, besides the data set's folder. The models
-            are only listed; the user must train them again and delete the old ones.
+        bundles: folders or files to search for models trained on the person and for corrections of the person, besides
+            the data set's folder and the studio's folder that it lies in. They are only listed; the user must train the
+            models again, and delete the old ones and the corrections.
 
     Raises:
         DatasetError: when the person is not in the data set.
     """
     folder = Path(dataset)
     plan = plan_removal(folder, subject)
-    trained = trained_on(folder, subject, [folder, *map(Path, bundles)])
+    places = [folder, *map(Path, bundles)]
+    trained = trained_on(folder, subject, places)
+    kept = {place.resolve() / FOLDER / f"{subject}.jsonl" for place in [*places, folder.resolve().parent.parent]}
+    feedback = sorted(str(path) for path in kept if path.is_file())
     if confirm:
         plan = remove_person(folder, subject)
-    return Forgotten(plan, trained, confirm, str(folder))
+    return Forgotten(plan, trained, confirm, str(folder), feedback)
 
 
 def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[TrainedOn]:

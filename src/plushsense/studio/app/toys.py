@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DeviceError
 from plushsense.core.layouts import layout_names
+from plushsense.core.recorder_csv import Frames
 from plushsense.devices.base import Device, Frame
 from plushsense.devices.opening import SCAN_S, DeviceListing, list_devices, open_device, parse_url
 from plushsense.devices.reconnect import ConnectionGap
@@ -77,6 +78,13 @@ class SampleBuffer:
             at = at[self._seconds[at] >= self._seconds[at[-1:]] - seconds] if len(at) else at
             clocks, values = self._clocks[at].tolist(), self._values[at].astype(np.int64).tolist()
         return [Frame(host, device, tuple(v)) for (host, device), v in zip(clocks, values, strict=True)]
+
+    def rows(self) -> tuple[float, Frames]:
+        """Return all rows that are kept, and the time of the first of them by the toy's clock."""
+        with self._lock:
+            at = self._places(0, len(self._seconds))
+            first_s = float(self._seconds[at[0]]) if len(at) else 0.0
+            return first_s, Frames(self._values[at].astype(np.int64), self._clocks[at, 1])
 
     def _places(self, place: int, most: int) -> NDArray[np.int64]:
         size = len(self._seconds)

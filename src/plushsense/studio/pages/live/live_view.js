@@ -62,7 +62,8 @@ const CSS = `
 @keyframes lv-glow { from { opacity: .75 } to { opacity: 1 } }`;
 
 export default {
-  template: '<div></div>',
+  // The slot is moved below the current event.
+  template: '<div><div ref="below"><slot></slot></div></div>',
   props: { words: Object, affects: Object, signs: Object, colours: Object, lines: Array, locale: String, sameClock: Boolean, start: Object },
   mounted() {
     if (!document.getElementById("lv-css")) {
@@ -138,7 +139,7 @@ export default {
       }
       n.spoken = el("p", "lv-hidden");
       n.spoken.setAttribute("aria-live", "polite");
-      now.append(top, voices, n.spoken);
+      now.append(top, this.$refs.below, voices, n.spoken);
       const chances = el("h2", "", w.chances);
       chances.style.marginTop = "14px";
       n.bars = el("div");

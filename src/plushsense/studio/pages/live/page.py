@@ -32,7 +32,7 @@ from plushsense.studio.app.shell import (
 from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import VIRTUAL, Workspace
-from plushsense.studio.pages.live import clips_page
+from plushsense.studio.pages.live import clips_page, feedback_page
 from plushsense.studio.pages.live.clips import Clips
 from plushsense.studio.pages.live.reader import EventSpan, LatestAnswer, LiveChoice, LiveReader, LiveState
 
@@ -187,7 +187,10 @@ def _span(span: EventSpan) -> Message:
 
 
 class LiveView(Element, component="live_view.js"):
-    """Browser component that displays the messages of ``feed``, with texts from ``words``."""
+    """Browser component that displays the messages of ``feed``, with texts from ``words``.
+
+    Elements that are added to it are displayed below the current event.
+    """
 
     def __init__(self, words: Words, feed: Feed) -> None:
         super().__init__()
@@ -252,7 +255,10 @@ def show(page: Page) -> None:
     on_change(reader.changed, update_mark)
     update_mark()
     feed = Feed(reader)
-    _follow(LiveView(words, feed), feed, reader)
+    view = LiveView(words, feed)
+    with view:
+        feedback_page.show(page, reader)
+    _follow(view, feed, reader)
     clips_page.show(page, reader)
     clips = page.workspace.part(Clips)
     context.client.on_delete(reader.add_viewer(lambda: bool(clips.recording)))

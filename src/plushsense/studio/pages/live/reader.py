@@ -64,6 +64,7 @@ class EventSpan:
         number: consecutive number from 1, continued when the bundle changes.
         change: number of the latest change of this event; all changes of all events are numbered consecutively.
         end_s: time of its end, None while it lasts.
+        named_s, closed_s: times at which its gesture and its end were reported, None before that.
     """
 
     number: int
@@ -73,6 +74,8 @@ class EventSpan:
     gesture: str | None
     source: str
     end_s: float | None = None
+    named_s: float | None = None
+    closed_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -356,15 +359,23 @@ class LiveReader:
             self._spans_begun += 1
             self._changes += 1
             span = EventSpan(
-                self._spans_begun, self._changes, zero + event.since_s, event.affect, event.gesture, event.source
+                self._spans_begun,
+                self._changes,
+                zero + event.since_s,
+                event.affect,
+                event.gesture,
+                event.source,
+                named_s=None if event.gesture is None else zero + event.t_s,
             )
             while self._spans and self._spans[0].begin_s < span.begin_s - KEPT_SPAN_S:
                 self._spans.popleft()
             self._spans.append(span)
             self.now = replace(self.now, event=span)
         elif self.now.event is not None:
-            end_s = zero + event.since_s if event.kind == "ended" else None
-            self._change_event(affect=event.affect, gesture=event.gesture, end_s=end_s)
+            changed = {"named_s": zero + event.t_s}
+            if event.kind == "ended":
+                changed = {"end_s": zero + event.since_s, "closed_s": zero + event.t_s}
+            self._change_event(affect=event.affect, gesture=event.gesture, **changed)
 
     def _change_event(self, **changed: Any) -> None:
         """Change or end the current event; the caller must hold the lock."""

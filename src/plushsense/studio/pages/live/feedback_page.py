@@ -1,0 +1,130 @@
+"""Build the part of the live page that marks an event as wrong and improves the network for the person."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from dataclasses import replace
+
+from nicegui import ui
+
+from plushsense.core.errors import BadInput
+from plushsense.studio.app.shell import Page, button, named, on_change, tag
+from plushsense.studio.pages.live.feedback import Feedback
+from plushsense.studio.pages.live.reader import EventSpan, LiveReader
+
+
+def show(page: Page, reader: LiveReader) -> None:
+    """Build the part, which is below the current event."""
+    box = ui.element("div").props("role=group").classes("w-full column no-wrap ps-small-gap q-mt-sm")
+    with named(box, page.words("live.wrong_about")):
+        _FeedbackPanel(page, reader)
+
+
+class _FeedbackPanel:
+    """Fields and buttons that mark the last event, remove the last mark, and improve the network."""
+
+    def __init__(self, page: Page, reader: LiveReader) -> None:
+        self._reader, self._words = reader, page.words
+        self._feedback = page.workspace.part(Feedback)
+        self._event: EventSpan | None = None
+        self._labels: tuple[str, ...] = ()
+        self._busy = False
+        words = page.words
+        with ui.row().classes("w-full justify-between ps-small-gap"):
+            self._which = tag(ui.label(""), "wrong-event")
+            self._count = tag(ui.label("").classes("ps-dim"), "marks")
+        with ui.row().classes("w-full items-center ps-small-gap"):
+            self._wrong = button("wrong", words("live.wrong"), self._mark, "unelevated", icon="thumb_down")
+            nothing = {"": words("live.wrong_nothing")}
+            self._right = ui.select(nothing, value="", label=words("live.wrong_really"))
+            tag(self._right, "wrong-really").style("flex: 1 1 10rem; min-width: 0")
+            self._person = ui.input(words("live.wrong_person"), placeholder="S01").props("maxlength=16")
+            tag(self._person.style("width: 7rem"), "wrong-person").on_value_change(self._update_marks)
+        with ui.row().classes("w-full items-center ps-small-gap"):
+            self._improve = button("improve", words("live.improve"), self._fit, icon="auto_fix_high")
+            self._undo = button("marks-undo", words("live.marks_undo"), self._remove, "flat", icon="undo")
+        # Messages are displayed here, because the top of the page may be out of view.
+        self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))
+        on_change(reader.changed, self._update_event)
+        on_change(self._feedback.changed, self._update)
+        self._update()
+
+    def _code(self) -> str:
+        """Return the code of the person; if it is missing, show a message and return ""."""
+        text = str(self._person.value or "").strip()
+        if not text:
+            self._page.say(self._words("live.person_first"), "warning")
+            self._person.run_method("focus")
+        return text
+
+    async def _mark(self) -> None:
+        # The event that the page shows: another one may begin while the button is pressed.
+        event, right, words = self._event, str(self._right.value or ""), self._words
+        if event is None or not (subject := self._code()):
+            return
+        with self._page.show_errors():
+            n = await asyncio.to_thread(self._feedback.mark, event.number, subject, right)
+            self._right.set_value("")
+            values = {"gesture": words.gesture(event.gesture or ""), "s": self._begin(event)}
+            key = "live.marked_right" if right else "live.marked"
+            self._page.say(words(key, **values, right=words.gesture(right), subject=subject, n=n), "good")
+
+    async def _remove(self) -> None:
+        if subject := self._code():
+            with self._page.show_errors():
+                n = await asyncio.to_thread(self._feedback.undo, subject)
+                self._page.say(self._words("live.marks_undone", subject=subject, n=n), "good")
+
+    async def _fit(self) -> None:
+        words = self._words
+        if self._busy or not (subject := self._code()):
+            return
+        self._busy = True
+        self._page.say(words("live.improving"))
+        self._update_marks()
+        try:
+            with self._page.show_errors():
+                done = await asyncio.to_thread(self._feedback.improve, subject)
+                if done.name:
+                    values = {"name": done.name, "before": done.before, "subject": subject}
+                    self._page.say(words("live.improved", **values, reason=done.reason), "good")
+                else:
+                    self._page.say(words("live.improve_refused", reason=done.reason), "warning")
+        finally:
+            self._busy = False
+            self._update_marks()
+
+    def _begin(self, event: EventSpan) -> str:
+        # 8.95 is written as 9.0, as in the list of events.
+        return self._words.number(round(event.begin_s, 2) + 1e-6, 1)
+
+    def _update(self) -> None:
+        self._update_event()
+        self._update_marks()
+
+    def _update_event(self) -> None:
+        """Display the event that can be marked, and the gestures of the bundle in use."""
+        words, bundle = self._words, self._reader.bundle
+        self._event = event = self._feedback.last_event()
+        self._wrong.set_enabled(event is not None)
+        if event is None:
+            self._which.set_text(words("live.wrong_none"))
+        else:
+            gesture = words.gesture(event.gesture or "")
+            self._which.set_text(words("live.wrong_event", gesture=gesture, s=self._begin(event)))
+        labels = bundle.gestures.labels if bundle is not None else ()
+        if labels != self._labels:
+            self._labels = labels
+            options = {"": words("live.wrong_nothing")} | {label: words.gesture(label) for label in labels}
+            self._right.set_options(options, value=self._right.value if self._right.value in options else "")
+
+    def _update_marks(self) -> None:
+        subject, n = str(self._person.value or "").strip(), 0
+        if subject:
+            # A code that is still being typed may be invalid.
+            with contextlib.suppress(BadInput, OSError):
+                n = self._feedback.count(subject)
+        self._count.set_text(self._words("live.marks", subject=subject, n=n) if n else "")
+        for control in (self._undo, self._improve):
+            control.set_enabled(n > 0 and not self._busy)
