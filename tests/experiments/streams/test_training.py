@@ -55,7 +55,8 @@ def test_a_fold_of_the_benchmark(rested: Dataset, trained: list[WindowSet], tmp_
     config = from_settings(filters=(4, 4, 4), epochs=2, classes="all")
     fold = PeopleFold("fold 1", ("P1", "P2", "P3"), ("P4",), ("P5",))
     TrainStreams(recipes_for(rested, config, {WINDOWS, ANYWHERE}, None), False, tmp_path)(rested, fold, lambda *_: None)
-    assert len(trained) == 2
+    # Gestures, anywhere without hard negatives, anywhere with them.
+    assert len(trained) == 3
     for windows in trained:
         assert owners(rested, windows) == {"P1", "P2", "P3"}
         assert NOBODY in windows.subject and "Rest" in np.array(windows.labels)[windows.y]
@@ -65,6 +66,19 @@ def test_a_training_that_fits_decisions(rested: Dataset, trained: list[WindowSet
     bundle = ps.train(rested, filters=(4, 4, 4), epochs=2, classes="all").bundle
     (held,) = set(bundle.provenance["validation_subjects"]) - {NOBODY}
     assert owners(rested, trained[0]) == {"P1", "P2", "P3", "P4", "P5"} - {held}
+
+
+def test_a_training_anywhere_adds_hard_negatives_of_the_training_people(
+    rested: Dataset, trained: list[WindowSet]
+) -> None:
+    bundle = ps.train(
+        rested, context="anywhere", filters=(4, 4, 4), epochs=2, classes="all", fit_decisions=False
+    ).bundle
+    (held,) = set(bundle.provenance["validation_subjects"]) - {NOBODY}
+    first, second = trained
+    assert len(first) <= len(second) <= 1.15 * len(first)
+    for windows in trained:
+        assert owners(rested, windows) == {"P1", "P2", "P3", "P4", "P5"} - {held}
 
 
 def test_a_fold_of_abstaining(rested: Dataset) -> None:
