@@ -63,8 +63,6 @@ def test_the_stretch_is_kept_with_its_past(bundle: Bundle, marks: list[Correctio
     with path.open("ab") as file:
         file.write(b'{"subject": "S0')  # a crash
     append_corrections(path, marks[1:])
-    text = path.read_text(encoding="utf-8")
-    path.write_text(text.replace('{"subject": "S0\n', ""), encoding="utf-8")
     found = read_corrections(path)
     assert [c.gesture for c in found] == [c.gesture for c in marks] and path.stat().st_mode & 0o077 == 0
     for one, other in zip(found, marks, strict=True):
@@ -152,6 +150,7 @@ def test_a_damaged_line_is_no_correction(marks: list[Correction], tmp_path_facto
     path = tmp_path_factory.mktemp("damaged") / "S07.jsonl"
     path.write_bytes(bytes(line) + marks[0].to_line().encode())
     try:
-        assert len(read_corrections(path)) == 2  # still a correction, of other numbers or words
+        # Not JSON any more, or still a correction, of other numbers or words.
+        assert len(read_corrections(path)) in (1, 2)
     except DatasetError as said:
         assert "line 1" in str(said)

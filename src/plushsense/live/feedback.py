@@ -162,13 +162,13 @@ def append_corrections(path: str | os.PathLike[str], corrections: Sequence[Corre
 
 
 def read_corrections(path: str | os.PathLike[str]) -> list[Correction]:
-    """Read the corrections of a file; a last line that was cut off by a crash is skipped.
+    """Read the corrections of a file; a line that is not JSON (cut off by a crash) is skipped.
 
     Raises:
         DatasetError: if the file cannot be read, or a line of it is no correction.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        lines = Path(path).read_text(encoding="utf-8").split("\n")
     except (OSError, UnicodeDecodeError) as cause:
         raise DatasetError(f"'{path}' cannot be read ({cause}): give a file that plushsense feedback wrote.") from None
     found = []
@@ -177,9 +177,9 @@ def read_corrections(path: str | os.PathLike[str]) -> list[Correction]:
             continue
         try:
             found.append(Correction.from_line(line))
+        except json.JSONDecodeError:
+            continue
         except (ValueError, TypeError, KeyError):
-            if number == len(lines):
-                continue
             raise DatasetError(
                 f"'{path}' line {number} is no correction: give a file that plushsense feedback wrote."
             ) from None
@@ -265,7 +265,9 @@ def correct(
         f"{len(marks)} event{'s' if len(marks) > 1 else ''}"
     )
     refusal = ""
-    if len(marks) > 1:
+    if after >= before:
+        refusal = "the gestures that were marked as wrong would not become less likely"
+    elif len(marks) > 1:
         others = [[n for n in everything if n != at] for at in everything]
         left_out = [
             probability(_fit(layer, [marks[n] for n in rest], [targets[n] for n in rest], strength), at)
