@@ -146,7 +146,7 @@ def test_a_bundle_is_improved_beside_the_former_one(workspace: Workspace) -> Non
     marked(workspace, right=PULL)
     done = feedback.improve("S07")
     assert (done.name, done.before) == ("one-for-S07", "one")
-    assert "probability of the gestures" in done.reason
+    assert "probability of a wrong answer" in done.reason
     assert reader.choice.bundle == workspace.folder / "bundles" / "one-for-S07.plush"
     made = Bundle.load(reader.choice.bundle)
     assert made.adapted_to == "S07"

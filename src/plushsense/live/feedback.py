@@ -211,8 +211,8 @@ def remove_last_correction(path: str | os.PathLike[str]) -> bool:
 class Corrected:
     """Result of `correct`: ``bundle`` is the corrected one, or the given one if ``accepted`` is false.
 
-    ``before`` and ``after`` are the mean probability of the reported gestures in their events. ``reason`` explains the
-    decision as text.
+    ``before`` and ``after`` are the mean probability of a wrong answer in the events: of the reported gesture or, where
+    the right one was named, of any other. ``reason`` explains the decision as text.
     """
 
     bundle: Bundle
@@ -232,8 +232,9 @@ def correct(
 ) -> Corrected:
     """Fit the dense layer of a bundle to corrections, or return the bundle unchanged if that does not help.
 
-    Corrections of an earlier call are replaced. It does not help if the probability of a reported gesture does not fall
-    when its correction is left out of the fit, or if fewer of the person's own recordings are read right than before.
+    Corrections of an earlier call are replaced. It does not help if the probability of a wrong answer in the events
+    does not fall, also when an event is left out of the fit, or if fewer of the person's own recordings are read right
+    than before.
 
     Args:
         corrections: of one person.
@@ -254,23 +255,27 @@ def correct(
     targets = [_target(layer, x, bundle, c) for x, c in zip(marks, corrections, strict=True)]
     fitted = _fit(layer, marks, targets, strength)
 
-    def probability(rows: Floats, at: int) -> float:
-        return float(softmax(marks[at] @ rows.T)[:, reported[at]].mean())
+    def wrong(rows: Floats, at: int) -> float:
+        """Return the mean probability of the reported gesture, or of any other than the right one, in an event."""
+        shares = softmax(marks[at] @ rows.T)
+        right = corrections[at].right
+        wrong = 1.0 - shares[:, bundle.gestures.index(right)] if right else shares[:, reported[at]]
+        return float(wrong.mean())
 
     everything = range(len(marks))
-    before = float(np.mean([probability(layer, at) for at in everything]))
-    after = float(np.mean([probability(fitted, at) for at in everything]))
+    before = float(np.mean([wrong(layer, at) for at in everything]))
+    after = float(np.mean([wrong(fitted, at) for at in everything]))
     figures = (
-        f"the probability of the gestures that were marked as wrong is {after:.2f} instead of {before:.2f} in "
-        f"{len(marks)} event{'s' if len(marks) > 1 else ''}"
+        f"the probability of a wrong answer is {after:.2f} instead of {before:.2f} in {len(marks)} "
+        f"event{'s' if len(marks) > 1 else ''} that {'were' if len(marks) > 1 else 'was'} corrected"
     )
     refusal = ""
     if after >= before:
-        refusal = "the gestures that were marked as wrong would not become less likely"
+        refusal = "a wrong answer would not become less likely"
     elif len(marks) > 1:
         others = [[n for n in everything if n != at] for at in everything]
         left_out = [
-            probability(_fit(layer, [marks[n] for n in rest], [targets[n] for n in rest], strength), at)
+            wrong(_fit(layer, [marks[n] for n in rest], [targets[n] for n in rest], strength), at)
             for at, rest in zip(everything, others, strict=True)
         ]
         if np.mean(left_out) >= before:
