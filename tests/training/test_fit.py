@@ -205,10 +205,14 @@ def test_hard_negatives_are_the_idle_windows_that_look_like_a_gesture(made: Make
     names = [candidates.recording_ids[r] for r in candidates.recording]
     assert names == [w.recording_ids[r] for w in (easy, hard) for r in w.recording]
     spec = replace(SPEC, epochs=25)
-    more = with_hard_negatives(train, candidates, idle, arch(), spec, share=0.1)
+    more = with_hard_negatives(train, candidates, idle, (0, 1), arch(), spec, share=0.1)
     added = more.take(np.arange(len(train), len(more)))
     assert 0 < len(added) <= 6 and np.array_equal(more.x[: len(train)], train.x) and set(added.y) == {idle}
     assert all(any(np.array_equal(x, other) for other in hard.x) for x in added.x)
+    # What is no reaction may be reported.
+    assert with_hard_negatives(train, hard, idle, (1,), arch(), spec, share=0.1).x.shape == train.x.shape
     # Gestures among the candidates are ignored, and with no share nothing is trained.
-    assert with_hard_negatives(train, made(30, seed=6).take(np.arange(0)), idle, arch(), spec, share=0.1) is train
-    assert with_hard_negatives(train, candidates, idle, arch(), spec, share=0.0) is train
+    assert (
+        with_hard_negatives(train, made(30, seed=6).take(np.arange(0)), idle, (0, 1), arch(), spec, share=0.1) is train
+    )
+    assert with_hard_negatives(train, candidates, idle, (0, 1), arch(), spec, share=0.0) is train

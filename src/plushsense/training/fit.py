@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -203,6 +203,7 @@ def with_hard_negatives(
     train: WindowSet,
     candidates: WindowSet,
     idle: int,
+    reactions: Sequence[int],
     arch: Arch,
     spec: TrainSpec,
     share: float,
@@ -212,11 +213,13 @@ def with_hard_negatives(
 
     Most idle windows are easy, and evenly spaced ones hold few of those at which a network reports a gesture for no
     reason. A network is trained on ``train`` and computes the candidates of class ``idle``, which must be of the
-    training people. Those that it takes for a gesture with a probability of at least 0.3 are added, the clearest first.
+    training people. Those in which the classes of ``reactions`` together have a probability of at least 0.3 are added,
+    the highest first.
 
     Args:
         candidates: windows of the same classes; those of other classes are ignored. Windows that are in ``train``
             already may be among them, and then count twice.
+        reactions: indices of the classes that must not be reported for no reason.
         share: largest number of added windows, as a share of ``train``.
         progress: as for `fit`.
     """
@@ -225,7 +228,8 @@ def with_hard_negatives(
     if not len(at) or not most:
         return train
     first = fit(train, None, arch, spec, progress)
-    gesture = 1.0 - predict(arch, first.weights, first.scaler, candidates.take(at), spec.device)[:, idle]
+    shares = predict(arch, first.weights, first.scaler, candidates.take(at), spec.device)
+    gesture = shares[:, list(reactions)].sum(axis=1)
     hardest = np.argsort(-gesture, kind="stable")[:most]
     return train.joined(candidates.take(at[hardest[gesture[hardest] >= _HARD]]))
 

@@ -195,7 +195,8 @@ def train(
             ``config.live`` that differ from the defaults are kept.
         journal: stores the progress of the training (see `unfinished`), so that an interrupted one resumes and gives
             the same bundle. The steps after the training are repeated.
-        progress: called with (epoch, maximum of epochs, the epoch's row), first for the epochs before an interruption.
+        progress: called with (epoch, maximum of epochs, the epoch's row), first for the epochs before an interruption;
+            not while the first network trains that finds hard negatives (context "anywhere").
         warn: called with a sentence for everything that is left out, and if 8-bit arithmetic changes many predictions.
     """
     given = config or from_settings(arch=arch, filters=filters, **settings)
@@ -223,7 +224,7 @@ def train(
     if division.kind == WHOLE_PEOPLE:
         train_on = add_hard_negatives(
             train_on, dataset, network, config.windows, config.anywhere, gestures, config.training,
-            division.fold.subjects, progress,
+            division.fold.subjects,
         )  # fmt: skip
     state = None if journal is None else ResumableTraining(journal, network, config.training, train_on, watched)
     start = state.load() if state else None

@@ -131,7 +131,9 @@ def add_hard_negatives(
     cut = windows_for(dataset, arch, spec, gestures, anywhere=idle_candidates(anywhere))
     mine = np.isin(cut.subject, np.unique(train.subject)) & outside_streams(cut, dataset, others)
     candidates = cut.take(np.flatnonzero(mine))
-    return with_hard_negatives(train, candidates, idle[0], arch, training, anywhere.hard_share, progress)
+    # A toy that is held between gestures may report a neutral one: that is no reaction, and often not wrong.
+    reactions = [k for k, g in enumerate(gestures.gestures) if not g.idle and g.affect != "neutral"]
+    return with_hard_negatives(train, candidates, idle[0], reactions, arch, training, anywhere.hard_share, progress)
 
 
 def warn_of_single_people(windows: WindowSet, warn: Warn) -> None:
