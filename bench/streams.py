@@ -54,10 +54,10 @@ ROWS = {
     "windows": Row("gestures only, smoothed argmax", system="smoothed"),
     "windows-hysteresis": Row("gestures only, hysteresis", system="hysteresis"),
     "smoothed": Row("anywhere, smoothed argmax", system="anywhere-smoothed"),
-    "easy": Row("anywhere, hysteresis, without hard negatives", anywhere={"hard_share": 0.0}),
-    "hard": Row("anywhere, hysteresis, hard negatives"),
-    "pool-0.8": Row("the same, pool 0.8 s, without hard negatives", pool_s=0.8, anywhere={"hard_share": 0.0}),
-    "pool-0.5": Row("the same, pool 0.5 s, without hard negatives", pool_s=0.5, anywhere={"hard_share": 0.0}),
+    "easy": Row("anywhere, hysteresis"),
+    "hard": Row("anywhere, hysteresis, hard negatives", anywhere={"hard_share": 0.15}),
+    "pool-0.8": Row("anywhere, hysteresis, pool 0.8 s", pool_s=0.8),
+    "pool-0.5": Row("anywhere, hysteresis, pool 0.5 s", pool_s=0.5),
 }
 FEEDBACK = "feedback"
 

@@ -14,8 +14,8 @@ replace this guess: positions in a practised gesture, and up to ``settle_s`` aft
 or where the toy is picked up, turned or put down are idle however much it moves. Of the remaining idle positions,
 evenly spaced ones are taken, so that ``idle_share`` of all windows are idle.
 
-`plushsense.training.fit.with_hard_negatives` adds hard negatives: those of all remaining idle positions that a first
-network takes for a gesture, at most ``hard_share`` of the windows.
+With a ``hard_share``, `plushsense.training.fit.with_hard_negatives` adds hard negatives: those of all remaining idle
+positions that a first network takes for a gesture, at most this share of the windows.
 
 A recording that is in no stream (or has no position there) is cut as in `plushsense.windows.cut`, and marked. If a
 recording of a session has no place in the stream, the session gives no idle positions outside recordings, since its
@@ -61,7 +61,7 @@ class AnywhereSpec:
     settle_s: float = 1.0
     idle_share: float = 0.3
     busy_share: float = 0.3
-    hard_share: float = 0.15
+    hard_share: float = 0.0
 
     def __post_init__(self) -> None:
         for f in fields(self):

@@ -52,7 +52,7 @@ def owners(dataset: Dataset, windows: WindowSet) -> set[str]:
 
 
 def test_a_fold_of_the_benchmark(rested: Dataset, trained: list[WindowSet], tmp_path: Path) -> None:
-    config = from_settings(filters=(4, 4, 4), epochs=2, classes="all")
+    config = from_settings(filters=(4, 4, 4), epochs=2, classes="all", hard_share=0.15)
     fold = PeopleFold("fold 1", ("P1", "P2", "P3"), ("P4",), ("P5",))
     TrainStreams(recipes_for(rested, config, {WINDOWS, ANYWHERE}, None), False, tmp_path)(rested, fold, lambda *_: None)
     # Gestures, anywhere without hard negatives, anywhere with them.
