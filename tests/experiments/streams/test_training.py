@@ -71,9 +71,8 @@ def test_a_training_that_fits_decisions(rested: Dataset, trained: list[WindowSet
 def test_a_training_anywhere_adds_hard_negatives_of_the_training_people(
     rested: Dataset, trained: list[WindowSet]
 ) -> None:
-    bundle = ps.train(
-        rested, context="anywhere", filters=(4, 4, 4), epochs=2, classes="all", fit_decisions=False
-    ).bundle
+    settings = {"filters": (4, 4, 4), "epochs": 2, "classes": "all", "fit_decisions": False, "hard_share": 0.15}
+    bundle = ps.train(rested, context="anywhere", **settings).bundle
     (held,) = set(bundle.provenance["validation_subjects"]) - {NOBODY}
     first, second = trained
     assert len(first) <= len(second) <= 1.15 * len(first)
