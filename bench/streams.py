@@ -2,9 +2,10 @@
 
     plushsense import ../shared/data/makeability-gestures DS --layout accel-3
     plushsense trim DS --accept-above 0.5 --who K
-    python bench/streams.py DS                          # every row, seeds 0 to 2: about 3 hours on two cores
+    python bench/streams.py DS                          # every row, seeds 0 to 2
     python bench/streams.py DS --rows hard,feedback --seeds 0
 
+On two cores, the row ``easy`` takes 14 minutes for three seeds; others of one training take about as long.
 A seed decides both the folds by person and the training. Finished folds and networks are kept in DS/cache, so that the
 same command resumes. The row ``feedback`` simulates three corrections ("that was wrong") of a gesture: the first three
 false events of a person's stream that name it are marked, the network is corrected (`plushsense.live.feedback`), and

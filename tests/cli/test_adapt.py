@@ -253,6 +253,7 @@ def test_events_marked_as_wrong_correct_the_bundle(
     assert both.status == 0 and both.json["adapted"] and both.json["corrections"]["corrections"] == 2
     back = tmp_path / "back.plush"
     assert cli("adapt", tmp_path / "both.plush", "--undo", "--out", back).status == 0 and back.read_bytes() == before
+    again = person(make_session, tmp_path / "R" / "S98", (107, 108))
     for refused, said in (
         (("feedback", bundle, folder, "--wrong", "9999"), "no event '9999'"),
         (("feedback", bundle, folder, "--right", "1"), "names no gesture"),
@@ -261,6 +262,7 @@ def test_events_marked_as_wrong_correct_the_bundle(
             ("adapt", bundle, "--feedback", marks, "--subject", "S99", "--out", out, "--force"),
             "choose among RECORDINGS",
         ),
+        (("adapt", bundle, again, "--feedback", marks, "--out", out, "--force"), "of S99, the recordings of S98"),
         (("adapt", bundle, "--feedback", tmp_path / "none", "--out", out, "--force"), "cannot be read"),
     ):
         ran = cli(*refused)

@@ -319,6 +319,11 @@ def adapt(
     with tempfile.TemporaryDirectory(prefix="plushsense-") as place:
         dataset = _dataset(recordings, given, Path(place))
         person = _person(dataset, subject)
+        corrections = [] if feedback is None else read_corrections(feedback)
+        if others := sorted({c.subject for c in corrections} - {person}):
+            raise BadInput(
+                f"The corrections are of {', '.join(others)}, the recordings of {person}: give one person's."
+            )
         dataset = dataset.with_inputs(given.layout).with_gestures(given.gestures)
         _same_layout(given, dataset)
         _warn_of_training(given, person, warn)
@@ -343,9 +348,9 @@ def adapt(
         one, other = (judge(predict(test), test.y, test.recording).scores for predict in predictors)
         tested = (one, other)
     corrected = None
-    if feedback is not None:
+    if corrections:
         features = done.bundle.network().features(done.bundle.scaler.apply(adapting.x))
-        corrected = correct(done.bundle, read_corrections(feedback), Examples(features, adapting.y, adapting.recording))
+        corrected = correct(done.bundle, corrections, Examples(features, adapting.y, adapting.recording))
     dataset.generation.check()
     return Adapted(done, person, use, tested, left_out, dataset.head.simulated, corrected)
 

@@ -44,7 +44,7 @@ _ROUNDING_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """One row of a file: an event, or a decision, which begins and ends at the same time."""
+    """A predicted event with its score, and its line in the file; a decision begins and ends at the same time."""
 
     line: int
     event: ReportedEvent
