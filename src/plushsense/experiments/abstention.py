@@ -311,7 +311,7 @@ def curves(measured: Mapping[str, RiskCoverage], *, title: str = "") -> Figure:
     axes.grid(color="#dddddd", linewidth=0.5)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize=7.5, frameon=False, loc="upper left", bbox_to_anchor=(0, 1.0))
-    axes.set_ylim(0, 100 * max(first.random, *(float(c.risk.max()) for c in measured.values())) * 1.75)
+    axes.set_ylim(0, 100 * max(first.random, *(float(c.risk.max()) for c in measured.values())) * 2.0)
     if title:
         axes.set_title(title, fontsize=10, parse_math=False)
     return figure
