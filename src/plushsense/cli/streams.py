@@ -161,10 +161,12 @@ def _format_labels(result: dict[str, Any]) -> list[str]:
 
 def _format_systems(result: dict[str, Any]) -> list[str]:
     """Format the scores of the systems as text: a row for each setting, then false events at equal recall."""
+    from plushsense.experiments.streams.score import CHOICES
+
     rows = [
         (system["title"], how, *_row(system[how]))
         for system in result["systems"].values()
-        for how in ("plain", "balanced", "prompt", "cheapest")
+        for how in ("plain", *CHOICES)
         if how in system
     ]
     names = list(result["systems"])
@@ -184,7 +186,7 @@ def _format_systems(result: dict[str, Any]) -> list[str]:
         table(("system", "setting", *_HEAD), rows),
         "",
         "plain: no threshold; on the people used for fitting, balanced: highest F1; prompt: shortest latency with an "
-        "F1 at most 0.05 lower; cheapest: lowest cost",
+        "F1 at most 0.05 lower; quiet: highest F1 with at most 60 false events an hour; cheapest: lowest cost",
         "",
         *(["false events an hour at equal recall:", "", table(("recall", *names), equal), ""] if equal else []),
         result["note"],

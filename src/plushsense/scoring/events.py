@@ -254,6 +254,10 @@ class ErrorCosts:
     gesture; ``again`` for each further one; ``family`` for another gesture of the same family, or if only the affect
     was reported and is right; ``confused`` for another family of the same affect, or if an affect is unknown;
     ``affect`` for another affect. It is ``outside`` without such a truth. A truth without any event costs ``missed``.
+
+    Decision settings are fitted by the same costs (`plushsense.tuning.events`) and by two more, which `cost` does not
+    use: ``late_s`` for each second until a gesture is named, and ``unmarked``, instead of ``outside``, for an event in
+    a time of which nothing is known, because people may have practised then.
     """
 
     again: float = 0.5
@@ -262,6 +266,8 @@ class ErrorCosts:
     missed: float = 2.0
     outside: float = 3.0
     affect: float = 5.0
+    late_s: float = 0.4
+    unmarked: float = 0.5
 
 
 def cost(

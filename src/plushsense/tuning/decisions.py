@@ -24,6 +24,7 @@ from plushsense.runtime.events import ONE
 from plushsense.runtime.fixed import Ints, integer_logits, smoothing_weight, softmax
 from plushsense.runtime.health import MOST_MS, HealthSettings
 from plushsense.runtime.trace import TraceReplayer, trace_of
+from plushsense.scoring.events import ErrorCosts
 from plushsense.tuning.events import OTHER, MarkedStream, Truth, tune
 from plushsense.tuning.gate import fit_gate
 from plushsense.windows.clock import row_times_us
@@ -227,7 +228,11 @@ def fit_decisions(
     if streams:
         if "known" not in keep:
             spec = replace(spec, known=known_threshold(labelled_steps(bundle, streams, spec), known_share))
-        tuned = tune(streams, spec, bundle.gestures, keep=keep)
+        costs = ErrorCosts()
+        if dataset.head.simulated or dataset.layout.is_labelled:
+            # Nobody practises there between the marked gestures, so every event outside of them is false.
+            costs = replace(costs, unmarked=costs.outside)
+        tuned = tune(streams, spec, bundle.gestures, costs, keep)
         spec = tuned.spec
         labelled = labelled_steps(bundle, streams, spec)
         report["events"] = {

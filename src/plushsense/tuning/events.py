@@ -17,6 +17,7 @@ from plushsense.core.gestures import GestureSet
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import AFFECT_CODES, BEGUN, ENDED, NAMED, NO_GESTURE, Update
 from plushsense.runtime.trace import Trace, TraceReplayer
+from plushsense.scoring.events import ErrorCosts
 
 OTHER = -1
 
@@ -37,31 +38,6 @@ class MarkedStream:
     person: str
     trace: Trace
     truths: tuple[Truth, ...]
-
-
-@dataclass(frozen=True)
-class EventCosts:
-    """Costs of errors, in units of a missed gesture.
-
-    A gesture costs ``missed`` if it has no event, else as much as its best event: ``late_s`` for each second until it
-    is named, at most 3 s; ``unnamed`` if only its affect is reported; for a wrong gesture, ``family`` if it is of the
-    same family, ``same`` if it has the same affect, ``other`` if neither has one, ``affect`` if the affect differs.
-    Every further event costs ``again`` and half its error. An event during rest costs ``idle``, one in an unmarked part
-    ``unmarked``, which is less because people may have practised there.
-    """
-
-    missed: float = 1.0
-    late_s: float = 0.2
-    unnamed: float = 0.25
-    family: float = 0.3
-    same: float = 0.5
-    other: float = 1.0
-    affect: float = 2.0
-    again: float = 0.1
-    idle: float = 1.0
-    unmarked: float = 0.25
-    early_us: int = 250_000
-    grace_us: int = 1_000_000
 
 
 @dataclass(slots=True)
@@ -88,12 +64,19 @@ def timed_events(updates: Sequence[Update]) -> list[TimedEvent]:
     return out
 
 
+# An event belongs to a gesture if it begins from this long before the gesture to this long after it.
+_EARLY_US, _GRACE_US = 250_000, 1_000_000
+_LATEST_S = 3.0  # a later event costs no more for being late
+
+
 def event_costs(
-    stream: MarkedStream, events: Sequence[TimedEvent], gestures: GestureSet, prices: EventCosts
+    stream: MarkedStream, events: Sequence[TimedEvent], gestures: GestureSet, prices: ErrorCosts
 ) -> NDArray[np.float64]:
     """Return the cost (n,) of each of the n gestures of a stream, in order of time.
 
-    The cost of an event without a gesture is added to that of the nearest gesture.
+    A gesture costs ``missed`` if it has no event, else as much as its best event and the time until that was named.
+    Every further event costs ``again`` and half its error. The cost of an event without a gesture, ``outside`` at rest
+    and ``unmarked`` elsewhere, is added to that of the nearest gesture.
     """
     idle = [g.idle for g in gestures.gestures]
     active = [t for t in stream.truths if t.gesture != OTHER and not idle[t.gesture]]
@@ -105,14 +88,14 @@ def event_costs(
     answers: list[list[TimedEvent]] = [[] for _ in active]
     total = np.zeros(len(active))
     for event in events:
-        at = _place(event, active, prices)
+        at = _place(event, active)
         if at is not None:
             answers[at].append(event)
             continue
         nearest = int(np.abs(starts - event.begun_us).argmin())
-        if _within(event, resting, prices.early_us, 0):
-            total[nearest] += prices.idle
-        elif not _within(event, others, prices.early_us, prices.grace_us):
+        if _within(event, resting, 0):
+            total[nearest] += prices.outside
+        elif not _within(event, others, _GRACE_US):
             total[nearest] += prices.unmarked
     for at, (truth, reported) in enumerate(zip(active, answers, strict=True)):
         # A correct event may have begun earlier, if it lasts for at least half of the gesture.
@@ -120,7 +103,7 @@ def event_costs(
             e
             for e in events
             if e.gesture == truth.gesture
-            and e.begun_us < truth.start_us - prices.early_us
+            and e.begun_us < truth.start_us - _EARLY_US
             and 2 * (min(e.ended_us, truth.stop_us) - truth.start_us) >= truth.stop_us - truth.start_us
         ]
         answer_costs = [_price(e, truth, gestures, prices) for e in reported]
@@ -137,35 +120,33 @@ def event_costs(
     return total
 
 
-def _within(event: TimedEvent, truths: Sequence[Truth], early_us: int, grace_us: int) -> bool:
-    return any(t.start_us - early_us <= event.begun_us <= t.stop_us + grace_us for t in truths)
+def _within(event: TimedEvent, truths: Sequence[Truth], grace_us: int) -> bool:
+    return any(t.start_us - _EARLY_US <= event.begun_us <= t.stop_us + grace_us for t in truths)
 
 
-def _place(event: TimedEvent, truths: Sequence[Truth], prices: EventCosts) -> int | None:
+def _place(event: TimedEvent, truths: Sequence[Truth]) -> int | None:
     """Return the index of the gesture that an event belongs to: the same gesture, if possible, else the latest one."""
-    around = [
-        i for i, t in enumerate(truths) if t.start_us - prices.early_us <= event.begun_us <= t.stop_us + prices.grace_us
-    ]
+    around = [i for i, t in enumerate(truths) if t.start_us - _EARLY_US <= event.begun_us <= t.stop_us + _GRACE_US]
     own = [i for i in around if truths[i].gesture == event.gesture]
     near = own or around
     return near[-1] if near else None
 
 
-def _price(event: TimedEvent, truth: Truth, gestures: GestureSet, prices: EventCosts) -> tuple[bool, float]:
+def _price(event: TimedEvent, truth: Truth, gestures: GestureSet, prices: ErrorCosts) -> tuple[bool, float]:
     """Return whether an event is correct for a gesture, and its cost."""
     real = gestures.gestures[truth.gesture]
-    late = prices.late_s * min(max(event.named_us - truth.start_us, 0) / 1e6, 3.0)
+    late = prices.late_s * min(max(event.named_us - truth.start_us, 0) / 1e6, _LATEST_S)
     if event.gesture == truth.gesture:
         return True, late
     if event.gesture == NO_GESTURE:
         right = event.affect in (0, AFFECT_CODES[real.affect])
-        return right, prices.unnamed + late if right else prices.affect
+        return right, prices.family + late if right else prices.affect
     as_which = gestures.gestures[event.gesture]
     if as_which.family == real.family:
         return False, prices.family + late
     if as_which.affect != real.affect:
         return False, prices.affect
-    return False, (prices.other if real.affect == "none" else prices.same) + late
+    return False, prices.confused + late
 
 
 # Values to try, in this order and twice; settings with the largest effect come first.
@@ -202,7 +183,7 @@ def tune(
     streams: Sequence[MarkedStream],
     spec: DecideSpec,
     gestures: GestureSet,
-    prices: EventCosts | None = None,
+    prices: ErrorCosts | None = None,
     keep: Collection[str] = (),
 ) -> TunedEvents:
     """Search for the event settings with the lowest cost per gesture, averaged over people.
@@ -214,7 +195,7 @@ def tune(
         spec: start of the search; gate, health, ``known`` and ``sure`` are not changed.
         keep: settings not to change.
     """
-    prices = prices or EventCosts()
+    prices = prices or ErrorCosts()
     listeners = [(h, TraceReplayer(h.trace)) for h in streams]
     gate = bool(spec.gate.rules)
     settings = TRIED | (TRIED_AFFECT if gestures.has_affect else {}) | (TRIED_GATE if gate else {})

@@ -49,6 +49,7 @@ from plushsense.experiments.streams.systems import (
     fewest,
     gated,
     prompt,
+    quiet,
     searched,
     tried,
 )
@@ -298,6 +299,8 @@ def test_settings_are_chosen_on_those_who_tune() -> None:
     assert fewest(several, 0.55) == several[2] and fewest(several, 0.9) == several[2]
     quick = [TunedPoint(argmax_spec(), 0.5, 4.0, f1, s) for f1, s in ((0.6, 1.5), (0.56, 1.0), (0.5, 0.2), (0.58, 1.0))]
     assert prompt(quick) == quick[3]
+    calm = [TunedPoint(argmax_spec(), 0.5, f, f1) for f, f1 in ((50.0, 0.5), (60.0, 0.6), (61.0, 0.7), (90.0, 0.9))]
+    assert quiet(calm) == calm[1] and quiet(calm[2:]) == calm[2]
 
 
 # --- a data set -----------------------------------------------------------------------------------------------------

@@ -29,6 +29,7 @@ SETTINGS = {
     "plain": "no threshold",
     "balanced": "highest F1 on the tuning people",
     "prompt": "quickest with an F1 at most 0.05 lower",
+    "quiet": "highest F1 with at most 60 false events an hour",
     "cheapest": "lowest cost on the tuning people",
 }
 
