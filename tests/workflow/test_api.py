@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -67,6 +68,7 @@ def test_trained_anywhere_knows_idleness_and_is_scored_on_gestures(dataset: Data
     assert bundle.gestures.labels == ("Fast", "Rest", "Slow", "Idle")
     assert bundle.gestures.get("Idle").idle
     assert "added a class for what happens between gestures: Idle" in said
+    assert any("recordings are not trimmed" in line for line in said)
     assert bundle.arch.pool == 50
     assert bundle.provenance["context"]["anywhere"] > 50
     assert (bundle.windowing["context"], bundle.windowing["anywhere"]["idle_share"]) == ("anywhere", 0.25)
@@ -74,6 +76,18 @@ def test_trained_anywhere_knows_idleness_and_is_scored_on_gestures(dataset: Data
     assert inside & watching == set() and inside | watching == set(dataset.subjects)
     ordinary = ps.train(dataset, **kwargs)
     assert trained.scores["windows"] == ordinary.scores["windows"], "gestures with their real past, nothing else"
+
+
+def test_training_anywhere_does_not_warn_of_trimmed_recordings(dataset: Dataset) -> None:
+    from plushsense.workflow.preparation import warn_of_untrimmed
+
+    lines: list[str] = []
+    used = list(dataset.used)
+    for start, expected in ((20, 0), (0, 1)):
+        half = [replace(r, start=start) for r in used[::2]]
+        warn_of_untrimmed(Dataset(dataset.path, dataset.head, half, dataset.streams), dataset.gestures, lines.append)
+        assert len(lines) == expected
+    assert f"{len(used[::2])} of {len(used[::2])} recordings" in lines[0]
 
 
 def test_evaluated_anywhere_is_scored_on_the_real_past(dataset: Dataset) -> None:

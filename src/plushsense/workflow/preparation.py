@@ -93,6 +93,7 @@ def windows_for(
     span_s = arch.span / dataset.layout.rate_hz
     spec = replace(spec, span_s=span_s if span_s > spec.window_s else 0.0)
     if spec.context == ANYWHERE:
+        warn_of_untrimmed(dataset, gestures, warn)
         cut = cut_anywhere(dataset, spec, gestures, anywhere)
     else:
         cut = cut_windows(dataset, spec, gestures)
@@ -134,6 +135,19 @@ def add_hard_negatives(
     # A toy that is held between gestures may report a neutral one: that is no reaction, and often not wrong.
     reactions = [k for k, g in enumerate(gestures.gestures) if not g.idle and g.affect != "neutral"]
     return with_hard_negatives(train, candidates, idle[0], reactions, arch, training, anywhere.hard_share, progress)
+
+
+def warn_of_untrimmed(dataset: Dataset, gestures: GestureSet, warn: Warn) -> None:
+    """Warn if most recordings of gestures in streams begin where they were started, not where the gesture begins."""
+    active = [g.label for g in gestures.gestures if not g.idle]
+    located = [r for r in dataset.used if r.gesture in active and r.stream_row >= 0]
+    untrimmed = [r for r in located if not r.start]
+    if not dataset.layout.is_labelled and 2 * len(untrimmed) > len(located):
+        warn(
+            f"{len(untrimmed)} of {len(located)} recordings are not trimmed, so the network learns the time before a "
+            "gesture as the gesture and reports it too early and too often: run "
+            f"'plushsense trim {dataset.path.name} --accept-above 0.5' first"
+        )
 
 
 def warn_of_single_people(windows: WindowSet, warn: Warn) -> None:

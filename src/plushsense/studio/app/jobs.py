@@ -11,7 +11,9 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import ConfigError
@@ -66,7 +68,7 @@ class Jobs:
 
     def __init__(self, workspace: Workspace) -> None:
         self.changed = ChangeSignal()
-        self._folder = workspace.folder / WORK
+        self._workspace, self._folder = workspace, workspace.folder / WORK
         self._processes: dict[str, subprocess.Popen[str]] = {}
         self._lock = threading.RLock()
         self._jobs: dict[str, StudioJob] = {}
@@ -113,6 +115,16 @@ class Jobs:
             self._jobs[identity] = job
         self._run(job)
         return job
+
+    def import_sessions(self, sessions: Iterable[Path], dest: Path, title: str) -> StudioJob:
+        """Start to import recorded sessions into the data set ``dest``, which is created if it does not exist."""
+        spec: dict[str, Any] = {
+            "sessions": [str(session) for session in sessions],
+            "recordings": str(self._workspace.recordings),
+            "work": str(self._folder),
+            "dest": str(dest),
+        }
+        return self.start("import", spec | ({"add": True} if dest.exists() else {"name": dest.name}), title)
 
     def resume(self, identity: str) -> StudioJob:
         """Restart a job that has ended, with the same spec; the task continues from what it has stored."""

@@ -173,9 +173,30 @@ def frame(workspace: Workspace, name: str) -> Iterator[Page]:
         ui.space()
         _choices(words, dark)
     with ui.element("div").classes("ps-main column no-wrap items-start").props('id="content" tabindex="-1"'):
+        if name != "record":
+            _recording_bar(page)
         tag(html(words(f"{name}.title"), "h1"), "title")
         page._messages = ui.column().classes("w-full ps-messages")
         yield page
+
+
+def _recording_bar(page: Page) -> None:
+    """Add a bar that names the sessions that are being recorded, with a link to each; hide it while there are none."""
+    bar = tag(
+        ui.row().classes("ps-message ps-message-recording w-full items-center").props('role="status"'), "recording-now"
+    )
+
+    def draw() -> None:
+        bar.clear()
+        bar.set_visibility(bool(page.workspace.recording))
+        with bar:
+            for name in page.workspace.recording:
+                ui.label(f"● {page.words('shell.recording_now', name=name)}").classes("text-bold")
+                link = ui.link(page.words("shell.show_recording"), address("record", session=name)).classes("ps-link")
+                named(link, f"{page.words('shell.show_recording')}: {name}")
+
+    draw()
+    on_change(page.workspace.recording_changed, draw)
 
 
 def _set_appearance(words: Words, dark: bool | None) -> None:

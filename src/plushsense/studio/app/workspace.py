@@ -7,12 +7,12 @@ import contextlib
 import os
 import re
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.dataset.importing.build import DEVICE_NAME
 from plushsense.dataset.store import DatasetHead
 from plushsense.recording.session_files import SESSION_HEAD
@@ -20,7 +20,7 @@ from plushsense.recording.session_files import SESSION_HEAD
 RECORDINGS, DATASETS, BUNDLES, EXPORTS, PACKAGES = "recordings", "datasets", "bundles", "exports", "packages"
 WORK = "work"
 VIRTUAL = "virtual://?person=7"
-_HEAD = "dataset.toml"
+_HEAD, _INDEX = "dataset.toml", "recordings.csv"
 _BUNDLE = "*.plush"
 _NOT_PLAIN = re.compile(r"[^\w .-]")
 
@@ -54,6 +54,8 @@ class Workspace:
         toy: URL of the chosen toy, "" for none.
         speed: speed of a virtual toy, as a multiple of real time.
         invite: returns an address with a new token for one more visitor; None if no token is needed.
+        recording: names of the sessions that are being recorded, as ``<subject>/<session>``; see `set_recording`.
+        recording_changed: notified when ``recording`` changes.
     """
 
     folder: Path
@@ -63,6 +65,8 @@ class Workspace:
     toy: str = ""
     speed: float = 1.0
     invite: Callable[[], str] | None = None
+    recording: tuple[str, ...] = ()
+    recording_changed: ChangeSignal = field(default_factory=lambda: ChangeSignal(), repr=False)
     _parts: dict[type, Any] = field(default_factory=dict, repr=False)
     _titles: dict[Path, tuple[FileStamps, str]] = field(default_factory=dict, repr=False)
     _lock: Any = field(default_factory=threading.RLock, repr=False)
@@ -91,6 +95,12 @@ class Workspace:
         for part in reversed(parts):
             if hasattr(part, "close"):
                 part.close()
+
+    def set_recording(self, names: Iterable[str]) -> None:
+        """Set the names of the sessions that are being recorded; every page shows them."""
+        if self.recording != (now := tuple(names)):
+            self.recording = now
+            self.recording_changed.notify()
 
     # Contents -------------------------------------------------------------------------------------------------
 
@@ -158,6 +168,24 @@ class Workspace:
         if place.exists():
             raise ConfigError(f"'{plain}' exists already in '{place.parent}': give another name, nothing is replaced.")
         return place
+
+    def dataset_for(self, layout: str, simulated: bool) -> Path:
+        """Return the folder of the data set to which recordings can be added, the last changed one of several.
+
+        Args:
+            layout: name of the layout of the recordings.
+            simulated: whether the toy was a virtual one; real and simulated recordings are never mixed.
+
+        Returns:
+            The path of a new data set if none fits.
+        """
+        fitting = []
+        for path in self.datasets():
+            with contextlib.suppress(PlushSenseError, OSError):
+                head = DatasetHead.read(path)
+                if (head.layout.name, head.simulated) == (layout, simulated):
+                    fitting.append(((path / _INDEX).stat().st_mtime, path))
+        return max(fitting)[1] if fitting else self.folder / DATASETS / self.free_name(DATASETS, "recordings")
 
     def free_name(self, kind: str, name: str, *suffixes: str, separator: str = "-", taken: Collection[str] = ()) -> str:
         """Return ``name``, numbered if it is in ``taken`` or exists in ``folder / kind`` with one of ``suffixes``."""

@@ -8,7 +8,7 @@ import json
 import os
 import threading
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,11 @@ class DatasetEntry:
 
 @dataclass(frozen=True)
 class SessionEntry:
-    """Summary of a recorded session; ``datasets`` are the names of the data sets that contain all its recordings."""
+    """Summary of a recorded session.
+
+    ``datasets`` are the names of the data sets that contain all its recordings; ``active`` is whether it is being
+    recorded now.
+    """
 
     path: Path
     subject: str
@@ -62,11 +66,12 @@ class SessionEntry:
     layout: str = ""
     refused: str = ""
     datasets: tuple[str, ...] = ()
+    active: bool = False
 
     @property
     def waiting(self) -> bool:
-        """True if the session has recordings and no data set contains all of them."""
-        return bool(self.recordings) and not self.datasets and not self.refused
+        """True if the session has ended, has recordings, and no data set contains all of them."""
+        return bool(self.recordings) and not (self.datasets or self.refused or self.active)
 
 
 @dataclass(frozen=True)
@@ -124,6 +129,8 @@ def next_step(summary: WorkspaceSummary, *, toy: str = "", virtual: bool = False
     """
     if making:
         return NextStep("making")
+    if active := [s for s in summary.sessions if s.active]:
+        return NextStep("recording", "record", {"subject": active[0].subject, "session": active[0].session})
     waiting = [s for s in summary.sessions if s.waiting]
     bundles = [b for b in summary.bundles if not b.refused]
     readable = [d for d in summary.datasets if not d.refused and d.recordings]
@@ -160,7 +167,9 @@ class Overview:
         """Return the current contents of the workspace."""
         with self._lock:
             datasets = tuple(self._cached(p, _dataset, HEAD, INDEX, MARKS) for p in self._workspace.datasets())
-            sessions = tuple(_session(p, datasets) for p in self._workspace.sessions())
+            active = self._workspace.recording
+            read = (_session(path, datasets) for path in self._workspace.sessions())
+            sessions = tuple(replace(s, active=f"{s.subject}/{s.session}" in active) for s in read)
             bundles = tuple(self._cached(p, _bundle, "") for p in self._workspace.bundles())
         exports = sum(1 for p in (self._workspace.folder / EXPORTS).glob("*") if p.is_dir() and p.name[0] != ".")
         return WorkspaceSummary(datasets, sessions, bundles, exports)

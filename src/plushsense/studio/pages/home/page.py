@@ -308,6 +308,7 @@ async def show(page: Page) -> None:
     fill(summary or WorkspaceSummary())
     on_change(jobs.changed, update)
     on_change(toys.changed, step.update)
+    on_change(workspace.recording_changed, refresh)
 
 
 class NextStepCard:
@@ -346,12 +347,18 @@ class NextStepCard:
         if step.key == "try":
             self._try()
         elif step.key == "collect":
-            ui.run_javascript(
-                "const box = document.querySelector('[data-test=sessions]');"
-                "box.scrollIntoView({block: 'center'}); box.querySelector('[data-test=new-name]')?.focus()"
-            )
+            self._collect()
         else:
             ui.navigate.to(address(step.page))
+
+    def _collect(self) -> None:
+        """Import the sessions that are in no data set; add them to one that fits, if there is one."""
+        workspace = self._page.workspace
+        batch = next(b for b in self._summary.batches() if any(s.waiting for s in b))
+        with self._page.show_errors():
+            place = workspace.dataset_for(batch[0].layout, batch[0].simulated)
+            title = self._page.words("home.import_title", name=workspace.title(place))
+            self._jobs.import_sessions([s.path for s in batch if s.waiting], place, title)
 
     def _try(self) -> None:
         """Start to simulate a small data set, and choose the virtual toy if no toy is chosen."""

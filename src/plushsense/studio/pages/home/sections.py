@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from nicegui import ui
 
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, address, button, html, moment, named, tag
-from plushsense.studio.app.workspace import DATASETS, WORK
+from plushsense.studio.app.workspace import DATASETS
 from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
 
 SMALL = 'outline padding="4px 12px"'
@@ -157,6 +158,7 @@ class SessionSection:
                 for entry in batch:
                     box = ui.checkbox(self._describe(entry), value=str(entry.path) in self._chosen)
                     box.on_value_change(lambda e, entry=entry: self._choose(entry, bool(e.value)))
+                    box.set_enabled(not entry.active)
             with ui.row().classes("items-end ps-small-gap w-full"):
                 name = tag(ui.input(words("home.name")).classes("ps-wide"), "new-name")
                 button("make", words("home.make"), lambda: self._make(batch, str(name.value or "")), "unelevated")
@@ -177,7 +179,7 @@ class SessionSection:
             words("home.session", name=entry.session),
             moment(entry.start_s),
             words("home.recordings", n=entry.recordings),
-            words("home.finished" if entry.finished else "home.unfinished"),
+            words(f"home.{'active' if entry.active else 'finished' if entry.finished else 'unfinished'}"),
         ]
         if entry.datasets:
             facts.append(words("home.kept", names=", ".join(f"“{n}”" for n in entry.datasets)))
@@ -189,22 +191,20 @@ class SessionSection:
     def _make(self, batch: tuple[SessionEntry, ...], name: str) -> None:
         with self._page.show_errors():
             place = self._page.workspace.new(DATASETS, name)
-            self._start(batch, {"dest": str(place), "name": place.name}, place.name)
+            self._start(batch, place, place.name)
 
     def _add(self, batch: tuple[SessionEntry, ...], dataset: str) -> None:
         with self._page.show_errors():
             place = self._page.workspace.inside(dataset)
-            self._start(batch, {"dest": str(place), "add": True}, self._page.workspace.title(place))
+            self._start(batch, place, self._page.workspace.title(place))
 
-    def _start(self, batch: tuple[SessionEntry, ...], spec: dict[str, object], name: str) -> None:
-        workspace = self._page.workspace
-        chosen = [str(s.path) for s in batch if str(s.path) in self._chosen]
+    def _start(self, batch: tuple[SessionEntry, ...], place: Path, name: str) -> None:
+        chosen = [s.path for s in batch if str(s.path) in self._chosen]
         if not chosen:
             self._page.say(self._page.words("home.none_chosen"), "warning")
             return
-        spec |= {"sessions": chosen, "recordings": str(workspace.recordings), "work": str(workspace.folder / WORK)}
         self._page.say("")
-        self._jobs.start("import", spec, self._page.words("home.import_title", name=name))
+        self._jobs.import_sessions(chosen, place, self._page.words("home.import_title", name=name))
 
 
 class JobList:

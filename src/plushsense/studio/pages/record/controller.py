@@ -191,6 +191,12 @@ class RecordController:
         session.device.close()
         with self._lock:
             self._active.pop(session.name, None)
+        self._changed()
+
+    def _changed(self) -> None:
+        """Notify `changed`, and update the names of the sessions being recorded."""
+        running = [s.name for s in self.active_sessions() if s.recorder.status().state not in ("finished", "stopped")]
+        self._workspace.set_recording(running)
         self.changed.notify()
 
     def close(self) -> None:
@@ -256,7 +262,7 @@ class RecordController:
             try:
                 recorder = Recorder(files, device, speed=request.speed, software=SOFTWARE)
                 prompt_virtual(recorder)
-                recorder.subscribe(lambda _what, _status: self.changed.notify())
+                recorder.subscribe(lambda _what, _status: self._changed())
                 recorder.start()
             except BaseException:
                 files.close()
@@ -274,5 +280,5 @@ class RecordController:
         )
         with self._lock:
             self._active[session.name] = session
-        self.changed.notify()
+        self._changed()
         return session

@@ -15,7 +15,7 @@ from plushsense.recording.session import SessionSummary
 from plushsense.studio.app.shell import Page, address, button, html, named, query, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
-from plushsense.studio.pages.record.session import show_session, summary
+from plushsense.studio.pages.record.session import collect, show_session, summary
 
 _LISTED = 8
 _SCAN_S = 3.0
@@ -53,6 +53,8 @@ async def show_start(page: Page, controller: RecordController, requested: str, e
         session = mine[ended]
         counts = {"name": ended, "done": session.done, "steps": session.steps}
         page.say(page.words("record.ended_whole" if session.finished else "record.ended_part", **counts), "good")
+        if session.done:
+            _ended(page, session)
     elif requested in mine and not mine[requested].finished:
         page.say(page.words("record.not_open", name=requested), "warning")
     elif requested:
@@ -65,6 +67,19 @@ async def show_start(page: Page, controller: RecordController, requested: str, e
         with ui.row().classes("items-baseline"):
             ui.label(page.words("record.finished_ones", n=done)).classes("ps-dim")
             ui.link(page.words("record.import_them"), "/").classes("ps-link")
+
+
+def _ended(page: Page, session: SessionSummary) -> None:
+    """Add the button that leads from an ended session to its recordings."""
+
+    def clicked() -> None:
+        see.disable()
+        with page.show_errors():
+            collect(page, session.folder)
+
+    with tag(ui.row().classes("ps-card ps-next w-full items-center"), "ended-session"):
+        ui.label(page.words("record.now_see", n=session.done)).classes("flex-grow text-lg")
+        see = button("collect", page.words("record.collect"), clicked, "unelevated size=lg", about=session.name)
 
 
 def _open_ones(page: Page, controller: RecordController) -> None:

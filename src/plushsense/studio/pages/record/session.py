@@ -6,13 +6,17 @@ import math
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 from nicegui import run, ui
 from nicegui.element import Element
 
+from plushsense.core.errors import DatasetError
+from plushsense.recording.session_files import SessionHead
 from plushsense.recording.states import RecorderStatus
+from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import LINES, Keys, Page, address, button, focus, html, named, on_change, on_click, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
@@ -127,6 +131,26 @@ class SignalPanel:
                 ((values[:, n] * channels[n].step - channels[n].offset) * channels[n].scale).tolist() for n in indices
             ]
             plot.push(seconds, curves)
+
+
+def collect(page: Page, folder: Path) -> None:
+    """Import an ended session into a data set that fits, or into a new one; then show its recordings for review."""
+    jobs, words = page.workspace.part(Jobs), page.words
+    head = SessionHead.read(folder)
+    if head is None:
+        raise DatasetError(f"'{folder}' holds no session.")
+    place = page.workspace.dataset_for(str(head.layout["name"]), head.simulated)
+    name = page.workspace.title(place)
+    job = jobs.import_sessions([folder], place, words("home.import_title", name=name))
+    page.say(words("record.collecting", name=name))
+
+    def follow() -> None:
+        if job.state == DONE:
+            ui.navigate.to(address("review", dataset=place))
+        elif job.state != RUNNING:
+            page.say(job.message or words("record.not_collected"), "error")
+
+    on_change(jobs.changed, follow)
 
 
 _MAX_STEPS = 400
@@ -319,9 +343,9 @@ class _View:
         with self._done:
             self._done_text = ui.label().classes("text-bold").style("overflow-wrap: anywhere")
             ui.label(words("record.what_next"))
-            with ui.row():
+            with ui.row().classes("items-center"):
+                button("collect", words("record.collect"), self._collect, "unelevated")
                 ui.link(words("record.to_home"), "/").classes("ps-link")
-                ui.link(words("record.to_review"), "/review").classes("ps-link")
         self._done.set_visibility(False)
 
     def _note_row(self) -> None:
@@ -373,6 +397,15 @@ class _View:
         with self._page.show_errors():
             await run.io_bound(self._controller.close_session, self._session.name)
             ui.navigate.to(address("record", ended=self._session.name))
+            return
+        self._left = False
+
+    async def _collect(self) -> None:
+        """End the session, and lead to its recordings."""
+        self._left = True
+        with self._page.show_errors():
+            await run.io_bound(self._controller.close_session, self._session.name)
+            collect(self._page, self._session.recorder.session.folder)
             return
         self._left = False
 
