@@ -102,6 +102,45 @@ def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, lo
     assert browser.complaints == []
 
 
+def test_data_sets_and_networks_are_renamed_discarded_and_deleted(studio: Fixture, look: Fixture, home: Path) -> None:
+    browser = look(TABLET)
+    page = browser.open(studio(home=home).url)
+    name = marked(page, "dataset").first.locator(".text-bold").inner_text()
+
+    def menu(kind: str, item: str) -> None:
+        marked(page, kind).first.locator("[data-test=menu]").click()
+        page.get_by_role("menuitem", name=item).click()
+
+    menu("dataset", "Rename")
+    marked(page, "ask-text").fill("spring")
+    marked(page, "ask-go").click()
+    marked(page, "dataset").get_by_text("spring", exact=True).wait_for()
+    marked(page, "undo").click()
+    marked(page, "dataset").get_by_text(name, exact=True).first.wait_for()
+    bundle = marked(page, "bundle").first.locator(".text-bold").inner_text()
+    menu("bundle", "Rename")
+    marked(page, "ask-text").fill("../network")
+    marked(page, "ask-go").click()
+    marked(page, "message").get_by_text("cannot be a name").wait_for()
+    menu("bundle", "Discard")
+    marked(page, "message").get_by_text("is discarded").wait_for()
+    assert (home / "discarded" / "bundles" / f"{bundle}.plush").is_file()
+    menu("dataset", "Discard")
+    marked(page, "message").get_by_text(f"“{name}” is discarded").wait_for()
+    marked(page, "discarded").locator("summary").click()
+    assert axe(page) == []
+    row = marked(page, "discarded").locator(".ps-row").filter(has_text="Network")
+    row.get_by_role("button", name="Delete for good").click()
+    marked(page, "ask").get_by_role("button", name="Cancel").click()
+    row.get_by_role("button", name="Delete for good").click()
+    marked(page, "ask-go").click()
+    marked(page, "message").get_by_text("is deleted").wait_for()
+    assert not (home / "discarded" / "bundles" / f"{bundle}.plush").exists()
+    marked(page, "discarded").get_by_role("button", name="Restore").click()
+    marked(page, "dataset").get_by_text(name, exact=True).first.wait_for()
+    assert browser.complaints == []
+
+
 def test_the_toy_is_chosen_and_tested(studio: Fixture, look: Fixture) -> None:
     one = studio("--speed", "10")
     browser = look()

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from plushsense.recording.session import is_finished
+from plushsense.recording.session_files import SessionHead
 from support.browsing import DESK, TABLET, axe, connected, marked
 from support.recording_pages import CALM, begun, choose, events, files, heard, sat, showing, take, until, whats
 
 if TYPE_CHECKING:
-    from playwright.sync_api import WebSocketRoute
+    from playwright.sync_api import Page, WebSocketRoute
 
 Fixture = Callable[..., Any]
 SPEED = ("--device", CALM, "--speed", "10")
@@ -83,6 +85,66 @@ def test_every_page_names_the_session_that_is_being_recorded(studio: Fixture, lo
     assert axe(page) == []
     marked(page, "collect").click()
     page.wait_for_url("**/review?dataset=**/recordings")
+    assert browser.complaints == []
+
+
+def menu(page: Page, place: str, item: str) -> None:
+    """Choose an item of the menu in the element ``place``."""
+    marked(page, place).locator("[data-test=menu]").click()
+    page.get_by_role("menuitem", name=item).click()
+
+
+def test_an_ended_session_is_finished_renamed_discarded_and_restored(
+    studio: Fixture, look: Fixture, tmp_path: Path
+) -> None:
+    server, browser = studio(*SPEED), look(TABLET)
+    recordings = tmp_path / "home" / "recordings"
+    page = begun(browser.open(server.url + "/record"), server.url, "S01")
+    take(page, 0)
+    marked(page, "end").click()
+    marked(page, "end-yes").click()
+    page.wait_for_url("**/record?ended=S01/1")
+    connected(page)
+    before = {p.name: p.read_bytes() for p in (recordings / "S01/1").glob("*.csv")}
+    menu(page, "unfinished-S01/1", "Finished for this child")
+    marked(page, "message").get_by_text("S01/1 is marked as finished.").wait_for()
+    assert marked(page, "unfinished-S01/1").count() == 0
+    assert is_finished(recordings / "S01/1")
+    marked(page, "finished-sessions").locator("summary").click()
+    assert axe(page) == []
+    marked(page, "undo").click()
+    marked(page, "unfinished-S01/1").wait_for()
+    assert not is_finished(recordings / "S01/1")
+    # A wrong code is corrected; a name is refused.
+    menu(page, "unfinished-S01/1", "Correct the person's code")
+    marked(page, "ask-text").fill("Anna")
+    marked(page, "ask-go").click()
+    marked(page, "message").get_by_text("never a name").wait_for()
+    menu(page, "unfinished-S01/1", "Correct the person's code")
+    marked(page, "ask-text").fill("S02")
+    page.keyboard.press("Enter")
+    marked(page, "unfinished-S02/1").wait_for()
+    assert SessionHead.read(recordings / "S02/1").subject == "S02"  # type: ignore[union-attr]
+    assert {p.name: p.read_bytes() for p in (recordings / "S02/1").glob("*.csv")} == before
+    assert not (recordings / "S01").exists()
+    menu(page, "unfinished-S02/1", "Discard")
+    marked(page, "message").get_by_text("“S02/1” is discarded").wait_for()
+    assert not (recordings / "S02").exists()
+    page.goto(server.url)
+    connected(page)
+    marked(page, "discarded").locator("summary").click()
+    assert "Session: S02/1" in marked(page, "discarded").inner_text()
+    assert axe(page) == []
+    marked(page, "discarded").get_by_role("button", name="Restore").click()
+    marked(page, "sessions").get_by_text("S02 · session 1").wait_for()
+    assert not marked(page, "discarded").is_visible()
+    assert {p.name: p.read_bytes() for p in (recordings / "S02/1").glob("*.csv")} == before
+    # A continued session goes on after its recording.
+    page.goto(server.url + "/record?new=1")
+    connected(page)
+    marked(page, "unfinished-S02/1").get_by_role("button", name="Continue").click()
+    sat(page, "S02/1")
+    take(page, 1)
     assert browser.complaints == []
 
 

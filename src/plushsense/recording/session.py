@@ -95,10 +95,10 @@ def session_names(person: Path) -> list[str]:
 
 
 def is_finished(folder: Path) -> bool:
-    """Return whether the session in ``folder`` was completed, and no step was reopened since."""
+    """Return whether the session in ``folder`` was completed or marked as finished, and not reopened since."""
     finished = False
     for event in read_events(folder):
-        finished = event.kind == "finished" or (finished and event.kind not in ("redo", "go"))
+        finished = event.kind == "finished" or (finished and event.kind not in ("redo", "go", "reopened"))
     return finished
 
 
@@ -201,6 +201,34 @@ class OpenSession:
                 with contextlib.suppress(OSError):
                     (self.folder / LOCK).unlink()
             self._lock.release()
+
+
+def mark_finished(folder: Path, finished: bool = True) -> None:
+    """Mark a session as finished although its plan is not complete, or take that back with ``finished`` False.
+
+    Raises:
+        DatasetError: if another program uses the session, or it cannot be written.
+    """
+    with contextlib.closing(OpenSession(folder)) as session:
+        session.log.write([new_event("finished", early=True) if finished else new_event("reopened")])
+
+
+def change_subject(folder: Path, code: str) -> Path:
+    """Give the session in ``folder`` to the person ``code``, and return its new folder.
+
+    Raises:
+        DatasetError: for an invalid code, or if another program uses the session.
+    """
+    person = folder.parent.parent / check_subject(code)
+    with contextlib.closing(OpenSession(folder)) as session:
+        place = person / (folder.name if not (person / folder.name).exists() else new_session(person))
+        person.mkdir(parents=True, exist_ok=True)
+        replace(session.head, subject=code, session=place.name).write(folder)
+        session.log.write([new_event("renamed", subject=session.head.subject, session=session.head.session)])
+    folder.rename(place)
+    with contextlib.suppress(OSError):
+        folder.parent.rmdir()
+    return place
 
 
 def _end_torn_line(path: Path) -> None:

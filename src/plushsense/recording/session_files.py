@@ -74,7 +74,9 @@ class SessionEvent:
     recording: ``file``, ``gesture``, ``repetition``), ``abandon`` (recording stopped on purpose, ``why``: redo, pause
     or quit; its rows are in the stream only), ``unfinished`` (stopped by a crash), ``redo`` (``file`` is discarded),
     ``keep`` (``file`` is used again), ``skip``, ``go`` (to another step), ``note``, ``pause``, ``resume``, ``gap``,
-    ``mended`` (repaired after a crash), ``failed``, ``finished``. Readers ignore other kinds.
+    ``mended`` (repaired after a crash), ``failed``, ``finished`` (``early``: although steps are missing), ``reopened``,
+    ``renamed`` (the person's code was changed; with the former ``subject`` and ``session``). Readers ignore other
+    kinds.
     """
 
     kind: str

@@ -116,6 +116,12 @@ class Jobs:
         self._run(job)
         return job
 
+    def check_unused(self, path: Path) -> None:
+        """Raise ConfigError if a running job uses the data set or bundle ``path``."""
+        for job in self.all():
+            if job.state == RUNNING and str(path) in map(str, job.spec.values()):
+                raise ConfigError(f"'{job.title}' is running and uses '{path.name}': wait for it, or stop it first.")
+
     def import_sessions(self, sessions: Iterable[Path], dest: Path, title: str) -> StudioJob:
         """Start to import recorded sessions into the data set ``dest``, which is created if it does not exist."""
         spec: dict[str, Any] = {

@@ -118,8 +118,11 @@ class Page:
     dark: bool
     _messages: Any = None
 
-    def say(self, sentence: str, kind: Kind = "info") -> None:
-        """Show a message at the top of the page and announce it to screen readers; "" removes the message."""
+    def say(self, sentence: str, kind: Kind = "info", undo: Callable[[], Any] | None = None) -> None:
+        """Show a message at the top of the page and announce it to screen readers; "" removes the message.
+
+        With ``undo``, the message has a button that calls it.
+        """
         self._messages.clear()
         if not sentence:
             return
@@ -128,6 +131,8 @@ class Page:
             box = ui.row().classes(f"ps-message ps-message-{kind} w-full items-center no-wrap").props(f'role="{role}"')
             with tag(box, "message"):
                 ui.label(sentence).classes("flex-grow")
+                if undo is not None:
+                    button("undo", self.words("shell.undo"), on_page(undo), "outline color=inherit")
                 icon_button("close", self.words("shell.close"), lambda: self.say(""), "flat round dense color=inherit")
 
     @contextmanager
@@ -259,6 +264,18 @@ def on_change(signal: ChangeSignal, callback: Callable[[], Any]) -> None:
             background_tasks.create(finish(result))
 
     client.on_delete(signal.subscribe(called))
+
+
+def on_page(call: Callable[..., Any]) -> Callable[..., Awaitable[None]]:
+    """Return a handler that calls ``call`` in the slot of the page, which outlives the element that was clicked."""
+
+    async def called(*values: Any) -> None:
+        with context.client.content:
+            result = call(*values)
+            if inspect.isawaitable(result):
+                await result
+
+    return called
 
 
 def address(page: str, **query: str | Path) -> str:

@@ -6,22 +6,25 @@ import asyncio
 import contextlib
 import os
 import re
+import shutil
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from plushsense.core.errors import ConfigError, PlushSenseError
+from plushsense.core.files import write_file
 from plushsense.dataset.importing.build import DEVICE_NAME
 from plushsense.dataset.store import DatasetHead
 from plushsense.recording.session_files import SESSION_HEAD
 
 RECORDINGS, DATASETS, BUNDLES, EXPORTS, PACKAGES = "recordings", "datasets", "bundles", "exports", "packages"
-WORK = "work"
+WORK, DISCARDED = "work", "discarded"
 VIRTUAL = "virtual://?person=7"
 _HEAD, _INDEX = "dataset.toml", "recordings.csv"
 _BUNDLE = "*.plush"
+_COPY = "~~"  # before the number of a second discarded file of the same name
 _NOT_PLAIN = re.compile(r"[^\w .-]")
 
 T = TypeVar("T")
@@ -47,7 +50,8 @@ class Workspace:
     Pages may read and write only inside ``folder`` and the data sets given at start.
 
     Attributes:
-        folder: contains `RECORDINGS`, `DATASETS`, `BUNDLES`, `EXPORTS`, `PACKAGES` and `WORK`, created when needed.
+        folder: contains `RECORDINGS`, `DATASETS`, `BUNDLES`, `EXPORTS`, `PACKAGES`, `WORK` and `DISCARDED`, created
+            when needed.
         given: data sets given at start, in any folder.
         devices: URLs of the toys given at start; the first is chosen.
         models: bundles (model files) given at start.
@@ -152,22 +156,97 @@ class Workspace:
             "with --dataset or --home for the other one."
         )
 
+    def rename(self, path: Path, name: str) -> Path:
+        """Change the name of a data set, whose folder keeps its name, or of a bundle; return its path.
+
+        Raises:
+            ConfigError: for a name that is not a plain file name, or that another one has.
+        """
+        real = self.inside(path)
+        if real.is_dir():
+            if name in [self.title(other) for other in self.datasets() if other != path]:
+                raise ConfigError(f"Another data set is called '{name}': give another name.")
+            self._check_name(name)
+            write_file(real / _HEAD, replace(DatasetHead.read(real), name=name).to_toml())
+            return real
+        place = self.new(BUNDLES, f"{name}{real.suffix}")
+        real.rename(place)
+        return place
+
+    def discard(self, path: Path) -> Path:
+        """Move a session, data set or bundle of ``folder`` into `DISCARDED`, and return its new path.
+
+        Raises:
+            ConfigError: for a path outside ``folder``.
+        """
+        real = self.inside(path)
+        if self.folder not in real.parents:
+            raise ConfigError(f"'{path}' lies outside the studio's folder: remove it there yourself.")
+        inside = real.relative_to(self.folder)
+        place, number = self.folder / DISCARDED / inside, 2
+        while place.exists():
+            place, number = self.folder / DISCARDED / inside.with_name(f"{inside.name}{_COPY}{number}"), number + 1
+        place.parent.mkdir(parents=True, exist_ok=True)
+        real.rename(place)
+        with contextlib.suppress(OSError):
+            real.parent.rmdir()
+        return place
+
+    def discarded(self) -> list[Path]:
+        """Return the discarded sessions, data sets and bundles."""
+        patterns = (f"{RECORDINGS}/*/*", f"{DATASETS}/*", f"{BUNDLES}/*")
+        return [path for pattern in patterns for path in sorted((self.folder / DISCARDED).glob(pattern))]
+
+    def restore(self, path: Path) -> Path:
+        """Move something discarded back to where it was, and return its path there.
+
+        Raises:
+            ConfigError: if it is not discarded, or there is something else in its place.
+        """
+        real = self._of_discarded(path)
+        inside = real.relative_to(self.folder / DISCARDED)
+        place = self.folder / inside.with_name(inside.name.partition(_COPY)[0])
+        if place.exists():
+            raise ConfigError(f"'{place.name}' exists again in '{place.parent}': rename or discard that first.")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        real.rename(place)
+        return place
+
+    def delete(self, path: Path) -> None:
+        """Delete something discarded for good; raise ConfigError if it is not discarded."""
+        real = self._of_discarded(path)
+        if real.is_dir():
+            shutil.rmtree(real)
+        else:
+            real.unlink()
+
+    def _of_discarded(self, path: Path) -> Path:
+        real = self.inside(path)
+        if real not in self.discarded():
+            raise ConfigError(f"'{path}' is not discarded: it may have been restored or deleted already.")
+        return real
+
     def new(self, kind: str, name: str) -> Path:
         """Return the path for a new file or folder ``name`` in ``folder / kind``, without creating it.
 
         Raises:
             ConfigError: if ``name`` is not a plain file name, or exists already.
         """
+        plain = self._check_name(name)
+        place = self.inside(Path(kind) / plain)
+        if place.exists():
+            raise ConfigError(f"'{plain}' exists already in '{place.parent}': give another name, nothing is replaced.")
+        return place
+
+    @staticmethod
+    def _check_name(name: str) -> str:
         plain = name.strip()
         dotted = plain.startswith(".") or plain.endswith(".")
         if not 0 < len(plain) <= 64 or dotted or _NOT_PLAIN.search(plain) or DEVICE_NAME.match(plain):
             raise ConfigError(
                 f"'{name}' cannot be a name: give at most 64 letters, digits, spaces, points and hyphens."
             )
-        place = self.inside(Path(kind) / plain)
-        if place.exists():
-            raise ConfigError(f"'{plain}' exists already in '{place.parent}': give another name, nothing is replaced.")
-        return place
+        return plain
 
     def dataset_for(self, layout: str, simulated: bool) -> Path:
         """Return the folder of the data set to which recordings can be added, the last changed one of several.

@@ -4,20 +4,31 @@ from __future__ import annotations
 
 import base64
 import time
-from collections.abc import Awaitable, Callable, Collection, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jinja2
 from markupsafe import Markup
-from nicegui import run, ui
+from nicegui import context, run, ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
 from plushsense.core.gestures import plain_label
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, Jobs, StudioJob
-from plushsense.studio.app.shell import Kind, Page, button, html, icon_button, named, on_change, scroll_region, tag
+from plushsense.studio.app.shell import (
+    Kind,
+    Page,
+    button,
+    html,
+    icon_button,
+    named,
+    on_change,
+    on_page,
+    scroll_region,
+    tag,
+)
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
 
@@ -51,6 +62,48 @@ def text(message: str, kind: str = "p", classes: str = "") -> ui.html:
 def notice(message: str, kind: Kind = "warning") -> ui.html:
     """Add a sentence in a coloured box."""
     return text(message, classes=f"ps-message ps-message-{kind} w-full")
+
+
+def item_menu(words: Words, about: str, actions: Mapping[str, Callable[[], Any]]) -> ui.button:
+    """Add a button that opens a menu; ``actions`` maps each text to the function to call.
+
+    Args:
+        about: what the actions apply to, for screen readers.
+    """
+    opener = named(
+        ui.button(icon="more_vert").props('flat round dense aria-haspopup="menu"'), f"{words('shell.menu')}: {about}"
+    )
+    with tag(opener, "menu"), ui.menu():
+        for label, call in actions.items():
+            ui.menu_item(label, on_page(call)).props("role=menuitem")
+    return opener
+
+
+def ask(words: Words, title: str, go: str, answer: Callable[[str], Any], label: str = "", value: str = "") -> None:
+    """Ask a question in a dialog; if the button with the text ``go`` is clicked, call ``answer``, which may be async.
+
+    Args:
+        label, value: name of a text field, whose content ``answer`` gets, and what it holds at first; without a label
+            there is no field.
+    """
+
+    async def done() -> None:
+        dialog.close()
+        await on_page(answer)(str(field.value or "").strip() if field is not None else "")
+
+    field: ui.input | None = None
+    with context.client.content, ui.dialog() as dialog:
+        named(dialog.props("transition-duration=0"), title)
+        with tag(ui.card(), "ask"):
+            ui.label(title).classes("text-lg text-bold ps-break")
+            if label:
+                field = tag(ui.input(label, value=value).props("autofocus").classes("w-full"), "ask-text")
+                field.on("keydown.enter", done)
+            with ui.row().classes("w-full justify-end"):
+                button("", words("shell.cancel"), dialog.close, "flat" if label else "flat autofocus")
+                button("ask-go", go, done, "unelevated" if label else "outline")
+    dialog.on("hide", dialog.delete)
+    dialog.open()
 
 
 def verdict(good: bool | None, word: str) -> Markup:

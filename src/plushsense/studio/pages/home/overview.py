@@ -94,6 +94,7 @@ class WorkspaceSummary:
     sessions: tuple[SessionEntry, ...] = ()
     bundles: tuple[BundleEntry, ...] = ()
     exports: int = 0
+    discarded: tuple[Path, ...] = ()
 
     def batches(self) -> list[tuple[SessionEntry, ...]]:
         """Group sessions that can form one data set: same layout, all real or all simulated; real groups come first."""
@@ -172,7 +173,7 @@ class Overview:
             sessions = tuple(replace(s, active=f"{s.subject}/{s.session}" in active) for s in read)
             bundles = tuple(self._cached(p, _bundle, "") for p in self._workspace.bundles())
         exports = sum(1 for p in (self._workspace.folder / EXPORTS).glob("*") if p.is_dir() and p.name[0] != ".")
-        return WorkspaceSummary(datasets, sessions, bundles, exports)
+        return WorkspaceSummary(datasets, sessions, bundles, exports, tuple(self._workspace.discarded()))
 
     def _cached(self, path: Path, read: Callable[[Path], Any], *files: str) -> Any:
         """Return ``read(path)``, cached until one of the files in ``path`` changes."""

@@ -21,6 +21,8 @@ from plushsense.studio.pages.home.overview import NextStep, Overview, WorkspaceS
 from plushsense.studio.pages.home.sections import (
     SMALL,
     DatasetSection,
+    DiscardedSection,
+    FileActions,
     JobList,
     SessionSection,
     page_links,
@@ -128,7 +130,7 @@ ARCHIVE_BYTES = UPLOAD_BYTES - 1_000_000
 BUNDLE_BYTES = 64_000_000
 
 
-def bundles(page: Page) -> Callable[[WorkspaceSummary], None]:
+def bundles(page: Page, actions: FileActions) -> Callable[[WorkspaceSummary], None]:
     """Build the section that lists trained networks; return the function that fills it."""
     box = titled_card(page, "home.bundles", "bundles")
     with box:
@@ -140,10 +142,12 @@ def bundles(page: Page) -> Callable[[WorkspaceSummary], None]:
         with rows:
             for entry in summary.bundles:
                 with tag(ui.column().classes("ps-row w-full"), "bundle"):
-                    with ui.row().classes("items-center ps-small-gap"):
+                    with ui.row().classes("items-center w-full ps-small-gap"):
                         ui.label(entry.name).classes("text-bold ps-break")
                         if entry.simulated:
                             simulation_badge(page)
+                        ui.space()
+                        actions.menu(entry.path, entry.name)
                     if entry.refused:
                         ui.label(entry.refused).classes("ps-bad ps-break")
                         continue
@@ -272,10 +276,12 @@ async def show(page: Page) -> None:
     step = NextStepCard(page, jobs, toys)
     with ui.element("div").classes("ps-two w-full"):
         with ui.column().classes("w-full"):
-            datasets = DatasetSection(page, jobs)
+            actions = FileActions(page, jobs, lambda: refresh())
+            datasets = DatasetSection(page, jobs, actions)
             sessions = SessionSection(page, jobs)
-            networks = bundles(page)
+            networks = bundles(page, actions)
             uploads(page, jobs, lambda: refresh())
+            discarded = DiscardedSection(page, actions)
         with ui.column().classes("w-full"):
             toy_section(page, toys)
             job_list = JobList(page, jobs)
@@ -286,6 +292,7 @@ async def show(page: Page) -> None:
         datasets.fill(now)
         sessions.fill(now)
         networks(now)
+        discarded.fill(now.discarded)
 
     async def refresh() -> None:
         now = await run.io_bound(overview.look)

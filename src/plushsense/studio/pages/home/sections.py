@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from nicegui import ui
+from nicegui import run, ui
 
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
-from plushsense.studio.app.shell import Page, address, button, html, moment, named, tag
-from plushsense.studio.app.workspace import DATASETS
+from plushsense.studio.app.shell import Page, address, button, html, moment, named, on_page, tag
+from plushsense.studio.app.workspace import DATASETS, DISCARDED
 from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
+from plushsense.studio.widgets.elements import ask, item_menu
 
 SMALL = 'outline padding="4px 12px"'
 """Quasar properties of the buttons inside rows of a list."""
@@ -55,11 +56,86 @@ def page_links(page: Page, pages: tuple[str, ...], name: str, **query: Any) -> N
         named(ui.link(text, address(to, **query)).classes("ps-link"), f"{text}: {name}")
 
 
+class FileActions:
+    """Actions on data sets and bundles: rename, discard, restore and delete; ``refresh`` shows the files again."""
+
+    def __init__(self, page: Page, jobs: Jobs, refresh: Callable[[], Awaitable[None]]) -> None:
+        self._page, self._jobs, self._refresh = page, jobs, refresh
+
+    def menu(self, path: Path, name: str) -> None:
+        """Add the menu of a data set or bundle."""
+        words, workspace = self._page.words, self._page.workspace
+
+        async def rename(new: str) -> None:
+            message = words("home.renamed", name=name, new=new)
+            await self.change(lambda: workspace.rename(path, new), message, lambda now: workspace.rename(now, name))
+
+        async def discard() -> None:
+            with self._page.show_errors():
+                self._jobs.check_unused(path)
+                message = words("shell.discarded", name=name)
+                await self.change(lambda: workspace.discard(path), message, workspace.restore)
+
+        def ask_name() -> None:
+            title = words("home.rename_title", name=name)
+            ask(words, title, words("home.rename"), rename, words("home.new_name"), name)
+
+        item_menu(words, name, {words("home.rename"): ask_name, words("shell.discard"): discard})
+
+    async def change(self, work: Callable[[], Any], message: str, undo: Callable[[Any], Any] | None = None) -> None:
+        """Change files, say so with a button that calls ``undo`` with the result, and show the files again."""
+        with self._page.show_errors():
+            result = await run.io_bound(work)
+            again = None
+            if undo is not None:
+                back, done = undo, self._page.words("shell.undone")
+                again = lambda: self.change(lambda: back(result), done)  # noqa: E731
+            self._page.say(message, "good", again)
+            await self._refresh()
+
+
+class DiscardedSection:
+    """Section that lists the discarded sessions, data sets and bundles; hidden if there are none."""
+
+    def __init__(self, page: Page, actions: FileActions) -> None:
+        self._page, self._actions = page, actions
+        with tag(ui.element("details").classes("ps-card w-full"), "discarded") as self._box:
+            html(page.words("home.discarded"), "summary").style("cursor: pointer; font-weight: 600")
+            self._rows = ui.column().classes("w-full ps-small-gap")
+
+    def fill(self, paths: Sequence[Path]) -> None:
+        """Replace the displayed files."""
+        words, workspace = self._page.words, self._page.workspace
+        self._rows.clear()
+        self._box.set_visibility(bool(paths))
+        with self._rows:
+            for path in paths:
+                kind, _, name = path.relative_to(workspace.folder / DISCARDED).as_posix().partition("/")
+                self._row(path, f"{words(f'home.kind_{kind}')}: {name}", name)
+
+    def _row(self, path: Path, text: str, name: str) -> None:
+        words, workspace, change = self._page.words, self._page.workspace, self._actions.change
+
+        async def restore() -> None:
+            await change(lambda: workspace.restore(path), words("home.restored", name=name))
+
+        async def delete(_: str) -> None:
+            await change(lambda: workspace.delete(path), words("home.deleted", name=name))
+
+        def ask_delete() -> None:
+            ask(words, words("home.delete_title", name=name), words("home.delete"), delete)
+
+        with ui.row().classes("ps-row items-center w-full ps-small-gap"):
+            ui.label(text).classes("flex-grow ps-break")
+            button("", words("home.restore"), on_page(restore), SMALL, about=name)
+            button("", words("home.delete"), ask_delete, SMALL, about=name)
+
+
 class DatasetSection:
     """Section that lists the data sets, with links to the pages that use them."""
 
-    def __init__(self, page: Page, jobs: Jobs) -> None:
-        self._page, self._jobs = page, jobs
+    def __init__(self, page: Page, jobs: Jobs, actions: FileActions) -> None:
+        self._page, self._jobs, self._actions = page, jobs, actions
         with titled_card(page, "home.datasets", "datasets"):
             self._rows = ui.column().classes("w-full ps-small-gap")
 
@@ -79,6 +155,8 @@ class DatasetSection:
                 ui.label(entry.name).classes("text-bold")
                 if entry.simulated:
                     simulation_badge(page)
+                ui.space()
+                self._actions.menu(entry.path, entry.name)
             if entry.refused:
                 ui.label(entry.refused).classes("ps-bad")
                 return

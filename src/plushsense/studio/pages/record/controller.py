@@ -27,7 +27,14 @@ from plushsense.recording.recorder import (
     speed_of,
     with_speed,
 )
-from plushsense.recording.session import OpenSession, SessionSummary, is_finished, list_sessions
+from plushsense.recording.session import (
+    OpenSession,
+    SessionSummary,
+    change_subject,
+    is_finished,
+    list_sessions,
+    mark_finished,
+)
 from plushsense.recording.session_files import SESSION_HEAD, SessionHead
 from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import VIRTUAL, ChangeSignal, Workspace
@@ -177,6 +184,44 @@ class RecordController:
             request = SessionRequest(device=url, subject=known.subject, speed=self.speed_for(url, known.simulated))
             self._check(request, known.device)
             return self._open(request, folder, known)
+
+    def finish(self, name: str, finished: bool = True) -> None:
+        """Mark a session as finished although steps are missing, or take that back.
+
+        Raises:
+            PlushSenseError: for an unknown session, or one that is being recorded.
+        """
+        with self._opening:
+            mark_finished(self._closed(name), finished)
+        self.changed.notify()
+
+    def rename_person(self, name: str, code: str) -> str:
+        """Give a session to the person ``code``, and return its new name.
+
+        Raises:
+            PlushSenseError: for an unknown session, one that is being recorded, or an invalid code.
+        """
+        with self._opening:
+            place = change_subject(self._closed(name), code)
+        self.changed.notify()
+        return f"{place.parent.name}/{place.name}"
+
+    def discard(self, name: str) -> Path:
+        """Move a session to the discarded files (`Workspace.discard`), and return its folder there.
+
+        Raises:
+            PlushSenseError: for an unknown session, or one that is being recorded.
+        """
+        with self._opening:
+            place = self._workspace.discard(self._closed(name))
+        self.changed.notify()
+        return place
+
+    def _closed(self, name: str) -> Path:
+        """Return the folder of a session; raise ConfigError if it is open."""
+        if self.get(name) is not None:
+            raise ConfigError(f"The session '{name}' is being recorded: end it first.")
+        return self._folder(name)
 
     def close_session(self, name: str) -> None:
         """Close a session and discard only the recording in progress; do nothing if it is closed already."""

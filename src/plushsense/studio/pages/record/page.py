@@ -16,6 +16,7 @@ from plushsense.studio.app.shell import Page, address, button, html, named, quer
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.session import collect, show_session, summary
+from plushsense.studio.widgets.elements import ask, item_menu
 
 _LISTED = 8
 _SCAN_S = 3.0
@@ -59,14 +60,8 @@ async def show_start(page: Page, controller: RecordController, requested: str, e
         page.say(page.words("record.not_open", name=requested), "warning")
     elif requested:
         page.say(page.words("record.no_session", name=requested), "warning")
-    _open_ones(page, controller)
-    _unfinished(page, controller, sessions)
+    _SessionLists(page, controller).fill(sessions)
     _Form(page, controller)
-    done = sum(s.finished for s in sessions)
-    if done:
-        with ui.row().classes("items-baseline"):
-            ui.label(page.words("record.finished_ones", n=done)).classes("ps-dim")
-            ui.link(page.words("record.import_them"), "/").classes("ps-link")
 
 
 def _ended(page: Page, session: SessionSummary) -> None:
@@ -82,49 +77,113 @@ def _ended(page: Page, session: SessionSummary) -> None:
         see = button("collect", page.words("record.collect"), clicked, "unelevated size=lg", about=session.name)
 
 
-def _open_ones(page: Page, controller: RecordController) -> None:
-    for session in controller.active_sessions():
-        with tag(ui.row().classes("ps-card w-full items-center"), "open-session"):
-            ui.label(page.words("record.open_now", name=session.name)).classes("flex-grow text-bold")
-            there = address("record", session=session.name)
-            show = page.words("record.show")
-            button("", show, lambda to=there: ui.navigate.to(to), "unelevated", about=session.name)
+class _SessionLists:
+    """The sessions that are open, unfinished and finished, with what can be done with each."""
 
+    def __init__(self, page: Page, controller: RecordController) -> None:
+        self._page, self._controller = page, controller
+        self._box = ui.column().classes("w-full")
 
-def _unfinished(page: Page, controller: RecordController, sessions: list[SessionSummary]) -> None:
-    words = page.words
-    left = [s for s in sessions if not s.finished and controller.get(s.name) is None]
-    if not left:
-        return
-    with ui.column().classes("ps-card w-full"):
-        html(words("record.unfinished"), "h2")
-        for session in left[:_LISTED]:
-            _one_unfinished(page, controller, session)
-        if len(left) > _LISTED:
-            with ui.element("details").classes("w-full"):
-                summary(words("record.older", n=len(left) - _LISTED))
-                for session in left[_LISTED:]:
-                    _one_unfinished(page, controller, session)
+    def fill(self, sessions: list[SessionSummary]) -> None:
+        """Show these sessions."""
+        words, controller = self._page.words, self._controller
+        self._box.clear()
+        with self._box:
+            for active in controller.active_sessions():
+                with tag(ui.row().classes("ps-card w-full items-center"), "open-session"):
+                    ui.label(words("record.open_now", name=active.name)).classes("flex-grow text-bold")
+                    there = address("record", session=active.name)
+                    button(
+                        "", words("record.show"), lambda to=there: ui.navigate.to(to), "unelevated", about=active.name
+                    )
+            closed = [s for s in sessions if controller.get(s.name) is None]
+            if left := [s for s in closed if not s.finished]:
+                with ui.column().classes("ps-card w-full"):
+                    html(words("record.unfinished"), "h2")
+                    for session in left[:_LISTED]:
+                        self._unfinished(session)
+                    if len(left) > _LISTED:
+                        with ui.element("details").classes("w-full"):
+                            summary(words("record.older", n=len(left) - _LISTED))
+                            for session in left[_LISTED:]:
+                                self._unfinished(session)
+            if finished := [s for s in closed if s.finished]:
+                with tag(ui.element("details").classes("ps-card w-full"), "finished-sessions"):
+                    summary(words("record.finished_ones", n=len(finished)))
+                    for session in finished:
+                        with ui.row().classes("w-full items-center"):
+                            self._describe(session)
+                            self._menu(session)
 
+    def _unfinished(self, session: SessionSummary) -> None:
+        words, name, controller = self._page.words, session.name, self._controller
+        with tag(ui.row().classes("w-full items-center"), f"unfinished-{name}"):
+            if session.head is None or session.protocol is None:
+                ui.label(f"{name}: {session.error}").classes("flex-grow")
+                return
+            self._describe(session)
+            toys = list(dict.fromkeys([session.head.device, *controller.toys()]))
+            titles = {u: toy_name(words, u) for u in toys}
+            toy = ui.select(titles, value=toys[0], label=words("record.toy")).style("width: 24rem; max-width: 100%")
+            named(toy.props("outlined dense"), f"{words('record.toy')}: {name}")
+            go_on = button("", words("record.go_on"), None, "unelevated", about=name)
+            go_on.on_click(lambda: _open_session(self._page, go_on, lambda: controller.resume(name, str(toy.value))))
+            self._menu(session)
 
-def _one_unfinished(page: Page, controller: RecordController, session: SessionSummary) -> None:
-    words, name = page.words, session.name
-    with tag(ui.row().classes("w-full items-center"), f"unfinished-{name}"):
-        if session.head is None or session.protocol is None:
-            ui.label(f"{name}: {session.error}").classes("flex-grow")
-            return
-        text = words("record.so_far", name=name, done=session.done, steps=session.steps)
-        with ui.column().classes("flex-grow").style("gap: 0"):
+    def _describe(self, session: SessionSummary) -> None:
+        words = self._page.words
+        text = words("record.so_far", name=session.name, done=session.done, steps=session.steps)
+        with ui.column().classes("flex-grow ps-no-gap"):
             ui.label(text).classes("text-bold")
-            title = words.get(f"record.protocol_{session.protocol.name}", session.protocol.title)
-            title += f" · {words('record.simulated')}" if session.head.simulated else ""
-            ui.label(title).classes("ps-dim")
-        toys = list(dict.fromkeys([session.head.device, *controller.toys()]))
-        titles = {u: toy_name(words, u) for u in toys}
-        toy = ui.select(titles, value=toys[0], label=words("record.toy")).style("width: 24rem; max-width: 100%")
-        named(toy.props("outlined dense"), f"{words('record.toy')}: {name}")
-        go_on = button("", words("record.go_on"), None, "unelevated", about=name)
-        go_on.on_click(lambda: _open_session(page, go_on, lambda: controller.resume(name, str(toy.value))))
+            if session.head is not None and session.protocol is not None:
+                title = words.get(f"record.protocol_{session.protocol.name}", session.protocol.title)
+                title += f" · {words('record.simulated')}" if session.head.simulated else ""
+                ui.label(title).classes("ps-dim")
+
+    def _menu(self, session: SessionSummary) -> None:
+        """Add a menu: finish or reopen the session, correct the person's code, or discard it; each can be undone."""
+        words, name, controller = self._page.words, session.name, self._controller
+        subject, finished = session.folder.parent.name, session.finished
+
+        async def finish() -> None:
+            message = words("record.reopened" if finished else "record.marked_finished", name=name)
+            await self._change(
+                lambda: controller.finish(name, not finished), message, lambda _: controller.finish(name, finished)
+            )
+
+        async def rename(code: str) -> None:
+            message = words("record.renamed", name=name, code=code)
+            await self._change(
+                lambda: controller.rename_person(name, code),
+                message,
+                lambda new: controller.rename_person(new, subject),
+            )
+
+        async def discard() -> None:
+            message = words("shell.discarded", name=name)
+            await self._change(lambda: controller.discard(name), message, self._page.workspace.restore)
+
+        def ask_code() -> None:
+            title = words("record.rename_title", name=name)
+            ask(words, title, words("record.rename_go"), rename, words("record.code"), subject)
+
+        actions = {
+            words("record.reopen_session" if finished else "record.finish"): finish,
+            words("record.rename"): ask_code,
+            words("shell.discard"): discard,
+        }
+        item_menu(words, name, actions)
+
+    async def _change(self, work: Callable[[], Any], message: str, undo: Callable[[Any], Any] | None) -> None:
+        """Change a session, say so with a button that calls ``undo`` with the result, and show the sessions again."""
+        with self._page.show_errors():
+            result = await run.io_bound(work)
+            again = None
+            if undo is not None:
+                back, done = undo, self._page.words("shell.undone")
+                again = lambda: self._change(lambda: back(result), done, None)  # noqa: E731
+            self._page.say(message, "good", again)
+            self.fill(await run.io_bound(self._controller.sessions) or [])
 
 
 async def _open_session(page: Page, begin: ui.button, work: Callable[[], ActiveSession]) -> None:
