@@ -38,7 +38,7 @@ def test_what_plush_begin_says(c_library: Any) -> None:
     assert status(image) == OK
     assert status(image + b"what stands behind it in flash") == OK
     assert status(b"") == status(image[:15]) == status(b"PLSX" + image[4:]) == NOT_A_MODEL
-    assert status(image[:4] + b"\2" + image[5:]) == OTHER_VERSION == status(image[:4] + b"\4" + image[5:])
+    assert status(image[:4] + b"\3" + image[5:]) == OTHER_VERSION == status(image[:4] + b"\5" + image[5:])
     for cut in (16, 17, len(image) // 2, len(image) - 1):
         assert status(image[:cut]) == DAMAGED
     for at in range(16, len(image), 7):
@@ -251,7 +251,7 @@ def test_a_swap_to_what_is_no_model_for_this_toy_changes_nothing(c_library: Any)
         other_layout = sealed(body[:26] + bytes([body[26] ^ 1]) + body[27:])
         refused = {
             NOT_A_MODEL: [b"", good[:15], b"PLSX" + good[4:]],
-            OTHER_VERSION: [good[:4] + b"\2" + good[5:], good[:4] + b"\4" + good[5:]],
+            OTHER_VERSION: [good[:4] + b"\3" + good[5:], good[:4] + b"\5" + good[5:]],
             DAMAGED: [good[: int(rng.integers(16, len(good)))] for _ in range(20)],
             OTHER_LAYOUT: [other_layout],
         }

@@ -87,7 +87,7 @@ def test_what_is_no_patch_for_this_toy_changes_nothing(c_library: Any) -> None:
     fewer, more = ruled_model(5, classes=2), ruled_model(5, classes=4)
     refused = {
         NOT_A_MODEL: [b"", good[:15], b"PLSH" + good[4:], model.to_bytes()],
-        OTHER_VERSION: [good[:4] + b"\2" + good[5:], good[:4] + b"\4" + good[5:]],
+        OTHER_VERSION: [good[:4] + b"\3" + good[5:], good[:4] + b"\5" + good[5:]],
         DAMAGED: [
             *(good[: int(rng.integers(HEAD_BYTES, len(good)))] for _ in range(20)),
             sealed(body[:8] + struct.pack("<H", 32768) + body[10:]),

@@ -29,7 +29,7 @@ def told(fold, withheld, rows, covered=(0.8,), known=1.0):
             "known": known,
             "logits": logits,
             "shares": shares,
-            "highest": logits.max(axis=1),
+            "score": logits.max(axis=1),
             "typical": logits.max(axis=1),
             "label": np.array([r[0] for r in rows]),
             "person": np.array([r[1] for r in rows]),

@@ -28,7 +28,7 @@ def test_train_fits_decisions_on_those_who_validate(cli: Cli, dataset: Dataset, 
     assert fitted["people"] == len(bundle.provenance["validation_subjects"]) == 1
     assert fitted["health"]["people"] == 5
     assert fitted["streams"] == 1 and fitted["answers"]["coverage_left_out"] is None
-    assert spec.known is not None and spec.health.low
+    assert spec.known_margin is not None and spec.health.low
     assert ran.json["decision"]["fitted"] == fitted
     # Who they are stands in the provenance alone, which an export takes out.
     assert not any(f'"{code}"' in json.dumps(bundle.decision) for code in dataset.subjects)

@@ -34,7 +34,7 @@ from plushsense.runtime.events import (
     EventSettings,
     Update,
 )
-from plushsense.runtime.fixed import LOGIT_LIMIT, smooth, softmax
+from plushsense.runtime.fixed import LOGIT_LIMIT, known_score, smooth, softmax
 
 STROKE, SCRATCH, HOLD, HIT, PULL, REST, THING = range(7)
 SET = GestureSet(
@@ -62,6 +62,9 @@ def logits(shares: dict[int, float], most: float = 10.0, classes: int = 7) -> np
     rest = (1 - sum(shares.values())) / max(1, classes - len(shares))
     logs = np.log([max(shares.get(k, rest), 1e-9) for k in range(classes)])
     return np.clip(np.rint((logs - logs.max() + most) * 256), -LOGIT_LIMIT, LOGIT_LIMIT).astype(np.int64)
+
+
+IDLE_CLASSES = np.array([g.idle for g in SET.gestures])
 
 
 def sure_of(gesture: int) -> dict[int, float]:
@@ -103,12 +106,12 @@ def answered(shares: dict[int, float], settings: EventSettings = SETTINGS, most:
 # 1. Smoothing
 
 
-def test_probabilities_and_the_highest_logit_are_smoothed_alike() -> None:
+def test_probabilities_and_the_known_score_are_smoothed_alike() -> None:
     machine = EventMachine(SETTINGS, 6000, SET)
     mean = None
     for at, (shares, most) in enumerate([(STROKES, 9.0), (HITS, 3.0), (HITS, -2.0), (NOTHING, 20.0)]):
         row = logits(shares, most)
-        mean = smooth(mean, np.append(softmax(row), row.max()), 6000)
+        mean = smooth(mean, np.append(softmax(row), known_score(row, IDLE_CLASSES)), 6000)
         answer, _ = machine.step(row, at)
         assert machine.mean is not None
         np.testing.assert_array_equal(machine.mean, mean)
@@ -132,12 +135,15 @@ def test_of_two_that_look_equal_the_best_is_the_one_with_more_bits_and_of_equal_
 
 
 def test_the_kinds_of_an_answer() -> None:
-    settings = replace(SETTINGS, sure=round(0.3 * ONE), known=5 * 256)
-    assert answered(STROKES, settings, most=4.9) == "unknown"
-    assert answered(STROKES, settings, most=5.1) == "sure"
-    assert answered(RESTS, settings) == "idle"
+    settings = replace(SETTINGS, sure=round(0.3 * ONE))
+    # The logit of the stroke is log(94) = 4.54 above all others.
+    assert answered(STROKES, replace(settings, known=round(4.6 * 256))) == "unknown"
+    assert answered(STROKES, replace(settings, known=round(4.5 * 256))) == "sure"
+    assert answered(STROKES, replace(settings, known=round(4.5 * 256)), most=-5.0) == "sure", "its height is no matter"
+    assert answered(BOTH_POSITIVE, replace(settings, known=round(3.6 * 256))) == "affect", "two gestures stand out"
+    assert answered({STROKE: 0.3, SCRATCH: 0.3, HIT: 0.3}, replace(settings, known=256)) == "unknown", "three do not"
+    assert answered(RESTS, replace(settings, known=256)) == "idle", "idle goes before unknown"
     assert answered({REST: 0.4, HIT: 0.3}, settings) == "idle", "the best class is idle, sure or not"
-    assert answered(RESTS, settings, most=4.0) == "unknown", "unknown goes before idle"
     assert answered(BOTH_POSITIVE, settings) == "affect"
     assert answered({STROKE: 0.45, HIT: 0.45}, settings) == "unsure", "two affects"
     assert answered(NOTHING, settings) == "unsure", "no class is in the set"
@@ -153,7 +159,9 @@ def test_the_kinds_of_an_answer() -> None:
 def test_a_class_of_exactly_sure_is_in_the_set_and_known_exactly_is_known() -> None:
     row = logits({STROKE: 0.5, HIT: 0.4})
     shares = softmax(row)
-    machine = EventMachine(replace(SETTINGS, sure=int(shares[HIT]), known=int(row.max())), UNSMOOTHED, SET)
+    machine = EventMachine(
+        replace(SETTINGS, sure=int(shares[HIT]), known=int(known_score(row, IDLE_CLASSES))), UNSMOOTHED, SET
+    )
     assert machine.step(row, 0)[0].kind == UNSURE
     machine = EventMachine(replace(SETTINGS, sure=int(shares[HIT]) + 1), UNSMOOTHED, SET)
     assert machine.step(row, 0)[0].kind == SURE
@@ -172,8 +180,8 @@ def test_a_gesture_is_wanted_from_enter_on_an_affect_by_its_classes_together_and
     assert played([RESTS] * 9) == []
     assert played([{HOLD: 0.41, REST: 0.57}] * 9) == [], "idle"
     assert played([{HOLD: 0.5, REST: 0.48}] * 9) == [], "an idle class counts for no affect"
-    assert played([STROKES] * 9, replace(SETTINGS, known=11 * 256)) == [], "unknown"
-    assert played([STROKES] * 9, replace(SETTINGS, known=9 * 256)) != []
+    assert played([STROKES] * 9, replace(SETTINGS, known=5 * 256)) == [], "unknown"
+    assert played([STROKES] * 9, replace(SETTINGS, known=4 * 256)) != []
 
 
 def test_exactly_enter_is_enough_and_exactly_leave_stays() -> None:
@@ -270,8 +278,9 @@ def test_it_ends_after_end_steps_below_leave_in_a_row() -> None:
     assert played(first + [{HIT: 0.21, PULL: 0.21, STROKE: 0.5}] * 9) == played(first)
     assert played(first + [{HIT: 0.19, PULL: 0.19, STROKE: 0.5}] * 4)[-1][:2] == (6, "ended")
     # Unknown is no reason to end.
-    machine = EventMachine(replace(SETTINGS, known=5 * 256), UNSMOOTHED, SET)
-    found = [u for now in range(20) for u in machine.step(logits(STROKES, 10.0 if now < 3 else 1.0), now)[1]]
+    machine = EventMachine(replace(SETTINGS, known=2 * 256), UNSMOOTHED, SET)
+    vague = {STROKE: 0.5, SCRATCH: 0.25, HIT: 0.25}
+    found = [u for now in range(20) for u in machine.step(logits(STROKES if now < 3 else vague), now)[1]]
     assert len(found) == 1
 
 

@@ -49,7 +49,7 @@ def test_read_back(model: IntegerModel) -> None:
     image = model.to_bytes()
     network, layout, arch = model.network, model.layout, model.network.arch
     magic, version, zero, length, crc = struct.unpack_from("<4sHHII", image)
-    assert (magic, version, zero, length, crc) == (b"PLSH", 3, 0, len(image), zlib.crc32(image[16:]))
+    assert (magic, version, zero, length, crc) == (b"PLSH", 4, 0, len(image), zlib.crc32(image[16:]))
     r = Reader(image[16:])
     head = r.take("BBBBHHIIIIHH")
     assert head[:4] == (len(arch.layers), len(layout.channels), arch.channels, arch.classes)

@@ -22,8 +22,10 @@ SPECS = [
     DecideSpec(),
     argmax_spec(),
     argmax_spec(0.3),
-    DecideSpec(0.1, 0.4, 0.2, 0.5, 0.3, known=0.2, least_s=0.1, switch_s=0.1, end_s=0.1, hold_s=0.1, rest_s=0.1),
-    DecideSpec(0.1, 0.9, 0.2, 0.5, 0.6, known=-1.0, least_s=0.05, switch_s=0.05, end_s=0.2, rest_s=0.0, wait_s=0.3),
+    DecideSpec(0.1, 0.4, 0.2, 0.5, 0.3, known_margin=0.2, least_s=0.1, switch_s=0.1, end_s=0.1, hold_s=0.1, rest_s=0.1),
+    DecideSpec(
+        0.1, 0.9, 0.2, 0.5, 0.6, known_margin=1.0, least_s=0.05, switch_s=0.05, end_s=0.2, rest_s=0.0, wait_s=0.3
+    ),
 ]
 
 

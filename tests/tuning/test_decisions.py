@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset.importing.importers import import_recordings
@@ -30,6 +31,7 @@ from plushsense.tuning.events import OTHER
 from plushsense.windows.clock import row_times_us
 
 ACCEL = load_layout("accel-3")
+TWO = GestureSet("two", (Gesture("a"), Gesture("b", idle=True)))
 
 
 def labelled(shares, person, recording):
@@ -58,7 +60,7 @@ def test_the_threshold_is_the_corrected_quantile_of_split_conformal_prediction(n
     shares = np.random.default_rng(n).permutation(np.arange(1, n + 1)) * 100
     steps = labelled(shares, ["a"] * n, range(n))
     assert sure_threshold(steps, coverage) * ONE == 100 * rank
-    assert known_threshold(steps, coverage) == 200 * rank / 256
+    assert known_threshold(steps, TWO, coverage) == 200 * rank / 256
     assert coverage_of(steps, sure_threshold(steps, coverage)) == pytest.approx((n - rank + 1) / n)
 
 
@@ -68,7 +70,7 @@ def test_coverage_of_the_left_out_uses_the_others_threshold():
     # b's smallest is 50: it covers all of a. a's is 100, which covers 6 of 10 of b.
     assert left_out_coverage(steps, 0.9) == pytest.approx([1.0, 0.6])
     assert left_out_coverage(steps.take(steps.person == "a"), 0.9) == []
-    assert known_threshold(steps.take(steps.person == "c"), 0.9) is None
+    assert known_threshold(steps.take(steps.person == "c"), TWO, 0.9) is None
 
 
 def test_split_conformal_covers_what_it_states_on_new_people():
@@ -124,7 +126,7 @@ def test_a_fit_on_streams_says_on_what_and_comes_back_from_a_bundle(made, bundle
     heard = marked_streams(model, dataset, ["P1", "P2"], spec)
     steps = labelled_steps(model, heard, spec)
     assert coverage_of(steps, spec.sure) >= 0.8
-    assert float((weights_of(steps) * (steps.highest >= spec.known * 256)).sum()) >= 0.95
+    assert float((weights_of(steps) * (steps.known >= spec.known_margin * 256)).sum()) >= 0.95
     back = DecideSpec.from_dict(replace(model, decision=spec.to_dict()).decision)
     assert back == spec
     # The same people, the same settings; other people, other ones.
@@ -133,9 +135,11 @@ def test_a_fit_on_streams_says_on_what_and_comes_back_from_a_bundle(made, bundle
 
 
 def test_settings_that_were_given_stay(made, bundle):
-    given = DecideSpec(smoothing_s=0.11, enter=0.77, known=-3.0)
-    spec = fit_decisions(bundle(), made(), ["P1"], spec=given, keep=("smoothing_s", "enter", "known", "health", "gate"))
-    assert (spec.smoothing_s, spec.enter, spec.known) == (0.11, 0.77, -3.0)
+    given = DecideSpec(smoothing_s=0.11, enter=0.77, known_margin=3.0)
+    spec = fit_decisions(
+        bundle(), made(), ["P1"], spec=given, keep=("smoothing_s", "enter", "known_margin", "health", "gate")
+    )
+    assert (spec.smoothing_s, spec.enter, spec.known_margin) == (0.11, 0.77, 3.0)
     assert spec.health == given.health
     assert spec.sure != given.sure
 
@@ -147,7 +151,7 @@ def test_without_streams_the_events_keep_their_defaults_and_recordings_set_the_r
     assert "nothing" in spec.fitted["events"]["on"]
     assert (spec.enter, spec.least_s, spec.rest_s) == (plain.enter, plain.least_s, plain.rest_s)
     assert "windows" in spec.fitted["answers"]["on"]
-    assert spec.sure != plain.sure and spec.known is not None and spec.health.low
+    assert spec.sure != plain.sure and spec.known_margin is not None and spec.health.low
 
 
 def test_truths_stand_where_the_live_loop_hears_them(made, bundle):

@@ -121,7 +121,7 @@ def test_the_search_learns_to_pass_over_what_flickers_and_keeps_what_tells_nothi
     assert [e.gesture for e in after] == [1] * 30
     assert tuned.cost < 0.2 < 1.8 < tuned.cost_before
     assert "wait_s" not in tuned.moved  # there is no gate
-    assert tuned.spec.known is None and tuned.spec.sure == start.sure
+    assert tuned.spec.known_margin is None and tuned.spec.sure == start.sure
     kept = tune(streams, start, SET, keep=("least_s", "smoothing_s"))
     assert (kept.spec.least_s, kept.spec.smoothing_s) == (0.05, 0.05)
     assert not {"least_s", "smoothing_s"} & set(kept.moved)

@@ -70,7 +70,7 @@ def lines(result: dict[str, Any]) -> list[str]:
     return out
 
 
-_SHOWN = ("softmax, smoothed", "logit, smoothed", "energy", "relative Mahalanobis")
+_SHOWN = ("softmax, smoothed", "logit", "known score, smoothed", "energy", "relative Mahalanobis")
 
 
 def _unknown(rows: dict[str, Any]) -> list[str]:
@@ -89,6 +89,7 @@ def _unknown(rows: dict[str, Any]) -> list[str]:
         "recordings",
         "AUROC softmax",
         "logit",
+        "known score",
         "energy",
         "Mahalanobis",
         "known passed",

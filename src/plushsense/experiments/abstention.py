@@ -79,13 +79,13 @@ def last_answers(
 
     Returns:
         ``logits`` (n, K) of the last step; smoothed ``shares`` (n, K), the probabilities of the network's K classes;
-        ``highest`` (n,), the highest smoothed logit; ``typical`` (n,), the mean score of the steps in the second half
+        ``score`` (n,), the smoothed known score, and ``typical`` (n,), both the mean over the steps in the second half
         of the recording; ``label`` (n,), the true gesture, which need not be one of the network's classes; ``person``
         (n,).
     """
     network, arch = bundle.network(), bundle.arch
     weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
-    rows: list[tuple[NDArray[Any], NDArray[Any], Any, str, str, float]] = []
+    rows: list[tuple[NDArray[Any], NDArray[Any], float, str, str, float]] = []
     for stream in marked_streams(bundle, dataset, subjects, spec, gestures):
         smoothed = TraceReplayer(stream.trace).smoothed(weight)
         for truth in stream.truths:
@@ -101,12 +101,13 @@ def last_answers(
                     windows = [part.inputs[s * arch.step : s * arch.step + arch.span].T for s in steps]
                     features = network.features(bundle.scaler.apply(np.stack(windows)))
                     score = float(typical.scores(features).mean())
-                    rows.append((part.logits[at], after.shares[at], after.highest[at], label, stream.person, score))
+                    known = float(after.known[steps.start : steps.stop].mean())
+                    rows.append((part.logits[at], after.shares[at], known, label, stream.person, score))
     k = len(bundle.gestures)
     return {
         "logits": np.array([r[0] for r in rows], dtype=np.float64).reshape(len(rows), k) / 256,
         "shares": np.array([r[1] for r in rows], dtype=np.int64).reshape(len(rows), k) / ONE,
-        "highest": np.array([r[2] for r in rows], dtype=np.int64) / 256,
+        "score": np.array([r[2] for r in rows], dtype=np.float64) / 256,
         "label": np.array([r[3] for r in rows], dtype=np.str_),
         "person": np.array([r[4] for r in rows], dtype=np.str_),
         "typical": np.array([r[5] for r in rows], dtype=np.float64),
@@ -131,9 +132,9 @@ def fold_answers(
     spec = DecideSpec()
     calibration = labelled_steps(bundle, marked_streams(bundle, dataset, validation, spec), spec)
     if not len(calibration.truth):
-        empty = {name: np.zeros(0) for name in ("logits", "shares", "highest", "label", "person", "typical")}
+        empty = {name: np.zeros(0) for name in ("logits", "shares", "score", "label", "person", "typical")}
         return {"people": [], "covered": [], "size": [], "sure": 1.0, "known": None, **empty}
-    sure, known = sure_threshold(calibration, coverage), known_threshold(calibration, known_share)
+    sure, known = sure_threshold(calibration, coverage), known_threshold(calibration, bundle.gestures, known_share)
     steps = labelled_steps(bundle, marked_streams(bundle, dataset, test, spec), spec)
     people = sorted(set(steps.person.tolist()))
     features = bundle.network().features(bundle.scaler.apply(training.x))
@@ -162,7 +163,7 @@ class FoldAnswers:
     def scores(self) -> dict[str, Floats]:
         """Each kind of confidence by name, an array (n,) with one value for each recording."""
         r = self.result
-        found = confidences(r["logits"], r["shares"], r["highest"], float(r["sure"]))
+        found = confidences(r["logits"], r["shares"], r["score"], float(r["sure"]))
         return found | {"relative Mahalanobis": np.asarray(r["typical"], dtype=np.float64)}
 
     @property
@@ -250,7 +251,7 @@ def _against(folds: Sequence[FoldAnswers], known_share: float) -> dict[str, Any]
         for name, score in t.scores.items():
             auc.setdefault(name, []).append(auroc(score[t.known], score[other]))
         if t.result["known"] is not None:
-            under = np.asarray(t.result["highest"] < t.result["known"])
+            under = np.asarray(t.result["score"] < t.result["known"])
             passed.append(float((~under[t.known]).mean()))
             caught.append(float(under[other].mean()))
     return {
@@ -318,7 +319,7 @@ def curves(measured: Mapping[str, RiskCoverage], *, title: str = "") -> Figure:
 
 
 # Increase it when the meaning of a stored fold changes, also when the default smoothing does.
-_VERSION = 2
+_VERSION = 3
 FIGURE, TABLE = "risk-coverage.png", "abstaining.json"
 
 

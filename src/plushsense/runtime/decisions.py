@@ -37,7 +37,8 @@ class DecideSpec:
         enter, leave: smoothed probability from which a gesture may begin, and below which it may end.
         enter_affect, leave_affect: the same for the sum over an affect; above 1, no event begins with only an affect.
         sure: smoothed probability from which a class is in the conformal set of a step.
-        known: smoothed highest logit below which a touch is no known gesture; None: every touch is one.
+        known_margin: smoothed known score (`plushsense.runtime.fixed.known_score`), in logits, below which a touch is
+            no known gesture; None: every touch is one.
         least_s: how long a gesture or affect must be the candidate before its event begins (minimum duration).
         switch_s: how long another candidate must last before it ends the event and begins the next one.
         end_s: how long the gesture or affect must be below its threshold before the event ends.
@@ -54,7 +55,7 @@ class DecideSpec:
     enter_affect: float = 0.8
     leave_affect: float = 0.4
     sure: float = 0.5
-    known: float | None = None
+    known_margin: float | None = None
     least_s: float = 0.1
     switch_s: float = 0.3
     end_s: float = 0.3
@@ -74,9 +75,9 @@ class DecideSpec:
             most = 2.0 if name == "enter_affect" else 1.0
             if not _number(value := getattr(self, name)) or not 0.0 <= value <= most:
                 raise ConfigError(f"{name} is {value!r}; accepted are probabilities, 0 to 1.")
-        limit = LOGIT_LIMIT / 256
-        if self.known is not None and (not _number(self.known) or not -limit <= self.known <= limit):
-            raise ConfigError(f"known is {self.known!r}; accepted are logits from {-limit:g} to {limit:g}, or none.")
+        margin, most = self.known_margin, LOGIT_LIMIT / 256
+        if margin is not None and (not _number(margin) or not 0.0 <= margin <= most):
+            raise ConfigError(f"known_margin is {margin!r}; accepted are logits from 0 to {most:g}, or none.")
 
     def rules(self, step_s: float) -> Rules:
         """Convert the settings to integers, and durations to steps of ``step_s`` seconds."""
@@ -88,7 +89,7 @@ class DecideSpec:
         return Rules(
             EventSettings(
                 **shares,
-                known=-LOGIT_LIMIT if self.known is None else round(self.known * 256),
+                known=-LOGIT_LIMIT if self.known_margin is None else round(self.known_margin * 256),
                 least=steps(self.least_s, 1),
                 switch=steps(self.switch_s, 1),
                 end=steps(self.end_s, 1),
@@ -108,9 +109,12 @@ class DecideSpec:
     def from_dict(cls, table: Mapping[str, Any]) -> DecideSpec:
         """Create settings from plain values, as in a bundle or a configuration file; missing keys get defaults.
 
+        Bundles of earlier versions have a ``known``, a threshold of the highest logit, which is ignored.
+
         Raises:
             ConfigError: for an unknown key, or a value of the wrong type or out of range.
         """
+        table = {key: value for key, value in table.items() if key != "known"}
         return load_table(table, cls, "decision settings", ConfigError)
 
 

@@ -6,11 +6,10 @@ are in steps, shares (probabilities) in steps of 2^-15, logits in steps of 1/256
 
 In each step, in this order:
 
-1. The probabilities and the highest logit are smoothed (`fixed.smooth`). The latter is the *known* score: the maximum
-   logit score of open-set recognition.
-2. The step's `Answer` is ``unknown`` when this score is below ``known``; else ``idle`` when the best class is idle;
-   else the conformal set, every class of at least ``sure``: one class is ``sure``, several of one affect (not ``none``)
-   are ``affect``, anything else is ``unsure``.
+1. The probabilities and the known score (`fixed.known_score`) are smoothed (`fixed.smooth`).
+2. The step's `Answer` is ``idle`` when the best class is idle; else ``unknown`` when the known score is below
+   ``known``; else it depends on the conformal set, every class of at least ``sure``: one class is ``sure``, several of
+   one affect (not ``none``) are ``affect``, anything else is ``unsure``.
 3. The candidate is the gesture of the best class if it reaches ``enter``, else an affect whose classes together reach
    ``enter_affect``; there is none if the answer is idle or unknown.
 4. If no event is open, one begins when the candidate was the same for ``least`` steps in a row (the same affect;
@@ -38,7 +37,15 @@ import numpy as np
 
 from plushsense.core.errors import BundleError
 from plushsense.core.gestures import GestureSet
-from plushsense.runtime.fixed import LOGIT_LIMIT, PROBABILITY_BITS, SMOOTH_EXTRA_BITS, Ints, smooth, softmax
+from plushsense.runtime.fixed import (
+    LOGIT_LIMIT,
+    PROBABILITY_BITS,
+    SMOOTH_EXTRA_BITS,
+    Ints,
+    known_score,
+    smooth,
+    softmax,
+)
 
 ONE = 1 << PROBABILITY_BITS
 NO_GESTURE = 255
@@ -114,8 +121,8 @@ class Update:
 class Answer:
     """Answer of the network at one step.
 
-    ``best`` class, its smoothed ``share`` (2^-15), ``kind`` an index into `ANSWERS`, and ``known``, the smoothed
-    highest logit in steps of 1/256.
+    ``best`` class, its smoothed ``share`` (2^-15), ``kind`` an index into `ANSWERS`, and ``known``, the smoothed known
+    score in steps of 1/256.
     """
 
     best: int
@@ -126,13 +133,13 @@ class Answer:
 
 class EventMachine:
     """Decides the events of one stream. ``mean`` holds the smoothed probabilities (K,) in steps of 2^-27, then the
-    smoothed highest logit in steps of 2^-20; None before the first step.
+    smoothed known score in steps of 2^-20; None before the first step.
     """
 
     def __init__(self, settings: EventSettings, smoothing: int, gestures: GestureSet) -> None:
         self.settings, self.smoothing = settings, smoothing
         self._affects = [AFFECT_CODES[a] for a in gestures.affects]
-        self._idle = [g.idle for g in gestures.gestures]
+        self._idle = np.array([g.idle for g in gestures.gestures], dtype=np.bool_)
         self.reset()
 
     def reset(self) -> None:
@@ -180,8 +187,7 @@ class EventMachine:
 
     def step(self, logits: Ints, now: int, suspect: bool = False) -> tuple[Answer, list[Update]]:
         """Process the logits (K,) of a step; return the answer and the changes of events."""
-        highest = int(logits.max())
-        both = np.append(softmax(logits), highest)
+        both = np.append(softmax(logits), known_score(logits, self._idle))
         self.mean = smooth(self.mean, both, self.smoothing)
         rows = (self.mean >> SMOOTH_EXTRA_BITS).tolist()
         shares, known = rows[:-1], rows[-1]
@@ -229,10 +235,10 @@ class EventMachine:
 
     def _kind(self, shares: list[int], best: int, known: int) -> int:
         settings = self.settings
-        if known < settings.known:
-            return UNKNOWN
         if self._idle[best]:
             return IDLE
+        if known < settings.known:
+            return UNKNOWN
         members = [k for k, share in enumerate(shares) if share >= settings.sure]
         if len(members) == 1:
             return SURE

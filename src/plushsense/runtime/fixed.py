@@ -179,6 +179,18 @@ def softmax(logits: Ints) -> Ints:
     return np.asarray(((e << PROBABILITY_BITS) + (total >> 1)) // total)
 
 
+def known_score(logits: Ints, idle: NDArray[np.bool_]) -> Ints:
+    """Return how clearly the best gesture stands out (...,), from logits (..., K) in steps of 1/256.
+
+    It is the highest logit of a gesture less the third highest, at most `LOGIT_LIMIT`. The second highest is often that
+    of a gesture of the same family. Classes of ``idle`` (K,) are left out. With fewer than three gestures, the third
+    counts as ``-LOGIT_LIMIT``.
+    """
+    lowest = np.full((*logits.shape[:-1], 2), -LOGIT_LIMIT, dtype=np.int64)
+    ranked = np.sort(np.concatenate([lowest, logits[..., ~idle]], axis=-1), axis=-1)
+    return np.asarray(np.minimum(ranked[..., -1] - ranked[..., -3], LOGIT_LIMIT))
+
+
 def smoothing_weight(seconds: float, step_s: float) -> int:
     """Return the weight (at least 1, in steps of 2^-15) of a new step in an exponential mean over ``seconds``."""
     full = 1 << PROBABILITY_BITS

@@ -55,7 +55,7 @@ from plushsense.runtime.vectors import MOST_AXIS_SHIFT, IntegerVectors
 
 MAGIC = b"PLSH"
 PATCH_MAGIC = b"PLPT"
-IMAGE_VERSION = 3  # since 2 with the settings of events, gate and health, since 3 with zeros and the vector layer
+IMAGE_VERSION = 4  # 2: settings of events, gate and health; 3: zeros and the vector layer; 4: another known score
 HEAD_BYTES = 16
 IDLE_BIT = 4
 GROUP = 4  # number of filters, and of channels, in a block of weights

@@ -28,7 +28,7 @@ from plushsense.runtime.events import (
     EventSettings,
     Update,
 )
-from plushsense.runtime.fixed import SMOOTH_EXTRA_BITS, Ints, smooth, smoothing_weight, softmax
+from plushsense.runtime.fixed import SMOOTH_EXTRA_BITS, Ints, known_score, smooth, smoothing_weight, softmax
 from plushsense.runtime.gate import Gate, GateSettings
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel
@@ -196,13 +196,13 @@ class ReportedEvent:
 class SmoothedPart:
     """Smoothed values of the n steps of a part.
 
-    ``shares`` (n, K): probabilities in units of 2^-15; ``best`` (n,): most probable class, before rounding; ``highest``
-    (n,): highest logit in units of 1/256; ``affect_shares`` (n, 4): sum of the shares of each affect, without idle.
+    ``shares`` (n, K): probabilities in units of 2^-15; ``best`` (n,): most probable class, before rounding; ``known``
+    (n,): known score in units of 1/256; ``affect_shares`` (n, 4): sum of the shares of each affect, without idle.
     """
 
     shares: Ints
     best: Ints
-    highest: Ints
+    known: Ints
     affect_shares: Ints
 
 
@@ -223,11 +223,12 @@ class TraceReplayer:
 
     @cached_property
     def _probabilities(self) -> list[Ints]:
-        """Probabilities and highest logit (n, K + 1) of each part."""
+        """Probabilities and known score (n, K + 1) of each part."""
         k = len(self.trace.gestures)
+        rows = [np.array([softmax(row) for row in part.logits], dtype=np.int64) for part in self.trace.parts]
         return [
-            np.array([[*softmax(row), row.max()] for row in part.logits], dtype=np.int64).reshape(-1, k + 1)
-            for part in self.trace.parts
+            np.column_stack([row.reshape(-1, k), known_score(part.logits.reshape(-1, k), self._idle)])
+            for row, part in zip(rows, self.trace.parts, strict=True)
         ]
 
     def smoothed(self, weight: int) -> list[SmoothedPart]:
@@ -278,7 +279,7 @@ class TraceReplayer:
     def _candidates(self, smoothed: SmoothedPart, settings: EventSettings) -> tuple[Ints, Ints]:
         """Return gesture (n,) (or `NO_GESTURE`) and affect (n,) of the candidate of each step, as in `EventMachine`."""
         share = np.take_along_axis(smoothed.shares, smoothed.best[:, None], axis=1)[:, 0]
-        known = (smoothed.highest >= settings.known) & ~self._idle[smoothed.best]
+        known = (smoothed.known >= settings.known) & ~self._idle[smoothed.best]
         sure = known & (share >= settings.enter)
         totals = smoothed.affect_shares[:, 1:]
         leans = known & ~sure & (totals.max(axis=1) >= settings.enter_affect)

@@ -18,16 +18,17 @@ from plushsense.core.errors import BadInput
 Floats = NDArray[np.float64]
 
 
-def confidences(logits: ArrayLike, smoothed: ArrayLike, highest: ArrayLike, sure: float) -> dict[str, Floats]:
+def confidences(logits: ArrayLike, smoothed: ArrayLike, known: ArrayLike, sure: float) -> dict[str, Floats]:
     """Compute several confidence measures of n answers, (n,) each, by name; higher is more confident.
 
     Args:
         logits: (n, K) logits, not smoothed.
-        smoothed: (n, K) smoothed probabilities; ``highest`` (n,) are the smoothed highest logits.
+        smoothed: (n, K) smoothed probabilities.
+        known: (n,) smoothed known scores (`plushsense.runtime.fixed.known_score`).
         sure: threshold on smoothed probabilities for the conformal set, whose size is a measure; empty is lowest.
     """
     z = np.asarray(logits, dtype=np.float64)
-    p, top = np.asarray(smoothed, dtype=np.float64), np.asarray(highest, dtype=np.float64)
+    p = np.asarray(smoothed, dtype=np.float64)
     peak = z.max(axis=1)
     energy = peak + np.log(np.exp(z - peak[:, None]).sum(axis=1))
     two = np.sort(p, axis=1)[:, -2:]
@@ -38,7 +39,7 @@ def confidences(logits: ArrayLike, smoothed: ArrayLike, highest: ArrayLike, sure
         "margin, smoothed": two[:, 1] - two[:, 0],
         "set size": -np.where(size == 0, p.shape[1] + 1, size).astype(np.float64),
         "logit": peak,
-        "logit, smoothed": top.copy(),
+        "known score, smoothed": np.array(known, dtype=np.float64),
         "energy": energy,
     }
 

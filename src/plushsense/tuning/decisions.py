@@ -21,7 +21,7 @@ from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import ONE
-from plushsense.runtime.fixed import Ints, integer_logits, smoothing_weight, softmax
+from plushsense.runtime.fixed import Ints, integer_logits, known_score, smoothing_weight, softmax
 from plushsense.runtime.health import MOST_MS, HealthSettings
 from plushsense.runtime.trace import TraceReplayer, trace_of
 from plushsense.scoring.events import ErrorCosts
@@ -148,12 +148,12 @@ MOST_SEARCHED_S = 3600.0
 class LabelledSteps:
     """Steps (or windows) with known classes, (n,) each.
 
-    ``shares`` (n, K): probabilities in steps of 2^-15; ``highest``: highest logit in steps of 1/256 (both smoothed);
+    ``shares`` (n, K): probabilities in steps of 2^-15; ``known``: known score in steps of 1/256 (both smoothed);
     ``truth``: class index.
     """
 
     shares: Ints
-    highest: Ints
+    known: Ints
     truth: Ints
     person: NDArray[np.str_]
     recording: Ints
@@ -187,7 +187,7 @@ def fit_decisions(
       labelled steps (least ambiguous sets: Sadinle, Lei and Wasserman 2019), with equal
       weights of people and of their recordings; the finite-sample correction counts recordings, because the steps of
       one recording are not independent.
-    - ``known``: the smoothed highest logit that ``known_share`` of the same steps reach.
+    - ``known_margin``: the smoothed known score that ``known_share`` of the same steps reach, without idle gestures.
     - Gate: thresholds for a rate of false alarms on the streams of all people (`gate.fit_gate`).
     - Health: limits with which no sensor of these people is at fault.
 
@@ -226,8 +226,9 @@ def fit_decisions(
         "simulated": dataset.head.simulated,
     }
     if streams:
-        if "known" not in keep:
-            spec = replace(spec, known=known_threshold(labelled_steps(bundle, streams, spec), known_share))
+        if "known_margin" not in keep:
+            labelled = labelled_steps(bundle, streams, spec)
+            spec = replace(spec, known_margin=known_threshold(labelled, bundle.gestures, known_share))
         costs = ErrorCosts()
         if dataset.head.simulated or dataset.layout.is_labelled:
             # Nobody practises there between the marked gestures, so every event outside of them is false.
@@ -246,8 +247,8 @@ def fit_decisions(
         labelled = labelled_windows(bundle, dataset, people)
         report["events"] = {"on": "nothing: nobody who was held back has a stream", "moved": {}}
     if len(labelled.truth):
-        if "known" not in keep:
-            spec = replace(spec, known=known_threshold(labelled, known_share))
+        if "known_margin" not in keep:
+            spec = replace(spec, known_margin=known_threshold(labelled, bundle.gestures, known_share))
         if "sure" not in keep:
             spec = replace(spec, sure=sure_threshold(labelled, coverage))
         report["answers"] = _answers(labelled, spec, coverage, known_share, bool(streams))
@@ -337,7 +338,7 @@ def labelled_steps(bundle: Bundle, streams: Sequence[MarkedStream], spec: Decide
     """Return the steps in the second half of each recording of a known gesture, smoothed according to ``spec``."""
     weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
     shares = [np.zeros((0, len(bundle.gestures)), dtype=np.int64)]
-    highest = [_ints(())]
+    known = [_ints(())]
     truth: list[int] = []
     person: list[str] = []
     recording: list[int] = []
@@ -352,13 +353,13 @@ def labelled_steps(bundle: Bundle, streams: Sequence[MarkedStream], spec: Decide
             for part, at in zip(parts, times, strict=True):
                 selected = (at >= (t.start_us + t.stop_us) // 2) & (at <= t.stop_us)
                 shares.append(part.shares[selected])
-                highest.append(part.highest[selected])
+                known.append(part.known[selected])
                 n = int(selected.sum())
                 truth += [t.gesture] * n
                 person += [h.person] * n
                 recording += [number] * n
     return LabelledSteps(
-        np.concatenate(shares), np.concatenate(highest), _ints(truth), np.array(person, dtype=np.str_), _ints(recording)
+        np.concatenate(shares), np.concatenate(known), _ints(truth), np.array(person, dtype=np.str_), _ints(recording)
     )
 
 
@@ -376,7 +377,8 @@ def labelled_windows(bundle: Bundle, dataset: Dataset, subjects: Iterable[str]) 
         return LabelledSteps(empty, _ints(()), _ints(()), np.zeros(0, dtype=np.str_), _ints(()))
     logits = integer_logits(bundle.network().forward(bundle.scaler.apply(windows.x)))
     shares = np.array([softmax(row) for row in logits], dtype=np.int64)
-    return LabelledSteps(shares, logits.max(axis=1), windows.y, windows.subject, windows.recording)
+    known = known_score(logits, np.array([g.idle for g in bundle.gestures.gestures]))
+    return LabelledSteps(shares, known, windows.y, windows.subject, windows.recording)
 
 
 def _ints(values: Sequence[int]) -> Ints:
@@ -411,9 +413,14 @@ def sure_threshold(labelled: LabelledSteps, coverage: float) -> float:
     return _threshold(labelled.of_truth, labelled, coverage) / ONE
 
 
-def known_threshold(labelled: LabelledSteps, share: float) -> float | None:
-    """Return the smoothed highest logit that a share of the labelled steps reach; None without steps."""
-    return _threshold(labelled.highest, labelled, share) / 256 if len(labelled.truth) else None
+def known_threshold(labelled: LabelledSteps, gestures: GestureSet, share: float) -> float | None:
+    """Return the smoothed known score, in logits, that a share of the steps reach in gestures that are not idle.
+
+    It is None without such steps.
+    """
+    idle = np.array([g.idle for g in gestures.gestures])
+    active = labelled.take(~idle[labelled.truth])
+    return _threshold(active.known, active, share) / 256 if len(active.truth) else None
 
 
 def left_out_coverage(labelled: LabelledSteps, coverage: float) -> list[float]:

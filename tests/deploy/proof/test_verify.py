@@ -107,7 +107,7 @@ def test_a_last_layer_that_was_adapted_and_rules_that_were_fitted(c_compiler: st
     spec = DecideSpec(
         enter=0.2,
         leave=0.1,
-        known=-1.0,
+        known_margin=1.0,
         gate=GateSettings((Signal(JERK, (1, 4, 10), lag=2, floor=20),), (blow,)),
         health=HealthSettings((-1500,) * 13, (30_000,) * 13, still_ms=400),
     )

@@ -916,7 +916,30 @@ static int32_t smoothed(const plush_toy *toy, int32_t mean, int32_t now)
     return toy->started ? mean + high * 2 * toy->smoothing + (int32_t)((low * toy->smoothing + 16384u) >> 15) : now;
 }
 
-/* Smoothed probabilities, and with them how known the touch looks. Returns the best class. */
+/* How clearly the best gesture stands out: its logit less the third highest. Idle classes are left out. */
+static int32_t known_score(const plush_toy *toy)
+{
+    int32_t first = -LOGIT_LIMIT, second = -LOGIT_LIMIT, third = -LOGIT_LIMIT;
+    uint32_t k;
+
+    for (k = 0; k < toy->classes; k++) {
+        int32_t logit = is_idle(toy, k) ? -LOGIT_LIMIT : toy->logits[k];
+
+        if (logit > first) {
+            third = second;
+            second = first;
+            first = logit;
+        } else if (logit > second) {
+            third = second;
+            second = logit;
+        } else if (logit > third) {
+            third = logit;
+        }
+    }
+    return within(first - third, 0, LOGIT_LIMIT);
+}
+
+/* Smoothed probabilities, and with them the known score. Returns the best class. */
 static uint32_t decide(plush_toy *toy)
 {
     int32_t highest = -LOGIT_LIMIT, *known = toy->smooth + toy->classes;
@@ -934,7 +957,7 @@ static uint32_t decide(plush_toy *toy)
         if (toy->smooth[k] > toy->smooth[best])
             best = k;
     }
-    *known = smoothed(toy, *known, highest * 4096);
+    *known = smoothed(toy, *known, known_score(toy) * 4096);
     toy->started = 1;
     toy->answer.gesture = (uint8_t)best;
     toy->answer.affect = (plush_affect)affect_of(toy, best);
@@ -978,10 +1001,10 @@ static plush_kind kind_of(const plush_toy *toy, uint32_t best)
 {
     uint32_t sure = setting(toy, SURE), members = 0, affects = 0, k;
 
-    if (toy->answer.known < known_least(toy->event_plan))
-        return PLUSH_UNKNOWN;
     if (is_idle(toy, best))
         return PLUSH_IDLE;
+    if (toy->answer.known < known_least(toy->event_plan))
+        return PLUSH_UNKNOWN;
     for (k = 0; k < toy->classes; k++)
         if (share_of(toy, k) >= sure) {
             members++;

@@ -34,7 +34,7 @@
 extern "C" {
 #endif
 
-#define PLUSH_IMAGE_VERSION 3
+#define PLUSH_IMAGE_VERSION 4
 #define PLUSH_MAX_LAYERS 4
 #define PLUSH_ONE 32768 /* a confidence or probability of 1 */
 #define PLUSH_NO_GESTURE 255
@@ -99,7 +99,7 @@ typedef struct {
     plush_affect affect;
     uint16_t confidence; /* smoothed probability of the gesture, in steps of 1/32768 */
     plush_kind kind;
-    int16_t known;       /* how known the touch looks: the highest logit, smoothed, in steps of 1/256 */
+    int16_t known;       /* how clearly a gesture stands out: its logit less the third highest, smoothed, in steps of 1/256 */
 } plush_answer;
 
 /* One layer of the network. */

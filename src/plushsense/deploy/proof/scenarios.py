@@ -30,7 +30,7 @@ from plushsense.deploy.golden import (
 )
 from plushsense.runtime.decisions import Rules
 from plushsense.runtime.events import ANSWERS, BEGUN, ENDED, GATE, KINDS, NO_GESTURE, ONE, SOURCES, EventSettings
-from plushsense.runtime.fixed import LOGIT_LIMIT, PROBABILITY_BITS, Ints, LogitScale, split_ratio
+from plushsense.runtime.fixed import LOGIT_LIMIT, PROBABILITY_BITS, Ints, LogitScale, known_score, split_ratio
 from plushsense.runtime.gate import JERK, LEVEL, Gate, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel
@@ -186,7 +186,7 @@ def _gestures(model: IntegerModel, settings: _ScenarioSettings) -> GestureSet:
 class _NormalizedModel:
     """A model with a new last layer, so that the logits (n, K) of all classes have mean 0 and the same spread.
 
-    ``shares`` (n,) are the probabilities of the best class, ``known`` (n,) its logits.
+    ``shares`` (n,) are the probabilities of the best class, ``known`` (n,) the known scores.
     """
 
     def __init__(self, model: IntegerModel, logits: NDArray[np.float64]) -> None:
@@ -206,8 +206,8 @@ class _NormalizedModel:
         except BundleError:  # a sum could leave 32 bits
             self.model = model
         logits = np.clip(logits, -LOGIT_LIMIT, LOGIT_LIMIT)
-        self.known = logits.max(axis=1)
-        self.shares = ONE / np.exp((logits - self.known[:, None]) / 256).sum(axis=1)
+        self.known = known_score(np.rint(logits).astype(np.int64), np.array([g.idle for g in model.gestures.gestures]))
+        self.shares = ONE / np.exp((logits - logits.max(axis=1, keepdims=True)) / 256).sum(axis=1)
 
 
 def _events(level: _NormalizedModel, settings: _ScenarioSettings, rng: np.random.Generator) -> EventSettings:
