@@ -14,7 +14,7 @@ from plushsense.core.errors import ConfigError, DatasetError, DeviceError, Plush
 from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.recording.recorder import SessionRequest
 from plushsense.recording.session import OpenSession
-from plushsense.recording.session_files import read_events
+from plushsense.recording.session_files import SessionHead, read_events
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.record.controller import NO_CONSENT, PSEUDO, ActiveSession, RecordController
 from support.recording_pages import CALM, until
@@ -118,6 +118,42 @@ def test_a_command_counts_once(controller: RecordController, tmp_path: Path) -> 
     assert press(session, "p")
     assert press(session, "s")
     assert [e.kind for e in read_events(tmp_path / "recordings" / "S01" / "1")].count("countdown") <= 1
+
+
+def test_a_session_is_finished_renamed_and_discarded_only_when_it_is_closed(
+    controller: RecordController, tmp_path: Path
+) -> None:
+    session = controller.begin(QUICK)
+    for change in (
+        lambda: controller.finish("S01/1"),
+        lambda: controller.rename_person("S01/1", "S02"),
+        lambda: controller.discard("S01/1"),
+    ):
+        with pytest.raises(ConfigError, match="is being recorded: end it first"):
+            change()
+    take(session)
+    controller.close_session("S01/1")
+    controller.finish("S01/1")
+    with pytest.raises(ConfigError, match="is finished"):
+        controller.resume("S01/1")
+    controller.finish("S01/1", finished=False)
+    assert not controller.sessions()[0].finished
+    with pytest.raises(DatasetError, match="no code for a person"):
+        controller.rename_person("S01/1", "Anna")
+    controller.close_session(controller.begin(SessionRequest(CALM, "S02", "quick", speed=SPEED)).name)
+    assert controller.rename_person("S01/1", "S01") == "S01/1"
+    assert controller.rename_person("S01/1", "S02") == "S02/2"
+    head = SessionHead.read(tmp_path / "recordings/S02/2")
+    assert head is not None and (head.subject, head.session) == ("S02", "2")
+    assert [e.details for e in read_events(tmp_path / "recordings/S02/2") if e.kind == "renamed"] == [
+        {"subject": "S01", "session": "1"}
+    ]
+    assert len(take_files := list((tmp_path / "recordings/S02/2").glob("*_*_*.csv"))) == 1
+    discarded = controller.discard("S02/2")
+    assert (discarded / take_files[0].name).is_file()
+    assert [s.name for s in controller.sessions()] == ["S02/1"]
+    with pytest.raises(ConfigError, match="no session"):
+        controller.finish("S02/2")
 
 
 def test_two_tabs_begin_one_session(controller: RecordController) -> None:

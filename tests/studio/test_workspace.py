@@ -12,6 +12,9 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import ConfigError
+from plushsense.core.gestures import load_gestures
+from plushsense.core.layouts import load_layout
+from plushsense.dataset.store import DatasetHead
 from plushsense.studio.app.workspace import BUNDLES, DATASETS, EXPORTS, ChangeSignal, Workspace
 
 ODD = [
@@ -151,6 +154,62 @@ def test_parts_are_made_once_and_closed_in_turn(workspace: Workspace) -> None:
     workspace.close()
     assert closed == ["second", "first"]
     assert workspace.part(First) is not first
+
+
+def made_dataset(workspace: Workspace, name: str, layout: str = "accel-3", simulated: bool = False) -> Path:
+    """A data set without recordings."""
+    path = workspace.folder / "datasets" / name
+    path.mkdir(parents=True)
+    head = DatasetHead(name, load_layout(layout), load_gestures("plush-18"), simulated=simulated)
+    (path / "dataset.toml").write_text(head.to_toml(), encoding="utf-8")
+    (path / "recordings.csv").write_text("", encoding="utf-8")
+    return path
+
+
+def test_what_is_discarded_can_be_restored_or_deleted(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path)
+    first = made_dataset(workspace, "spring")
+    discarded = workspace.discard(first)
+    assert not first.exists() and workspace.discarded() == [discarded] and workspace.datasets() == []
+    # Another one of this name: neither replaces the other.
+    again = workspace.discard(made_dataset(workspace, "spring", simulated=True))
+    assert sorted(workspace.discarded()) == sorted([discarded, again])
+    assert workspace.restore(again) == first and DatasetHead.read(first).simulated
+    with pytest.raises(ConfigError, match="exists again"):
+        workspace.restore(discarded)
+    with pytest.raises(ConfigError, match="is not discarded"):
+        workspace.delete(first)
+    with pytest.raises(ConfigError, match="is not discarded"):
+        workspace.restore(tmp_path / "discarded" / "datasets" / ".." / ".." / "datasets" / "spring")
+    workspace.delete(discarded)
+    assert workspace.discarded() == []
+    given = Workspace(tmp_path / "other", given=(first,))
+    with pytest.raises(ConfigError, match="lies outside the studio's folder"):
+        given.discard(first)
+
+
+def test_a_data_set_changes_its_name_and_keeps_its_folder(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path)
+    path, other = made_dataset(workspace, "spring"), made_dataset(workspace, "autumn")
+    assert workspace.rename(path, "Spring 2026") == path
+    assert workspace.title(path) == "Spring 2026"
+    with pytest.raises(ConfigError, match="Another data set is called 'autumn'"):
+        workspace.rename(path, "autumn")
+    for name in ("", "a/b", "..", "x" * 65):
+        with pytest.raises(ConfigError, match="cannot be a name"):
+            workspace.rename(other, name)
+
+
+def test_recordings_go_into_the_last_changed_data_set_of_their_layout(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path)
+    assert workspace.dataset_for("accel-3", False) == tmp_path / "datasets" / "recordings"
+    old, new = made_dataset(workspace, "old"), made_dataset(workspace, "new")
+    made_dataset(workspace, "simulated", simulated=True)
+    os.utime(old / "recordings.csv", (1e9, 1e9))
+    assert workspace.dataset_for("accel-3", False) == new
+    os.utime(new / "recordings.csv", (1e8, 1e8))
+    assert workspace.dataset_for("accel-3", False) == old
+    assert workspace.dataset_for("plush-15", False) == tmp_path / "datasets" / "recordings"
 
 
 def test_many_rings_are_heard_as_one_and_none_after_the_end() -> None:

@@ -216,9 +216,13 @@ def mark_finished(folder: Path, finished: bool = True) -> None:
 def change_subject(folder: Path, code: str) -> Path:
     """Give the session in ``folder`` to the person ``code``, and return its new folder.
 
+    It keeps its name, or gets a number if the person has a session of that name.
+
     Raises:
         DatasetError: for an invalid code, or if another program uses the session.
     """
+    if code == folder.parent.name:
+        return folder
     person = folder.parent.parent / check_subject(code)
     with contextlib.closing(OpenSession(folder)) as session:
         place = person / (folder.name if not (person / folder.name).exists() else new_session(person))
