@@ -69,6 +69,7 @@ def test_confidences_by_hand():
     assert found["set size"].tolist() == [-2, -1]
     assert found["logit"] == pytest.approx(np.log([2, 6]))
     assert found["known score, smoothed"].tolist() == [7, 8]
+    assert found["known score"] == pytest.approx(np.log([2, 6]))
     assert found["energy"] == pytest.approx(np.log([4, 10]))
     empty = confidences(logits, [[0.5, 0.3, 0.2], [0.2, 0.1, 0.7]], [7.0, 8.0], 0.6)
     assert empty["set size"].tolist() == [-4, -1]

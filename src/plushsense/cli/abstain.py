@@ -70,7 +70,7 @@ def lines(result: dict[str, Any]) -> list[str]:
     return out
 
 
-_SHOWN = ("softmax, smoothed", "logit", "known score, smoothed", "energy", "relative Mahalanobis")
+_SHOWN = ("softmax, smoothed", "logit", "known score", "energy", "relative Mahalanobis")
 
 
 def _unknown(rows: dict[str, Any]) -> list[str]:

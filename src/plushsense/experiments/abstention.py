@@ -79,13 +79,13 @@ def last_answers(
 
     Returns:
         ``logits`` (n, K) of the last step; smoothed ``shares`` (n, K), the probabilities of the network's K classes;
-        ``score`` (n,), the smoothed known score, and ``typical`` (n,), both the mean over the steps in the second half
-        of the recording; ``label`` (n,), the true gesture, which need not be one of the network's classes; ``person``
+        ``score`` (n,), the smoothed known score; ``typical`` (n,), the mean score of the steps in the second half of
+        the recording; ``label`` (n,), the true gesture, which need not be one of the network's classes; ``person``
         (n,).
     """
     network, arch = bundle.network(), bundle.arch
     weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
-    rows: list[tuple[NDArray[Any], NDArray[Any], float, str, str, float]] = []
+    rows: list[tuple[NDArray[Any], NDArray[Any], Any, str, str, float]] = []
     for stream in marked_streams(bundle, dataset, subjects, spec, gestures):
         smoothed = TraceReplayer(stream.trace).smoothed(weight)
         for truth in stream.truths:
@@ -101,8 +101,7 @@ def last_answers(
                     windows = [part.inputs[s * arch.step : s * arch.step + arch.span].T for s in steps]
                     features = network.features(bundle.scaler.apply(np.stack(windows)))
                     score = float(typical.scores(features).mean())
-                    known = float(after.known[steps.start : steps.stop].mean())
-                    rows.append((part.logits[at], after.shares[at], known, label, stream.person, score))
+                    rows.append((part.logits[at], after.shares[at], after.known[at], label, stream.person, score))
     k = len(bundle.gestures)
     return {
         "logits": np.array([r[0] for r in rows], dtype=np.float64).reshape(len(rows), k) / 256,
@@ -284,6 +283,7 @@ _STYLES = (
     ("#56b4e9", "--"),
     ("#000000", "-."),
     ("#999999", "--"),
+    ("#8a8a00", "-."),
 )
 
 
@@ -319,7 +319,7 @@ def curves(measured: Mapping[str, RiskCoverage], *, title: str = "") -> Figure:
 
 
 # Increase it when the meaning of a stored fold changes, also when the default smoothing does.
-_VERSION = 3
+_VERSION = 4
 FIGURE, TABLE = "risk-coverage.png", "abstaining.json"
 
 

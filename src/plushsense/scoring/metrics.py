@@ -39,6 +39,7 @@ def confidences(logits: ArrayLike, smoothed: ArrayLike, known: ArrayLike, sure: 
         "margin, smoothed": two[:, 1] - two[:, 0],
         "set size": -np.where(size == 0, p.shape[1] + 1, size).astype(np.float64),
         "logit": peak,
+        "known score": peak - np.sort(z, axis=1)[:, -min(3, z.shape[1])],
         "known score, smoothed": np.array(known, dtype=np.float64),
         "energy": energy,
     }

@@ -106,6 +106,12 @@ def ask(words: Words, title: str, go: str, answer: Callable[[str], Any], label: 
     dialog.open()
 
 
+def summary(text: str) -> None:
+    """Add the heading of a collapsible part of the page, which stays visible when the part is folded."""
+    style = "display: list-item; list-style-position: inside; cursor: pointer; font-weight: 600"
+    html(text, "summary").style(style)
+
+
 def verdict(good: bool | None, word: str) -> Markup:
     """Render a verdict as a sign and ``word``, in the colour for ``good``; None means unknown."""
     kind, sign = {True: ("good", "✓"), False: ("bad", "✗"), None: ("none", "–")}[good]

@@ -13,7 +13,7 @@ from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, St
 from plushsense.studio.app.shell import Page, address, button, html, moment, named, on_page, tag
 from plushsense.studio.app.workspace import DATASETS, DISCARDED
 from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
-from plushsense.studio.widgets.elements import ask, item_menu
+from plushsense.studio.widgets.elements import ask, item_menu, summary
 
 SMALL = 'outline padding="4px 12px"'
 """Quasar properties of the buttons inside rows of a list."""
@@ -100,7 +100,7 @@ class DiscardedSection:
     def __init__(self, page: Page, actions: FileActions) -> None:
         self._page, self._actions = page, actions
         with tag(ui.element("details").classes("ps-card w-full"), "discarded") as self._box:
-            html(page.words("home.discarded"), "summary").style("cursor: pointer; font-weight: 600")
+            summary(page.words("home.discarded"))
             self._rows = ui.column().classes("w-full ps-small-gap")
 
     def fill(self, paths: Sequence[Path]) -> None:

@@ -15,8 +15,8 @@ from plushsense.recording.session import SessionSummary
 from plushsense.studio.app.shell import Page, address, button, html, named, query, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
-from plushsense.studio.pages.record.session import collect, show_session, summary
-from plushsense.studio.widgets.elements import ask, item_menu
+from plushsense.studio.pages.record.session import collect, show_session
+from plushsense.studio.widgets.elements import ask, item_menu, summary
 
 _LISTED = 8
 _SCAN_S = 3.0

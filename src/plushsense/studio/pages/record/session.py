@@ -20,7 +20,7 @@ from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import LINES, Keys, Page, address, button, focus, html, named, on_change, on_click, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
-from plushsense.studio.widgets.elements import Plot, own_picture, picture
+from plushsense.studio.widgets.elements import Plot, own_picture, picture, summary
 
 _WINDOW_S = 10.0
 # Figures that change faster cannot be read.
@@ -41,12 +41,6 @@ def percent(share: float, words: Words) -> str:
     """Format a share (0 to 1) in per cent, with one decimal place if it is below ten per cent."""
     text = words.number(100 * share, 1 if share < 0.1 else 0)
     return text.removesuffix(f"{words('shell.decimal_point')}0")
-
-
-def summary(text: str) -> None:
-    """Add the heading of a collapsible part of the page, which stays visible when the part is folded."""
-    style = "display: list-item; list-style-position: inside; cursor: pointer; font-weight: 600"
-    html(text, "summary").style(style)
 
 
 class SignalPanel:
