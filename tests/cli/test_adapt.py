@@ -171,14 +171,19 @@ def test_forget_names_a_bundle_that_was_adapted_to_the_person(
 def test_forget_names_the_corrections_that_the_studio_keeps(cli: Cli, stranger: Path, tmp_path: Path) -> None:
     made = import_recordings(stranger, tmp_path / "home" / "datasets" / "DS", layout="accel-3").dataset
     files = [tmp_path / home / "feedback" / "S99.jsonl" for home in ("home", "other")]
+    discarded = [tmp_path / "home" / "discarded" / p / "S99" for p in ("datasets/old/recordings", "recordings")]
+    for folder in discarded:
+        folder.mkdir(parents=True)
     for file in files:
         file.parent.mkdir(parents=True)
         file.write_text("{}\n", encoding="utf-8")
         file.with_name("S98.jsonl").write_text("{}\n", encoding="utf-8")
     ran = cli("forget", made.path, "S99", "--bundles", tmp_path / "other", "--json")
     assert ran.json["feedback"] == [str(file) for file in files]
+    assert ran.json["discarded"] == [str(folder) for folder in discarded]
     ran = cli("forget", made.path, "S99")
     assert f"corrections of this code, delete them: {files[0]}" in ran.out
+    assert f"discarded recordings of this code, delete them: {discarded[0]}" in ran.out
 
 
 def test_people_left_out(cli: Cli, make_session: Make, tmp_path: Path) -> None:

@@ -88,6 +88,7 @@ def _removal_lines(result: Forgotten) -> list[str]:
     lines += [f"still contains the code, check it: {path}" for path in plan.mentions]
     lines += [f"bundle: {b.bundle}: {b.message}" for b in result.bundles]
     lines += [f"corrections of this code, delete them: {path}" for path in result.feedback]
+    lines += [f"discarded recordings of this code, delete them: {path}" for path in result.discarded]
     if plan.published:
         lines.append(f"published as https://doi.org/{plan.published}: publish a new version without them")
     lines.append(

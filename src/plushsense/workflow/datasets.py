@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import html
 import os
 import secrets
@@ -255,7 +256,8 @@ class TrainedOn:
 class Forgotten:
     """The files that were removed from a data set (``done``) or would be, and what else holds the person's data.
 
-    ``bundles`` were trained on the person; ``feedback`` are files of the studio with corrections of this code.
+    ``bundles`` were trained on the person; ``feedback`` are files of the studio with corrections of this code, and
+    ``discarded`` folders of recordings that were discarded there.
     """
 
     plan: RemovalPlan
@@ -263,6 +265,7 @@ class Forgotten:
     done: bool
     dataset: str
     feedback: list[str] = field(default_factory=list)
+    discarded: list[str] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -272,6 +275,7 @@ class Forgotten:
             **self.plan.to_dict(),
             "bundles": [vars(b) for b in self.bundles],
             "feedback": self.feedback,
+            "discarded": self.discarded,
         }
 
 
@@ -285,9 +289,9 @@ def forget(
     """Remove a person from a data set permanently; without ``confirm``, only list what would be removed.
 
     Args:
-        bundles: folders or files to search for models trained on the person and for corrections of the person, besides
-            the data set's folder and the studio's folder that it lies in. They are only listed; the user must train the
-            models again, and delete the old ones and the corrections.
+        bundles: folders or files to search for models trained on the person, for corrections of the person and for
+            recordings discarded in the studio, besides the data set's folder and the studio's folder that it lies in.
+            They are only listed; the user must train the models again, and delete the old ones and the rest.
 
     Raises:
         DatasetError: when the person is not in the data set.
@@ -296,11 +300,14 @@ def forget(
     plan = plan_removal(folder, subject)
     places = [folder, *map(Path, bundles)]
     trained = trained_on(folder, subject, places)
-    kept = {place.resolve() / FOLDER / f"{subject}.jsonl" for place in [*places, folder.resolve().parent.parent]}
-    feedback = sorted(str(path) for path in kept if path.is_file())
+    homes = {place.resolve() for place in [*places, folder.resolve().parent.parent]}
+    feedback = sorted(str(p) for home in homes if (p := home / FOLDER / f"{subject}.jsonl").is_file())
+    code = glob.escape(subject)
+    patterns = (f"recordings/{code}", f"datasets/*/recordings/{code}")
+    discarded = sorted(str(p) for home in homes for pattern in patterns for p in (home / "discarded").glob(pattern))
     if confirm:
         plan = remove_person(folder, subject)
-    return Forgotten(plan, trained, confirm, str(folder), feedback)
+    return Forgotten(plan, trained, confirm, str(folder), feedback, discarded)
 
 
 def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[TrainedOn]:
