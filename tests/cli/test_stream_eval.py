@@ -161,7 +161,7 @@ def test_every_system_on_people_left_out(cli: Cli, dataset: Dataset, tmp_path: P
     ]  # fmt: skip
     assert json.loads((out / "streams.json").read_text(encoding="utf-8"))["systems"].keys() == SYSTEMS.keys()
     rows = list(csv.DictReader(io.StringIO((out / "streams.csv").read_text(encoding="utf-8"))))
-    assert {r["point"] for r in rows} == {"curve", "plain", "balanced", "prompt", "cheapest"}
+    assert {r["point"] for r in rows} == {"curve", "plain", "balanced", "prompt", "quiet", "cheapest"}
     assert {r["simulated"] for r in rows} == {"no"}
     page = (out / "streams.html").read_text(encoding="utf-8")
     assert "upper bound" in page and "Ward" in page and "http" not in page.replace("http-equiv", "")

@@ -55,7 +55,7 @@ def _home(page: Any, studio: Studio) -> None:
         marked(page, "virtual").click()
         marked(page, "chosen").wait_for()
     if not marked(page, "job-done").count():
-        marked(page, "dataset").get_by_role("button").click()
+        marked(page, "check").click()
     marked(page, "job-done").first.wait_for(timeout=90_000)
     marked(page, "test").click()
     page.locator(".ps-message-good").wait_for()

@@ -90,8 +90,8 @@ class FileActions:
             if undo is not None:
                 back, done = undo, self._page.words("shell.undone")
                 again = lambda: self.change(lambda: back(result), done)  # noqa: E731
-            self._page.say(message, "good", again)
             await self._refresh()
+            self._page.say(message, "good", again)
 
 
 class DiscardedSection:
@@ -174,7 +174,7 @@ class DatasetSection:
             with ui.row().classes("items-center ps-small-gap"):
                 page_links(page, ("review", "train", "publish"), entry.name, dataset=entry.path)
                 if not any(j.state == RUNNING for j in checks):
-                    button("", words("home.check"), lambda: self._check(entry), SMALL, about=entry.name)
+                    button("check", words("home.check"), lambda: self._check(entry), SMALL, about=entry.name)
 
     def _check(self, entry: DatasetEntry) -> None:
         with self._page.show_errors():

@@ -182,8 +182,8 @@ class _SessionLists:
             if undo is not None:
                 back, done = undo, self._page.words("shell.undone")
                 again = lambda: self._change(lambda: back(result), done, None)  # noqa: E731
-            self._page.say(message, "good", again)
             self.fill(await run.io_bound(self._controller.sessions) or [])
+            self._page.say(message, "good", again)
 
 
 async def _open_session(page: Page, begin: ui.button, work: Callable[[], ActiveSession]) -> None:
