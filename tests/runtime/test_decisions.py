@@ -20,5 +20,6 @@ def test_settings_come_back_and_an_unknown_one_names_the_nearest():
     spec = DecideSpec(smoothing_s=0.7)
     assert DecideSpec.from_dict(spec.to_dict()) == spec
     assert DecideSpec.from_dict({}) == DecideSpec()
+    assert DecideSpec.from_dict({"known": 5.3}) == DecideSpec(), "of a bundle of an earlier version"
     with pytest.raises(ConfigError, match="smoothing_s"):
         DecideSpec.from_dict({"smoothing": 0.7})

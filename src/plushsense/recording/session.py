@@ -224,12 +224,13 @@ def change_subject(folder: Path, code: str) -> Path:
     if code == folder.parent.name:
         return folder
     person = folder.parent.parent / check_subject(code)
-    with contextlib.closing(OpenSession(folder)) as session:
-        place = person / (folder.name if not (person / folder.name).exists() else new_session(person))
-        person.mkdir(parents=True, exist_ok=True)
-        replace(session.head, subject=code, session=place.name).write(folder)
-        session.log.write([new_event("renamed", subject=session.head.subject, session=session.head.session)])
+    OpenSession(folder).close()  # refuses if another program uses it
+    place = person / (folder.name if not (person / folder.name).exists() else new_session(person))
+    person.mkdir(parents=True, exist_ok=True)
     folder.rename(place)
+    with contextlib.closing(OpenSession(place)) as session:
+        session.log.write([new_event("renamed", subject=session.head.subject, session=session.head.session)])
+        replace(session.head, subject=code, session=place.name).write(place)
     with contextlib.suppress(OSError):
         folder.parent.rmdir()
     return place

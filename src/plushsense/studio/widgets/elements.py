@@ -106,6 +106,31 @@ def ask(words: Words, title: str, go: str, answer: Callable[[str], Any], label: 
     dialog.open()
 
 
+async def change_files(
+    page: Page,
+    work: Callable[[], Any],
+    message: str,
+    refresh: Callable[[], Awaitable[None]],
+    undo: Callable[[Any], Any] | None = None,
+) -> None:
+    """Call ``work`` in a thread, show the files again, and show ``message``, with a button to undo the change.
+
+    Args:
+        refresh: shows the files again.
+        undo: called with the result of ``work`` if the button is clicked; without it there is no button.
+    """
+    with page.show_errors():
+        result = await run.io_bound(work)
+        await refresh()
+
+        async def take_back() -> None:
+            assert undo is not None
+            back = undo
+            await change_files(page, lambda: back(result), page.words("shell.undone"), refresh)
+
+        page.say(message, "good", None if undo is None else take_back)
+
+
 def summary(text: str) -> None:
     """Add the heading of a collapsible part of the page, which stays visible when the part is folded."""
     style = "display: list-item; list-style-position: inside; cursor: pointer; font-weight: 600"

@@ -7,13 +7,13 @@ from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from nicegui import run, ui
+from nicegui import ui
 
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, address, button, html, moment, named, on_page, tag
 from plushsense.studio.app.workspace import DATASETS, DISCARDED
 from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
-from plushsense.studio.widgets.elements import ask, item_menu, summary
+from plushsense.studio.widgets.elements import ask, change_files, item_menu, summary
 
 SMALL = 'outline padding="4px 12px"'
 """Quasar properties of the buttons inside rows of a list."""
@@ -83,15 +83,8 @@ class FileActions:
         item_menu(words, name, {words("home.rename"): ask_name, words("shell.discard"): discard})
 
     async def change(self, work: Callable[[], Any], message: str, undo: Callable[[Any], Any] | None = None) -> None:
-        """Change files, say so with a button that calls ``undo`` with the result, and show the files again."""
-        with self._page.show_errors():
-            result = await run.io_bound(work)
-            again = None
-            if undo is not None:
-                back, done = undo, self._page.words("shell.undone")
-                again = lambda: self.change(lambda: back(result), done)  # noqa: E731
-            await self._refresh()
-            self._page.say(message, "good", again)
+        """Change files as `change_files` does."""
+        await change_files(self._page, work, message, self._refresh, undo)
 
 
 class DiscardedSection:

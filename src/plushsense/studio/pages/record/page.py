@@ -16,7 +16,7 @@ from plushsense.studio.app.shell import Page, address, button, html, named, quer
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.session import collect, show_session
-from plushsense.studio.widgets.elements import ask, item_menu, summary
+from plushsense.studio.widgets.elements import ask, change_files, item_menu, summary
 
 _LISTED = 8
 _SCAN_S = 3.0
@@ -174,16 +174,11 @@ class _SessionLists:
         }
         item_menu(words, name, actions)
 
-    async def _change(self, work: Callable[[], Any], message: str, undo: Callable[[Any], Any] | None) -> None:
-        """Change a session, say so with a button that calls ``undo`` with the result, and show the sessions again."""
-        with self._page.show_errors():
-            result = await run.io_bound(work)
-            again = None
-            if undo is not None:
-                back, done = undo, self._page.words("shell.undone")
-                again = lambda: self._change(lambda: back(result), done, None)  # noqa: E731
-            self.fill(await run.io_bound(self._controller.sessions) or [])
-            self._page.say(message, "good", again)
+    async def _change(self, work: Callable[[], Any], message: str, undo: Callable[[Any], Any]) -> None:
+        await change_files(self._page, work, message, self._refresh, undo)
+
+    async def _refresh(self) -> None:
+        self.fill(await run.io_bound(self._controller.sessions) or [])
 
 
 async def _open_session(page: Page, begin: ui.button, work: Callable[[], ActiveSession]) -> None:
