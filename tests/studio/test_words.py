@@ -6,12 +6,15 @@ import ast
 import re
 import string
 import tomllib
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from plushsense.core import errors
+from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import load_gestures
 from plushsense.studio.app.words import LANGUAGES, Words
 
@@ -51,8 +54,48 @@ def test_a_gesture_without_a_name_reads_as_its_label() -> None:
 
 
 def test_values_are_filled_in() -> None:
-    said = Words("en")("shell.system_refused", where=" 'x'", why="no room")
-    assert said == "The computer refused 'x': no room."
+    said = Words("en")("errors.system", where=" ('x')", why="no room")
+    assert said == "The computer refused: no room ('x')."
+
+
+def test_an_error_is_worded_in_the_language_of_the_page() -> None:
+    known = ConfigError("'a' exists already.", reason="name_exists", name="a")
+    assert Words("en").error(known).startswith("“a” exists already")
+    assert Words("lv").error(known).startswith("“a” jau ir")
+    other = ConfigError("Use --subject.")
+    assert Words("en").error(other) == "Use --subject."
+    assert Words("lv").error(other) == "Tas neizdevās. Programmas ziņa angliski: Use --subject."
+
+
+def raised() -> Iterator[tuple[str, ast.Call]]:
+    """Yield every error that the source raises or makes, with its place."""
+    package = Path(str(resources.files("plushsense")))
+    for module in sorted(package.rglob("*.py")):
+        for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+            name = getattr(node.func, "id", getattr(node.func, "attr", "")) if isinstance(node, ast.Call) else ""
+            if isinstance(node, ast.Call) and isinstance(getattr(errors, name, None), type):
+                yield f"{module.relative_to(package).as_posix()}:{node.lineno}", node
+
+
+def test_every_reason_of_an_error_has_a_text_with_its_values() -> None:
+    reasons = 0
+    for place, call in raised():
+        given = {keyword.arg: keyword.value for keyword in call.keywords}
+        if not isinstance(reason := given.pop("reason", None), ast.Constant):
+            continue
+        reasons += 1
+        text = Words("en").get(f"errors.{reason.value}")
+        assert text, f"{place}: errors.{reason.value} has no text"
+        assert None in given or fields(text) <= set(given), place
+    assert reasons > 10
+
+
+def test_every_error_of_the_studio_has_a_reason() -> None:
+    """Otherwise a page in another language would quote an English sentence."""
+    # Errors of `serve` are printed in the terminal.
+    places = {place: {k.arg for k in call.keywords} for place, call in raised() if place.startswith("studio/app/")}
+    lacking = {place for place, given in places.items() if "reason" not in given and "/serve.py" not in place}
+    assert lacking == set()
 
 
 def constant_keys(module: Path) -> set[str]:

@@ -32,7 +32,17 @@ from types import ModuleType
 
 
 class PlushSenseError(Exception):
-    """An error of PlushSense, whose message is one sentence for the user."""
+    """An error of PlushSense, whose message is one sentence for the user.
+
+    Args:
+        message: the sentence.
+        reason: key of the sentence in other languages, "" for none; the studio has a text ``errors.<reason>`` for each.
+        values: values that are filled into that text.
+    """
+
+    def __init__(self, message: str = "", *, reason: str = "", **values: object) -> None:
+        super().__init__(message)
+        self.reason, self.values = reason, values
 
 
 class BadInput(PlushSenseError):

@@ -2,7 +2,8 @@
 
 The worker reads one line of JSON, ``{"task": ..., "spec": {...}}``, from standard input. It writes lines of JSON to
 standard output: ``{"progress": {...}}``, ``{"warning": "..."}``, and finally ``{"result": {...}}`` or
-``{"refused": "..."}`` with an error message. A process that ends with neither of these was stopped.
+``{"refused": "...", "reason": "...", "values": {...}}`` for an error, see `plushsense.core.errors.PlushSenseError`. A
+process that ends with neither of these was stopped.
 """
 
 from __future__ import annotations
@@ -447,14 +448,17 @@ def main() -> int:
     except KeyboardInterrupt:
         return 1
     except PlushSenseError as refusal:
-        reporter.write(refused=str(refusal))
+        reporter.write(refused=str(refusal), reason=refusal.reason, values=refusal.values)
         return 2
     except OSError as cause:
         where = f" ({cause.filename})" if cause.filename else ""
-        reporter.write(refused=f"The computer refused: {cause.strerror or cause}{where}.")
+        values = {"where": where, "why": cause.strerror or str(cause)}
+        reporter.write(refused="The computer refused: {why}{where}.".format(**values), reason="system", values=values)
         return 2
     except Exception as cause:  # noqa: BLE001, RUF100
-        reporter.write(refused=f"The work broke off ({type(cause).__name__}: {cause}): what was finished is kept.")
+        what = f"{type(cause).__name__}: {cause}"
+        message = f"The work broke off ({what}): what was finished is kept."
+        reporter.write(refused=message, reason="broke_off", values={"what": what})
         return 2
     return 0
 

@@ -421,7 +421,7 @@ def path_in(workspace: Workspace, kind: str, name: str) -> Path:
     """
     place = workspace.inside(workspace.folder / kind / name)
     if place.parent != workspace.folder / kind or len(place.name.encode()) > _MAX_NAME:
-        raise ConfigError(f"'{name}' cannot be a name in '{workspace.folder / kind}'.")
+        raise ConfigError(f"'{name}' cannot be a name in '{workspace.folder / kind}'.", reason="name_bad", name=name)
     return place
 
 

@@ -39,8 +39,8 @@ class StudioJob:
         id: unique number as a string; later jobs have larger numbers.
         task: a key of `plushsense.studio.tasks.TASKS`.
         spec: the argument of the task, as JSON values.
-        state: `RUNNING`, `DONE`, `REFUSED` (``message`` is the reason) or `STOPPED` (by a person, or because the
-            process or the studio ended).
+        state: `RUNNING`, `DONE`, `REFUSED` (``message`` says why; ``reason`` and ``values`` are those of the error) or
+            `STOPPED` (by a person, or because the process or the studio ended).
         progress: the newest report of the task, as JSON values; ``reports`` has earlier ones too, thinned out if many.
         result: the value that the task returned.
         begun_s, ended_s: seconds since 1970.
@@ -56,6 +56,8 @@ class StudioJob:
     warnings: list[str] = field(default_factory=list)
     result: dict[str, Any] = field(default_factory=dict)
     message: str = ""
+    reason: str = ""
+    values: dict[str, Any] = field(default_factory=dict)
     begun_s: float = 0.0
     ended_s: float = 0.0
 
@@ -103,7 +105,8 @@ class Jobs:
         try:
             return self._jobs[identity]
         except KeyError:
-            raise ConfigError(f"There is no job '{identity}': it may have been removed.") from None
+            message = f"There is no job '{identity}': it may have been removed."
+            raise ConfigError(message, reason="job_gone") from None
 
     def start(self, task: str, spec: dict[str, Any], title: str) -> StudioJob:
         """Start a task in a separate process."""
@@ -120,7 +123,12 @@ class Jobs:
         """Raise ConfigError if a running job uses the data set or bundle ``path``."""
         for job in self.all():
             if job.state == RUNNING and str(path) in map(str, job.spec.values()):
-                raise ConfigError(f"'{job.title}' is running and uses '{path.name}': wait for it, or stop it first.")
+                raise ConfigError(
+                    f"'{job.title}' is running and uses '{path.name}': wait for it, or stop it first.",
+                    reason="in_use",
+                    job=job.title,
+                    name=path.name,
+                )
 
     def import_sessions(self, sessions: Iterable[Path], dest: Path, title: str) -> StudioJob:
         """Start to import recorded sessions into the data set ``dest``, which is created if it does not exist."""
@@ -139,6 +147,7 @@ class Jobs:
             if job.state == RUNNING:
                 return job
             job.state, job.message, job.result, job.reports, job.warnings = RUNNING, "", {}, [], []
+            job.reason, job.values = "", {}
         self._run(job)
         return job
 
@@ -151,7 +160,7 @@ class Jobs:
         job = self.get(identity)
         with self._lock:
             if job.state == RUNNING:
-                raise ConfigError(f"'{job.title}' is running: stop it first.")
+                raise ConfigError(f"'{job.title}' is running: stop it first.", reason="job_running", job=job.title)
             (self._folder / f"{job.id}.json").unlink(missing_ok=True)
             self._jobs.pop(job.id, None)
         self.changed.notify()
@@ -189,7 +198,9 @@ class Jobs:
             )
         except OSError as cause:
             where = cause.filename or self._folder
-            job.state, job.message = REFUSED, f"The work cannot begin: '{where}': {cause.strerror or cause}."
+            why = str(cause.strerror or cause)
+            job.state, job.message = REFUSED, f"The work cannot begin: '{where}': {why}."
+            job.reason, job.values = "system", {"where": f" ('{where}')", "why": why}
             job.ended_s = time.time()
             self.changed.notify()
             return
@@ -234,6 +245,7 @@ class Jobs:
                 job.state, job.result = DONE, outcome["result"]
             elif "refused" in outcome:
                 job.state, job.message = REFUSED, str(outcome["refused"])
+                job.reason, job.values = outcome.get("reason", ""), outcome.get("values", {})
             else:
                 job.state = STOPPED
             with contextlib.suppress(OSError):

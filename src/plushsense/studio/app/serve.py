@@ -129,7 +129,7 @@ def _lock_folder(workspace: Workspace) -> FileLock | None:
         lock.acquire()
     except Timeout:
         raise ConfigError(
-            f"A studio is already running in '{workspace.folder}': use that one, or give another folder with --home."
+            f"A studio is already running in '{workspace.folder}': use that one, or give another folder with --home.",
         ) from None
     except (OSError, NotImplementedError):
         # A read-only folder needs no lock.

@@ -141,10 +141,10 @@ class Page:
         try:
             yield
         except PlushSenseError as refusal:
-            self.say(str(refusal), "error")
+            self.say(self.words.error(refusal), "error")
         except OSError as cause:
-            where = f" '{cause.filename}'" if cause.filename else ""
-            self.say(self.words("shell.system_refused", where=where, why=cause.strerror or str(cause)), "error")
+            where = f" ('{cause.filename}')" if cause.filename else ""
+            self.say(self.words("errors.system", where=where, why=cause.strerror or str(cause)), "error")
 
 
 def visitor() -> tuple[Words, bool | None]:

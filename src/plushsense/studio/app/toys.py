@@ -215,7 +215,8 @@ class Toys:
     def person(self, number: int) -> str:
         """Choose the virtual toy used by virtual person ``number``, and return its URL."""
         if not 1 <= number <= PERSONS:
-            raise ConfigError(f"There is no virtual person {number}: give 1 to {PERSONS}.")
+            message = f"There is no virtual person {number}: give 1 to {PERSONS}."
+            raise ConfigError(message, reason="no_virtual_person", n=number, most=PERSONS)
         return self.choose(f"virtual://?person={number}")
 
     @property
@@ -232,7 +233,7 @@ class Toys:
         """
         url = url or self._workspace.toy
         if not url:
-            raise ConfigError("No toy is chosen: choose one first.")
+            raise ConfigError("No toy is chosen: choose one first.", reason="no_toy")
         url = with_speed(url, self._workspace.speed)
         speed = speed_of(url) or 1.0
         frames, first, last = 0, None, None
@@ -252,8 +253,13 @@ class Toys:
             if counters.malformed:
                 raise DeviceError(
                     f"'{url}' sends no frames of the layout '{layout.name}' but other lines ({counters.malformed}): "
-                    "name its layout, as in ?layout=plush-14 at the end of the address."
+                    "name its layout, as in ?layout=plush-14 at the end of the address.",
+                    reason="toy_unreadable",
+                    url=url,
+                    layout=layout.name,
+                    lines=counters.malformed,
                 )
-            raise DeviceError(f"'{url}' sent nothing within {_TIMEOUT_S:g} s: check that the toy is switched on.")
+            message = f"'{url}' sent nothing within {_TIMEOUT_S:g} s: check that the toy is switched on."
+            raise DeviceError(message, reason="toy_silent", url=url, s=f"{_TIMEOUT_S:g}")
         seconds = max(last - first, 1.0 / layout.rate_hz) * speed
         return ConnectionTest(layout.name, frames, counters.malformed, seconds, layout.rate_hz)

@@ -1,4 +1,7 @@
-"""Load the texts of the pages: one TOML file per language in ``words/``, all with the same keys."""
+"""Load the texts of the pages, in each language with the same keys.
+
+The texts of a page are in ``pages/<name>/<language>.toml``, those of several pages in ``app/words/<language>.toml``.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,10 @@ from importlib import import_module, resources
 from pathlib import Path
 from typing import Any
 
+from plushsense.core.errors import PlushSenseError
+
 LANGUAGES = {"en": "English", "lv": "Latviešu"}
-"""Maps language code to name; the texts are in ``words/<code>.toml``."""
+"""Maps language code to name; ``<code>.toml`` is the name of the files of texts."""
 
 
 class Words:
@@ -41,6 +46,22 @@ class Words:
         """Return the name of a gesture in this language, or ``label`` itself if it has none."""
         return self._texts.get(f"gestures.{label}", label)
 
+    def error(self, error: PlushSenseError) -> str:
+        """Return the sentence of an error in this language, see `explain`."""
+        return self.explain(str(error), error.reason, error.values)
+
+    def explain(self, message: str, reason: str = "", values: Mapping[str, object] | None = None) -> str:
+        """Return the sentence for the user about something that failed.
+
+        Args:
+            message: the sentence in English, as the command line prints it.
+            reason, values: those of the `PlushSenseError`. Without a text for ``reason``, ``message`` is quoted.
+        """
+        text = self._texts.get(f"errors.{reason}")
+        if text is not None:
+            return text.format(**(values or {}))
+        return self._texts["errors.other"].format(message=message) if message else ""
+
     def unit(self, unit: str) -> str:
         """Return the name of a unit in this language, or ``unit`` itself if it has none."""
         return self._texts.get(f"units.{unit}", unit)
@@ -54,7 +75,6 @@ class Words:
 def _texts(language: str) -> dict[str, str]:
     text = resources.files(__package__).joinpath(f"words/{language}.toml").read_text(encoding="utf-8")
     texts = dict(_flat(tomllib.loads(text)))
-    # A page may have its own texts in ``pages/<name>/<language>.toml``.
     for folder in import_module("plushsense.studio.pages").__path__:
         for path in Path(folder).glob(f"*/{language}.toml"):
             texts |= _flat(tomllib.loads(path.read_text(encoding="utf-8")))

@@ -153,7 +153,10 @@ class Workspace:
                 return real
         raise ConfigError(
             f"'{path}' lies outside the studio's folders: choose something in '{self.folder}', or start the studio "
-            "with --dataset or --home for the other one."
+            "with --dataset or --home for the other one.",
+            reason="outside",
+            path=path,
+            folder=self.folder,
         )
 
     def rename(self, path: Path, name: str) -> Path:
@@ -165,7 +168,8 @@ class Workspace:
         real = self.inside(path)
         if real.is_dir():
             if name in [self.title(other) for other in self.datasets() if other != path]:
-                raise ConfigError(f"Another data set is called '{name}': give another name.")
+                message = f"Another data set is called '{name}': give another name."
+                raise ConfigError(message, reason="name_exists", name=name)
             self._check_name(name)
             write_file(real / _HEAD, replace(DatasetHead.read(real), name=name).to_toml())
             return real
@@ -181,7 +185,8 @@ class Workspace:
         """
         real = self.inside(path)
         if self.folder not in real.parents:
-            raise ConfigError(f"'{path}' lies outside the studio's folder: remove it there yourself.")
+            message = f"'{path}' lies outside the studio's folder: remove it there yourself."
+            raise ConfigError(message, reason="not_ours", path=path)
         inside = real.relative_to(self.folder)
         place, number = self.folder / DISCARDED / inside, 2
         while place.exists():
@@ -207,7 +212,8 @@ class Workspace:
         inside = real.relative_to(self.folder / DISCARDED)
         place = self.folder / inside.with_name(inside.name.partition(_COPY)[0])
         if place.exists():
-            raise ConfigError(f"'{place.name}' exists again in '{place.parent}': rename or discard that first.")
+            message = f"'{place.name}' exists again in '{place.parent}': rename or discard that first."
+            raise ConfigError(message, reason="exists_again", name=place.name)
         place.parent.mkdir(parents=True, exist_ok=True)
         real.rename(place)
         return place
@@ -223,7 +229,8 @@ class Workspace:
     def _of_discarded(self, path: Path) -> Path:
         real = self.inside(path)
         if real not in self.discarded():
-            raise ConfigError(f"'{path}' is not discarded: it may have been restored or deleted already.")
+            message = f"'{path}' is not discarded: it may have been restored or deleted already."
+            raise ConfigError(message, reason="not_discarded", name=real.name)
         return real
 
     def new(self, kind: str, name: str) -> Path:
@@ -235,7 +242,8 @@ class Workspace:
         plain = self._check_name(name)
         place = self.inside(Path(kind) / plain)
         if place.exists():
-            raise ConfigError(f"'{plain}' exists already in '{place.parent}': give another name, nothing is replaced.")
+            message = f"'{plain}' exists already in '{place.parent}': give another name, nothing is replaced."
+            raise ConfigError(message, reason="name_exists", name=Path(plain).stem)
         return place
 
     @staticmethod
@@ -244,7 +252,9 @@ class Workspace:
         dotted = plain.startswith(".") or plain.endswith(".")
         if not 0 < len(plain) <= 64 or dotted or _NOT_PLAIN.search(plain) or DEVICE_NAME.match(plain):
             raise ConfigError(
-                f"'{name}' cannot be a name: give at most 64 letters, digits, spaces, points and hyphens."
+                f"'{name}' cannot be a name: give at most 64 letters, digits, spaces, points and hyphens.",
+                reason="name_bad",
+                name=name,
             )
         return plain
 

@@ -413,7 +413,11 @@ class WorkPanel:
                     self._bars[job.id] = (bar, tag(where, "where"))
             if last is not None:
                 bad = last.state == REFUSED
-                message = last.message if bad else words("export.stopped", title=title_of(words, last))
+                message = (
+                    words.explain(last.message, last.reason, last.values)
+                    if bad
+                    else words("export.stopped", title=title_of(words, last))
+                )
                 row = ui.row().classes(
                     f"ps-message ps-message-{'error' if bad else 'warning'} w-full items-center no-wrap"
                 )

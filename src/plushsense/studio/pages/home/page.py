@@ -75,8 +75,9 @@ def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
         try:
             result = await run.io_bound(toys.test)
         except Exception as cause:  # noqa: BLE001, RUF100
-            text = str(cause) if isinstance(cause, PlushSenseError) else " ".join(str(cause).split())
-            page.say(text or type(cause).__name__, "error")
+            text = " ".join(str(cause).split()) or type(cause).__name__
+            text = words.error(cause) if isinstance(cause, PlushSenseError) else words.explain(text)
+            page.say(text, "error")
             return
         finally:
             testing = False

@@ -322,7 +322,7 @@ class JobList:
         else:
             ui.label(f"{words(f'home.{job.state}')} · {moment(job.ended_s or job.begun_s)}").classes("ps-dim")
         if job.state == REFUSED:
-            ui.label(job.message).classes("ps-bad ps-break")
+            ui.label(words.explain(job.message, job.reason, job.values)).classes("ps-bad ps-break")
         if job.state == DONE:
             self._result(job)
         with ui.row().classes("items-center ps-small-gap"):

@@ -364,7 +364,7 @@ class _Card:
                 ui.label(w("train.stopped_about"))
             elif job.state == REFUSED:
                 with ui.element("div").classes("ps-message ps-message-error w-full").props('role="alert"'):
-                    tag(ui.label(job.message), "refused")
+                    tag(ui.label(w.explain(job.message, job.reason, job.values)), "refused")
             else:
                 self._result()
             charts = progress_charts(job)
