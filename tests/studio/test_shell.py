@@ -15,7 +15,7 @@ import pytest
 
 from plushsense.recording.session_files import SESSION_HEAD, SESSION_LOG
 from plushsense.studio.app import shell
-from plushsense.studio.app.shell import LIGHT_COOKIE, PAGES
+from plushsense.studio.app.shell import LIGHT_COOKIE, PAGES, TOUR
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.live.clips import PROTOCOL
@@ -23,10 +23,11 @@ from plushsense.studio.pages.train.result_details import confusion_table
 from plushsense.studio.pages.train.results import Confusion
 from plushsense.studio.widgets.elements import link, picture, verdict
 from plushsense.workflow.api import simulate
-from support.browsing import DESK, TABLET, Studio, axe, connected, marked
+from support.browsing import DESK, PHONE, TABLET, Studio, axe, connected, marked
 from support.recorded import record
 
 Fixture = Callable[..., Any]
+_IN_VIEW = "e => { const r = e.getBoundingClientRect(); return r.left >= 0 && r.right <= innerWidth }"
 
 
 @pytest.fixture(scope="module")
@@ -39,15 +40,51 @@ def empty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 def test_pages_open_without_complaint(empty: str, look: Fixture, shots: Fixture) -> None:
-    for language, dark, size in (("en", False, DESK), ("lv", True, TABLET)):
+    for language, dark, size in (("en", False, DESK), ("lv", True, PHONE)):
         browser = look(size, dark, language)
         for name, path in PAGES.items():
             page = browser.open(empty + path)
             assert marked(page, "title").inner_text()
             assert axe(page) == [], name
+            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{name} scrolls sideways"
+            assert page.locator(".ps-bar [aria-current]").evaluate(_IN_VIEW), name
             shots(page, f"{name}-{language}-{'dark' if dark else 'light'}")
             page.close()
         assert browser.complaints == []
+        # The icons are drawn, see `icons.js`: their font would be a third of a page.
+        fonts = [url for url in browser.asked if url.endswith(".woff2")]
+        assert len(set(fonts)) <= 2, fonts
+
+
+def test_a_first_page_is_small(empty: str, look: Fixture) -> None:
+    browser = look(own=True)
+    page = browser.context.new_page()
+    session = browser.context.new_cdp_session(page)
+    session.send("Network.enable")
+    sizes: list[float] = []
+    session.on("Network.loadingFinished", lambda event: sizes.append(event["encodedDataLength"]))
+    page.goto(empty)
+    connected(page)
+    assert 100_000 < sum(sizes) <= 400_000
+
+
+def test_help_and_tour(empty: str, look: Fixture) -> None:
+    browser = look()
+    page = browser.open(empty + PAGES["publish"])
+    marked(page, "open-help").click()
+    marked(page, "help").wait_for()
+    assert "makes a package" in marked(page, "help").inner_text()
+    assert axe(page) == []
+    marked(page, "tour").click()
+    for n, (name, path) in enumerate(PAGES.items(), 1):
+        page.wait_for_url(f"{empty}{path}?{TOUR}=1")
+        step = marked(page, "tour-step")
+        assert Words("en")(f"tour.{name}") in step.inner_text()
+        connected(page)
+        marked(page, "tour-next" if n < len(PAGES) else "tour-end").click()
+    page.wait_for_url(empty + "/")
+    assert marked(page, "tour-step").count() == 0
+    assert browser.complaints == []
 
 
 def test_language_and_light_are_kept(empty: str, look: Fixture) -> None:

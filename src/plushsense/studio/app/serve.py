@@ -8,9 +8,11 @@ import inspect
 import logging
 import os
 import socket
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
@@ -29,6 +31,9 @@ from plushsense.studio.app.workspace import WORK, Workspace
 
 PORT = 8137
 _OPENING_S = 30.0
+_ICONS = Path(__file__).with_name("icons.js")
+# Imported by NiceGUI's socket library for clients: 15 MB that a server does not need.
+_CLIENTS = ("aiohttp", "requests")
 _EVERYWHERE = ("0.0.0.0", "::")
 _ICON = (
     '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32"><g fill="#b07a4a"><circle cx="8" cy="8" r="5"/>'
@@ -59,11 +64,12 @@ def run(
         MissingExtraError: without the extra ``studio``.
         ConfigError: if the server cannot listen on the address, or another studio serves the folder.
     """
-    need("nicegui", "studio")
     # By default, NiceGUI stores files in the working directory or in Redis.
     os.environ["NICEGUI_STORAGE_PATH"] = str(workspace.folder / WORK / "nicegui")
     os.environ.pop("NICEGUI_REDIS_URL", None)
-    from nicegui import app, ui
+    with _without_clients():
+        need("nicegui", "studio")
+        from nicegui import app, ui
 
     from plushsense.studio.app.guard import router
     from plushsense.studio.app.shell import PAGES
@@ -95,6 +101,7 @@ def run(
     logging.getLogger("nicegui").addFilter(lambda record: "Could not cancel" not in str(record.msg))
     # Switch off Quasar's loading bar, because it has no accessible name.
     app.config.quasar_config["loadingBar"] = {"skipHijack": True}
+    app.config.vue_config_script = _ICONS.read_text(encoding="utf-8") + app.config.vue_config_script
     app.on_startup(lambda: threading.Thread(target=announce, daemon=True).start())
     app.on_shutdown(workspace.close)
     ui.run(
@@ -115,6 +122,18 @@ def run(
     )
     if lock is not None:
         lock.release()
+
+
+@contextlib.contextmanager
+def _without_clients() -> Iterator[None]:
+    """Hide the packages in `_CLIENTS` from the imports in the block."""
+    hidden = [name for name in _CLIENTS if name not in sys.modules]
+    sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type]
+    try:
+        yield
+    finally:
+        for name in hidden:
+            del sys.modules[name]
 
 
 def _lock_folder(workspace: Workspace) -> FileLock | None:

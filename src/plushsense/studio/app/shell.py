@@ -81,6 +81,9 @@ the content below the title. Put its texts in ``pages/<name>/<language>.toml`` f
 ``app/words``. The texts ``pages.<name>`` (for the navigation bar) and ``<name>.title`` are required.
 """
 
+TOUR = "tour"
+"""Query parameter of the address with which a page shows its sentences of the tour."""
+
 AFFECT_SIGNS = {"positive": "+", "neutral": "○", "negative": "−", "none": "·"}
 """Sign of each affect. Pages never mark affect by colour alone, but also by this sign and a word."""
 AFFECT_COLOURS = {"positive": "#00805c", "neutral": "#3a6ea5", "negative": "#b84a00", "none": "#767676"}
@@ -175,11 +178,16 @@ def frame(workspace: Workspace, name: str) -> Iterator[Page]:
                 link = ui.link(words(f"pages.{key}"), path)
                 if key == name:
                     link.props('aria-current="page"')
+        # On a phone, the link may be outside the visible part of the bar.
+        ui.run_javascript("document.querySelector('.ps-bar [aria-current]')?.scrollIntoView({inline: 'center'})")
         ui.space()
+        _help(words, name)
         _choices(words, dark)
     with ui.element("div").classes("ps-main column no-wrap items-start").props('id="content" tabindex="-1"'):
         if name != "record":
             _recording_bar(page)
+        if TOUR in query():
+            _tour(words, name)
         tag(html(words(f"{name}.title"), "h1"), "title")
         page._messages = ui.column().classes("w-full ps-messages")
         yield page
@@ -202,6 +210,41 @@ def _recording_bar(page: Page) -> None:
 
     draw()
     on_change(page.workspace.recording_changed, draw)
+
+
+def _help(words: Words, name: str) -> None:
+    """Add the button that opens the help of the page ``name``, which leads to the tour."""
+    with ui.dialog() as dialog:
+        named(dialog.props("transition-duration=0"), words("shell.help"))
+        with tag(ui.card(), "help"):
+            heading(f"{words('shell.help')}: {words(f'pages.{name}')}", 2)
+            for paragraph in words(f"help.{name}").split("\n"):
+                ui.label(paragraph)
+            with ui.row().classes("w-full justify-end"):
+                button("tour", words("shell.tour"), lambda: ui.navigate.to(address("home", **{TOUR: "1"})))
+                button("", words("shell.close_help"), dialog.close, "unelevated autofocus")
+    opener = icon_button("help", words("shell.help"), dialog.open, "flat round dense color=white")
+    tag(opener.props('aria-haspopup="dialog"'), "open-help")
+
+
+def _tour(words: Words, name: str) -> None:
+    """Add the sentences of the tour about the page ``name``, with buttons to the next and the former page."""
+    pages = list(PAGES)
+    at = pages.index(name)
+
+    def go(key: str, look: str, label: str, place: str) -> None:
+        button(key, words(label), lambda: ui.navigate.to(place), look)
+
+    with tag(named(ui.element("section").classes("ps-card ps-next w-full"), words("shell.tour")), "tour-step"):
+        heading(words("shell.tour_step", n=at + 1, m=len(pages), page=words(f"pages.{name}")), 2)
+        ui.label(words(f"tour.{name}"))
+        with ui.row().classes("w-full"):
+            if at + 1 < len(pages):
+                go("tour-next", "unelevated", "shell.tour_next", address(pages[at + 1], **{TOUR: "1"}))
+            if at:
+                go("tour-back", "outline", "shell.tour_back", address(pages[at - 1], **{TOUR: "1"}))
+            last = at + 1 == len(pages)
+            go("tour-end", "unelevated" if last else "flat", "shell.tour_end", address("home" if last else name))
 
 
 def _set_appearance(words: Words, dark: bool | None) -> None:
