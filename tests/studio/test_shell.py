@@ -151,6 +151,11 @@ def test_the_first_key_leads_to_the_content(empty: str, look: Fixture) -> None:
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
     assert page.evaluate("document.activeElement.id") == "content"
+    # The focus of everything that the Tab key reaches is visible.
+    for _ in range(12):
+        page.keyboard.press("Tab")
+        at = page.evaluate("(e => [e.tagName, e.innerText, getComputedStyle(e).outlineWidth])(document.activeElement)")
+        assert at[2] == "3px" or at[0] in ("INPUT", "BODY"), at
     assert page.get_by_role("main").count() == 1
     assert page.locator("[aria-current=page]").inner_text() == "Publish"
 
