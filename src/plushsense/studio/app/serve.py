@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import importlib
 import inspect
 import logging
@@ -34,6 +35,8 @@ _OPENING_S = 30.0
 _ICONS = Path(__file__).with_name("icons.js")
 # Imported by NiceGUI's socket library for clients: 15 MB that a server does not need.
 _CLIENTS = ("aiohttp", "requests")
+# Parameters of `mallopt` in malloc.h of glibc.
+_M_TRIM_THRESHOLD, _M_ARENA_MAX = -1, -8
 _EVERYWHERE = ("0.0.0.0", "::")
 _ICON = (
     '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32"><g fill="#b07a4a"><circle cx="8" cy="8" r="5"/>'
@@ -64,6 +67,7 @@ def run(
         MissingExtraError: without the extra ``studio``.
         ConfigError: if the server cannot listen on the address, or another studio serves the folder.
     """
+    _limit_heaps()
     # By default, NiceGUI stores files in the working directory or in Redis.
     os.environ["NICEGUI_STORAGE_PATH"] = str(workspace.folder / WORK / "nicegui")
     os.environ.pop("NICEGUI_REDIS_URL", None)
@@ -134,6 +138,14 @@ def _without_clients() -> Iterator[None]:
     finally:
         for name in hidden:
             del sys.modules[name]
+
+
+def _limit_heaps() -> None:
+    """Let all threads share two heaps where the C library is glibc, whose heap for each thread costs 20 MB in all."""
+    with contextlib.suppress(OSError, AttributeError, TypeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_M_ARENA_MAX, 2)
+        mallopt(_M_TRIM_THRESHOLD, 1 << 17)
 
 
 def _lock_folder(workspace: Workspace) -> FileLock | None:
