@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plushsense.core.errors import BadInput, ConfigError
-from plushsense.scoring.splits import Fold, make_folds, parse_split, purge
+from plushsense.scoring.splits import EXAMPLES, Fold, make_folds, parse_split, purge
 
 CLASSES = 4
 
@@ -107,6 +107,29 @@ def test_holdout_is_the_papers_70_15_15() -> None:
     assert np.bincount(label[folds[0].test]).tolist() == [15] * CLASSES
 
 
+def test_the_authors_script_takes_whole_recordings_in_the_order_of_the_files() -> None:
+    subject, label = study(10, repetitions=10)
+    names = np.array([f"{n:07d}" for n in np.random.default_rng(0).permutation(len(label))])
+    fold = make_folds(parse_split("recordings:holdout"), subject, label, names=names)[0]
+    check_partition([fold], len(label), whole=False)
+    for one in range(CLASSES):
+        parts = [np.sort(names[part[label[part] == one]]) for part in (fold.train, fold.validation, fold.test)]
+        assert [len(part) for part in parts] == [70, 15, 15]
+        assert parts[0][-1] < parts[1][0] and parts[1][-1] < parts[2][0]
+    again, other = (make_folds(parse_split("recordings:holdout"), subject, label, s, names)[0] for s in (0, 1))
+    assert again.test.tolist() == fold.test.tolist() == other.test.tolist()
+    first, second = (make_folds(parse_split("recordings:random"), subject, label, seed, names)[0] for seed in (0, 1))
+    check_partition([first], len(label), whole=False)
+    assert np.bincount(label[first.test]).tolist() == [15] * CLASSES
+    assert first.test.tolist() != second.test.tolist()
+
+
+def test_a_class_of_two_recordings_is_only_trained_on() -> None:
+    label = np.array([0] * 6 + [1] * 2, dtype=np.int64)
+    fold = make_folds(parse_split("recordings:holdout"), np.full(8, "P01"), label)[0]
+    assert fold.test.tolist() == [5] and fold.validation.tolist() == [4]
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -127,7 +150,7 @@ def test_bad_splits_say_what_is_accepted(text: str, says: str) -> None:
     assert says in str(refusal.value) and f"'{text}'" in str(refusal.value)
 
 
-@pytest.mark.parametrize("text", ["leave-one-subject-out", "by-subject:5", "by-recording:5", "windows:holdout"])
+@pytest.mark.parametrize("text", ["leave-one-subject-out", "by-recording:5", *EXAMPLES])
 def test_a_split_says_itself(text: str) -> None:
     assert parse_split(text).text == text
 

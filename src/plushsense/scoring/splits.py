@@ -8,6 +8,7 @@ training apart. Units of nobody (subject "none": the toy at rest) are spread ove
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,8 @@ Index = NDArray[np.int64]
 
 UNKNOWN = "unknown"
 VALIDATION_SHARE = 0.15
-# The paper trains on 70 %, validates on 15 % and tests on 15 % of the windows (section 3.6.1).
+# The paper trains on 70 %, validates on 15 % and tests on 15 % of the windows (section 3.6.1). The authors' script
+# takes these shares of each gesture in the order of the files, so that whole recordings stay together.
 HOLDOUT_SHARE = 0.15
 
 
@@ -41,17 +43,20 @@ class Fold:
 class Split:
     """A method of splitting: ``by-subject:5`` has the kind "by-subject" and ``k`` = 5 folds.
 
-    The kind "windows" without ``k`` is the paper's hold-out split (``windows:holdout``).
+    The kind "windows" without ``k`` is the hold-out split that the paper describes (``windows:holdout``), and the kind
+    "recordings" that of the authors' script: in the order of the files (``recordings:holdout``) or, if ``shuffled``, in
+    a random order (``recordings:random``).
     """
 
     kind: str
     k: int | None = None
+    shuffled: bool = False
 
     @property
     def text(self) -> str:
         """Name of the split, as on the command line."""
-        if self.kind == "windows" and self.k is None:
-            return "windows:holdout"
+        if self.kind in _HOLDOUTS and self.k is None:
+            return f"{self.kind}:{'random' if self.shuffled else 'holdout'}"
         return self.kind if self.k is None else f"{self.kind}:{self.k}"
 
     @property
@@ -70,7 +75,16 @@ class Split:
         return self.kind in ("leave-one-subject-out", "by-subject")
 
 
-EXAMPLES = ("leave-one-subject-out", "by-subject:5", "by-recording:5", "windows:5", "windows:holdout")
+_HOLDOUTS = ("windows", "recordings")
+EXAMPLES = (
+    "leave-one-subject-out",
+    "by-subject:5",
+    "by-recording:5",
+    "recordings:holdout",
+    "recordings:random",
+    "windows:5",
+    "windows:holdout",
+)
 
 
 def parse_split(text: str) -> Split:
@@ -82,8 +96,10 @@ def parse_split(text: str) -> Split:
     kind, colon, number = text.strip().partition(":")
     if kind == "leave-one-subject-out" and not colon:
         return Split(kind)
-    if kind == "windows" and number == "holdout":
+    if kind in _HOLDOUTS and number == "holdout":
         return Split(kind)
+    if kind == "recordings" and number == "random":
+        return Split(kind, shuffled=True)
     if kind in ("by-subject", "by-recording", "windows"):
         if number.isascii() and number.isdigit() and 2 <= int(number) <= 1000:
             return Split(kind, int(number))
@@ -93,8 +109,13 @@ def parse_split(text: str) -> Split:
     raise ConfigError(f"Unknown split '{text}': accepted are {', '.join(EXAMPLES)}.{nearest(text, EXAMPLES)}")
 
 
-def make_folds(split: Split, subject: NDArray[np.str_], label: Index, seed: int = 0) -> list[Fold]:
+def make_folds(
+    split: Split, subject: NDArray[np.str_], label: Index, seed: int = 0, names: NDArray[np.str_] | None = None
+) -> list[Fold]:
     """Return the folds of ``split`` for units with these people and classes, both (n,). Deterministic for a ``seed``.
+
+    Args:
+        names: file names (n,) of recordings, by which ``recordings:holdout`` sorts; by default the units' order.
 
     Raises:
         BadInput: if there are too few people or units for the split, or, when splitting by people, unknown ones.
@@ -109,6 +130,9 @@ def make_folds(split: Split, subject: NDArray[np.str_], label: Index, seed: int 
         return by_subject(subject, split.k or 5, seed)
     if split.kind == "by-recording":
         return by_recording(subject, label, split.k or 5, seed)
+    if split.kind == "recordings":
+        order = np.random.default_rng([seed, 7]).permutation(len(label)) if split.shuffled else None
+        return recordings(subject, label, names if order is None else order)
     if split.k is None:
         return holdout(subject, label, seed)
     return windows(subject, label, split.k, seed)
@@ -145,6 +169,26 @@ def holdout(subject: NDArray[np.str_], label: Index, seed: int = 0) -> list[Fold
     rest = np.setdiff1d(everything, test)
     validation = _stratified_share(rest, label, VALIDATION_SHARE / (1.0 - HOLDOUT_SHARE), rng)
     return [Fold("holdout", _named(subject[test]), np.setdiff1d(rest, validation), validation, test)]
+
+
+def recordings(subject: NDArray[np.str_], label: Index, order: NDArray[Any] | None = None) -> list[Fold]:
+    """Return the split of the authors' script, by recording: of each class the first 70 % of the recordings are for
+    training, the next 15 % for validation and the last 15 % for test. A person can be on both sides.
+
+    Args:
+        order: sort keys (n,), such as file names; by default the units stay in their order.
+    """
+    _enough(len(label), 3, "recordings:holdout", "recordings")
+    ranks = np.arange(len(label)) if order is None else np.argsort(np.argsort(order, kind="stable"))
+    parts: list[list[Index]] = [[], [], []]
+    for one in np.unique(label):
+        units = np.flatnonzero(label == one)
+        units = units[np.argsort(ranks[units])]
+        held = max(1, round(HOLDOUT_SHARE * len(units))) if len(units) > 2 else 0
+        for part, of in zip(parts, np.split(units, [len(units) - 2 * held, len(units) - held]), strict=True):
+            part.append(of)
+    train, validation, test = (np.sort(np.concatenate(part)) for part in parts)
+    return [Fold("holdout", _named(subject[test]), train, validation, test)]
 
 
 def purge(
