@@ -151,7 +151,7 @@ def test_filters_as_text(text: str, place: int) -> None:
     ("setting", "why"),
     [
         ({"padding": "miror"}, "Did you mean 'mirror'"),
-        ({"norm": "group"}, "accepted are batch, layer"),
+        ({"norm": "group"}, "accepted are batch, layer, none"),
         ({"channels": 0}, "channels is 0"),
         ({"classes": 1}, "classes is 1"),
         ({"window": 1}, "window is 1"),
@@ -190,7 +190,8 @@ def test_what_is_written_is_read_back(
 
 
 def test_parameters_are_the_learnable_tensors() -> None:
-    batch, layer = (Arch.parse("5_3d2", (2, 3), channels=4, classes=6, norm=n) for n in NORMS)
+    batch, layer, none = (Arch.parse("5_3d2", (2, 3), channels=4, classes=6, norm=n) for n in NORMS)
+    assert none.parameters == layer.parameters - 2 * (2 + 3)
     assert batch.parameters == layer.parameters == (5 * 4 * 2 + 2) + (3 * 2 * 3 + 3) + 2 * (2 + 3) + (3 * 6 + 6)
     assert set(batch.weight_shapes) - set(layer.weight_shapes) == {
         "norm0.mean",

@@ -42,6 +42,9 @@ def oracle(arch: Arch, weights: dict[str, NDArray[np.float32]], window: NDArray[
             for t in range(out.shape[1]):
                 taps = [kernel[f, :, k] @ z[:, t + k * layer.dilation] for k in range(layer.kernel)]
                 out[f, t] = max(sum(taps) + bias[f], 0.0)
+        if arch.norm == "none":
+            z = out
+            continue
         if arch.norm == "batch":
             mean, var = weights[f"norm{i}.mean"][:, None], weights[f"norm{i}.var"][:, None]
         else:

@@ -51,7 +51,7 @@ def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:
         args.config,
         windows=options(args, "context"),
         model=options(args, "arch", "filters", "padding", "norm", "pool_s"),
-        training=options(args, "preset", "epochs", "batch", "seed", "device"),
+        training=options(args, "preset", "epochs", "batch", "seed", "device", "scaling"),
         evaluation={"classes": args.classes, "seed": args.seed, **evaluation},
     )
 

@@ -125,10 +125,10 @@ def refuse_undeployable(arch: Arch) -> None:
             f"{arch.title} has the padding '{arch.padding}', with which a decision cannot be made sample by sample: "
             f"train {arch.symbol} with --padding stream."
         )
-    if arch.norm != "batch":
+    if arch.norm == "layer":
         raise ArchError(
             f"{arch.title} has {arch.norm} normalisation, which cannot be folded into a convolution: "
-            f"train {arch.symbol} with --norm batch."
+            f"train {arch.symbol} with --norm batch or none."
         )
 
 

@@ -132,10 +132,18 @@ def fail(why: str, text: str, at: int, symbol: bool = True) -> NoReturn:
 
 
 Padding = Literal["stream", "causal", "mirror"]
-Norm = Literal["batch", "layer"]
+Norm = Literal["batch", "layer", "none"]
 PADDINGS: tuple[str, ...] = get_args(Padding)
 NORMS: tuple[str, ...] = get_args(Norm)
 
+NORM_TENSORS: dict[Norm, tuple[str, ...]] = {
+    "batch": ("gain", "shift", "mean", "var"),
+    "layer": ("gain", "shift"),
+    "none": (),
+}
+"""Names of the tensors of each normalisation: the paper has batch, the authors' training script layer, and their live
+network none.
+"""
 NORM_EPSILON = 1e-5
 DEFAULT_SYMBOL = "14d1_19d2_19d4"  # at DEFAULT_RATE_HZ
 DEFAULT_RATE_HZ = 100.0
@@ -383,7 +391,7 @@ class Arch:
         for i, (layer, read) in enumerate(zip(self.layers, self.inputs, strict=True)):
             shapes[f"conv{i}.weight"] = (layer.filters, read, layer.kernel)
             shapes[f"conv{i}.bias"] = (layer.filters,)
-            for name in ("gain", "shift", "mean", "var") if self.norm == "batch" else ("gain", "shift"):
+            for name in NORM_TENSORS[self.norm]:
                 shapes[f"norm{i}.{name}"] = (layer.filters,)
         shapes["dense.weight"] = (self.classes, self.features)
         shapes["dense.bias"] = (self.classes,)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import need
-from plushsense.models.arch import NORM_EPSILON, Arch, VectorLayer
+from plushsense.models.arch import NORM_EPSILON, NORM_TENSORS, Arch, VectorLayer
 from plushsense.models.reference import check_weights, check_windows
 from plushsense.models.vectors import LENGTH_EPSILON, TURN_EPSILON
 
@@ -48,8 +48,9 @@ class _Block(nn.Module):
         layer = arch.layers[i]
         self.reach, self.padding, self.norm = layer.reach, arch.padding, arch.norm
         self.conv = nn.Conv2d(arch.inputs[i], layer.filters, (1, layer.kernel), dilation=(1, layer.dilation))
-        self.gain = nn.Parameter(torch.ones(layer.filters))
-        self.shift = nn.Parameter(torch.zeros(layer.filters))
+        if arch.norm != "none":
+            self.gain = nn.Parameter(torch.ones(layer.filters))
+            self.shift = nn.Parameter(torch.zeros(layer.filters))
         self.mean: Tensor
         self.var: Tensor
         self.register_buffer("mean", torch.zeros(layer.filters))
@@ -61,6 +62,8 @@ class _Block(nn.Module):
         elif self.reach and self.padding == "causal":
             x = F.pad(x, (self.reach, 0))
         z = F.relu(self.conv(x))
+        if self.norm == "none":
+            return z
         if self.norm == "layer":
             rows = F.layer_norm(z.permute(0, 2, 3, 1), (z.shape[1],), self.gain, self.shift, NORM_EPSILON)
             return rows.permute(0, 3, 1, 2)
@@ -149,7 +152,7 @@ class Net(nn.Module):
         for i, module in enumerate(self.blocks):
             block = cast(_Block, module)
             named |= {f"conv{i}.weight": block.conv.weight, f"conv{i}.bias": cast(Tensor, block.conv.bias)}
-            named |= {f"norm{i}.{name}": getattr(block, name) for name in ("gain", "shift", "mean", "var")}
+            named |= {f"norm{i}.{name}": getattr(block, name) for name in NORM_TENSORS[self.arch.norm]}
         return {name: named[name] for name in self.arch.weight_shapes}
 
     def export_weights(self) -> dict[str, NDArray[np.float32]]:

@@ -117,10 +117,12 @@ def check_weights(arch: Arch, weights: Mapping[str, NDArray[Any]]) -> None:
 
 
 def affine(arch: Arch, i: int, weights: Weights) -> tuple[Floats, Floats]:
-    """Return gain and shift (F,) of the normalisation of layer ``i``.
+    """Return gain and shift (F,) of the normalisation of layer ``i``, ones and zeros if there is none.
 
     With batch normalisation, the running mean and variance are included in them.
     """
+    if arch.norm == "none":
+        return np.ones(arch.layers[i].filters), np.zeros(arch.layers[i].filters)
     gain, shift = (weights[f"norm{i}.{name}"].astype(np.float64) for name in ("gain", "shift"))
     if arch.norm == "batch":
         gain = gain / np.sqrt(weights[f"norm{i}.var"].astype(np.float64) + NORM_EPSILON)
@@ -409,8 +411,9 @@ def random_weights(arch: Arch, seed: int) -> dict[str, NDArray[np.float32]]:
         f, taps = layer.filters, layer.kernel * read
         put(f"conv{i}.weight", rng.normal(size=(f, read, layer.kernel)) * np.sqrt(2.0 / taps))
         put(f"conv{i}.bias", 0.2 * rng.normal(size=f))
-        put(f"norm{i}.gain", np.exp(0.4 * rng.normal(size=f)))
-        put(f"norm{i}.shift", 0.3 * rng.normal(size=f))
+        if arch.norm != "none":
+            put(f"norm{i}.gain", np.exp(0.4 * rng.normal(size=f)))
+            put(f"norm{i}.shift", 0.3 * rng.normal(size=f))
         if arch.norm == "batch":
             put(f"norm{i}.mean", np.zeros(f))
             put(f"norm{i}.var", np.ones(f))

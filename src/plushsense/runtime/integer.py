@@ -33,7 +33,7 @@ _SUM_LIMIT = (1 << 31) - 1
 
 def deployable(arch: Arch) -> bool:
     """Return whether a network can be deployed; `plushsense.deploy.quantize.refuse_undeployable` gives the reasons."""
-    return arch.padding == "stream" and arch.norm == "batch"
+    return arch.padding == "stream" and arch.norm != "layer"
 
 
 @dataclass(frozen=True, eq=False)

@@ -84,7 +84,8 @@ def fit(
     if validation is not None and len(validation):
         _check(validation, arch, "validate on")
     device = _device(spec.device)
-    scaler = Scaler.fit(train.x, train.vectors if arch.vector is not None else ())
+    vectors = train.vectors if arch.vector is not None else ()
+    scaler = Scaler.none(train.x.shape[1]) if spec.scaling == "none" else Scaler.fit(train.x, vectors)
     x, y = _tensors(train, scaler, arch, device)
     val_data = None if validation is None or not len(validation) else _tensors(validation, scaler, arch, device)
     stops = val_data is not None and spec.patience is not None

@@ -67,7 +67,7 @@ def fine_tune(
     if not deployable(arch) or not calibration:
         raise TrainingError(
             f"{arch.title} cannot be deployed, so there is nothing to fine-tune it for: train it with --padding stream "
-            "and --norm batch."
+            "and --norm batch or none."
         )
     if epochs < 1:
         raise TrainingError(f"{epochs} epochs of fine-tuning: accepted are 1 and more.")
@@ -137,8 +137,11 @@ class Rounded:
             w, b = _rounded(tensors[f"conv{i}.weight"], tensors[f"conv{i}.bias"], unit, start, mean)
             sums = F.conv1d(codes, w, b, dilation=layer.dilation)
             codes = _whole(sums / (top / 255)[:, None])
-            gain = tensors[f"norm{i}.gain"] / torch.sqrt(tensors[f"norm{i}.var"] + NORM_EPSILON)
-            unit, start = gain * top / 255, tensors[f"norm{i}.shift"] - tensors[f"norm{i}.mean"] * gain
+            gain, start = torch.ones_like(top), torch.zeros_like(top)
+            if arch.norm == "batch":
+                gain = tensors[f"norm{i}.gain"] / torch.sqrt(tensors[f"norm{i}.var"] + NORM_EPSILON)
+                start = tensors[f"norm{i}.shift"] - tensors[f"norm{i}.mean"] * gain
+            unit = gain * top / 255
             mean = gain * self._means[i + 1] + start
         w, b = _rounded(tensors["dense.weight"], tensors["dense.bias"], unit, start, mean)
         return F.linear(codes.mean(dim=2), w, b)

@@ -10,6 +10,7 @@ from plushsense.training.augment import parse_augmentation
 
 DEVICES = ("auto", "cpu", "cuda")
 STOP_ON = ("loss", "accuracy")
+SCALINGS = ("z-score", "none")
 
 # Part of every training's id: increase it when the same settings give another result.
 TRAINING_VERSION = 2
@@ -29,6 +30,8 @@ class TrainSpec:
     The learning rate is halved every ``halve_every`` epochs (None: constant). Training stops
     after ``patience`` epochs without a better validation loss (``stop_on`` "accuracy": a better accuracy) and returns
     the best weights; None: it runs all epochs and returns the last weights.
+    ``scaling`` of the inputs is "z-score", by mean and standard deviation of each channel over the training windows, or
+    "none", as in the authors' script: the network reads integers.
     ``augment`` names the augmentations of the training windows (see `training.augment`).
     ``device`` "auto" is CUDA if it is available. ``threads`` is for the CPU. More than one rarely helps: a batch is
     divided among them in chunks of 64 windows, and PyTorch's own threads gain little on networks as small as these (on
@@ -42,6 +45,7 @@ class TrainSpec:
     patience: int | None = 10
     stop_on: str = "loss"
     augment: tuple[str, ...] = ()
+    scaling: str = "z-score"
     seed: int = 0
     device: str = "auto"
     threads: int = 1
@@ -59,6 +63,7 @@ class TrainSpec:
         for augmentation in self.augment:
             parse_augmentation(augmentation)
         check_known(self.device, DEVICES, "device to train on", ConfigError)
+        check_known(self.scaling, SCALINGS, "scaling of the inputs", ConfigError)
         check_known(self.stop_on, STOP_ON, "measure to stop on", ConfigError)
 
     def learning_rate_at(self, epoch: int) -> float:
@@ -80,7 +85,7 @@ class TrainSpec:
         return replace(self, **changes)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON.
+        """Return plain values, ready for JSON, without ``scaling`` if it is the default.
 
         ``augment`` with at most a random rotation is written as ``turn_deg``, as in earlier versions, so that the ids
         of their trainings and evaluations stay the same.
@@ -88,6 +93,8 @@ class TrainSpec:
         parsed = [parse_augmentation(text) for text in self.augment]
         values: dict[str, Any] = {}
         for key, value in asdict(self).items():
+            if key == "scaling" and value == "z-score":
+                continue
             if key != "augment":
                 values[key] = value
             elif [name for name, _ in parsed] in ([], [_ROTATION]):

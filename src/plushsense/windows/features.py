@@ -142,6 +142,11 @@ class Scaler:
             mean[axes] = 0.0
         return cls(mean, np.where(spread > 0, 1.0 / np.where(spread > 0, spread, 1.0), 1.0))
 
+    @classmethod
+    def none(cls, channels: int) -> Scaler:
+        """Return the scaling that changes nothing."""
+        return cls(np.zeros(channels), np.ones(channels))
+
     def apply(self, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
         """Scale windows (N, F, T) for the network."""
         scaled = (x - self.offset[:, None]) * self.scale[:, None]

@@ -3,7 +3,8 @@
     [windows]     window_s, step_s, context, longest_factor
     [anywhere]    every_s, onset_s, after_s, settle_s, idle_share, busy_share, hard_share
     [model]       arch, filters, padding, norm, step_s, pool_s
-    [training]    preset, epochs, batch, learning_rate, halve_every, patience, stop_on, augment, seed, device, threads
+    [training]    preset, epochs, batch, learning_rate, halve_every, patience, stop_on, augment, scaling, seed, device,
+                  threads
     [evaluation]  split, classes, train_context, workers, seed
     [live]        smoothing_s
 
@@ -245,7 +246,7 @@ _SETTINGS: dict[str, tuple[str, ...]] = {
     "model": ("arch", "filters", "padding", "norm", "pool_s"),
     "training": (
         *("preset", "epochs", "batch", "learning_rate", "halve_every", "patience", "device"),
-        *("augment", "turn_deg"),
+        *("augment", "turn_deg", "scaling"),
     ),
     "evaluation": ("classes", "train_context", "workers"),
     "live": ("smoothing_s",),

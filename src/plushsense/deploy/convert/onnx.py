@@ -100,6 +100,8 @@ def float_model(bundle: Bundle) -> bytes:
         w, b = (g.constant(n, bundle.weights[n]) for n in (f"conv{i}.weight", f"conv{i}.bias"))
         z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel], pads=pads)
         z = g.add("Relu", f"relu{i}", z)
+        if arch.norm == "none":
+            continue
         gain, shift = (g.constant(n, bundle.weights[n]) for n in (f"norm{i}.gain", f"norm{i}.shift"))
         if arch.norm == "batch":
             mean, var = (g.constant(n, bundle.weights[n]) for n in (f"norm{i}.mean", f"norm{i}.var"))

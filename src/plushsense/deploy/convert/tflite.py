@@ -208,6 +208,8 @@ def _padded(g: _TfliteGraph, i: int, arch: Arch, layer: ConvLayer, z: int) -> in
 
 
 def _normed(g: _TfliteGraph, i: int, bundle: Bundle, z: int, shape: tuple[int, ...]) -> int:
+    if bundle.arch.norm == "none":
+        return z
     gain, shift = affine(bundle.arch, i, bundle.weights)
     if bundle.arch.norm == "layer":
         row = (*shape[:3], 1)
