@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from plushsense.core.errors import DatasetError, DeviceError
+from plushsense.core.errors import ConfigError, DatasetError, DeviceError
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import STREAM_NAME, read_recording, read_stream
 from plushsense.devices.base import Device, Frame, now_ms
@@ -630,3 +630,43 @@ def test_a_session_can_be_closed_while_no_file_descriptor_is_free(tmp_path: Path
     said = without_descriptors(tmp_path, "stays")
     assert said["done"] == 0
     assert "close other programs, and continue the same session" in said["failed"]
+
+
+def test_a_toy_is_exchanged_within_the_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with recorder(tmp_path) as r, open_device(URL + "&person=9") as other, open_device(URL) as third:
+        former = r.device
+        r.space()
+        assert r.wait("recording", timeout_s=20)
+        with pytest.raises(ConfigError, match="between two recordings"):
+            r.exchange(other)
+        until(lambda: r.status().elapsed_s > 1)
+        r.space()
+        assert r.wait("idle", timeout_s=20)
+        r.pause()
+        assert r.exchange(other) is former
+        former.close()
+        until(lambda: r.status().signal != "none")
+        assert (r.status().state, r.status().done, r.status().message.reason) == ("paused", 1, "exchanged")
+        r.mark()
+        # The data of this toy end, and the session goes on with a third one.
+        monkeypatch.setattr(other, "read", lambda: None)
+        assert r.wait("stopped", timeout_s=20)
+        assert r.status().message.reason == "data_ended"
+        r.exchange(third)
+        r.resume()
+        until(lambda: r.status().signal != "none")
+        assert (r.status().state, r.status().done) == ("idle", 1)
+        r.space()
+        assert r.wait("recording", timeout_s=20)
+        until(lambda: r.status().elapsed_s > 1)
+        r.space()
+        assert r.wait("idle", timeout_s=20)
+    events = list(read_events(tmp_path))
+    exchanges = [e.details for e in events if e.kind == "exchange"]
+    assert [e["device"] for e in exchanges] == [other.url, URL]
+    stream = read_stream(tmp_path / STREAM_NAME, LAYOUT).frames
+    assert len(stream) == next(e.details["rows"] for e in events if e.kind == "close")
+    assert {e.details["after_row"] for e in events if e.kind == "gap"} >= {e["row"] for e in exchanges}
+    mark = next(e.details for e in events if e.kind == "mark")
+    assert mark["device_ms"] in stream.device_ms and mark["host_ms"] <= now_ms()
+    assert [e.details["gesture"] for e in events if e.kind == "take"] == ["Back stroke 1", "Head stroke 1"]

@@ -1,11 +1,12 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from plushsense.core.errors import ConfigError, GestureError
 from plushsense.devices.virtual.session import GESTURES
-from plushsense.recording.plan import Protocol, load_protocol, protocol_names, wordings
+from plushsense.recording.plan import Protocol, load_protocol, protocol_names, save_protocol, wordings
 
 
 def own(folder: Path, text: str) -> Path:
@@ -56,8 +57,26 @@ def test_every_built_in_prompt_is_there_in_latvian(name: str) -> None:
 
 def test_the_wordings_of_a_protocol(tmp_path: Path) -> None:
     assert wordings("plush-17") == ("default", "child", "lv", "lv-child")
-    assert wordings(own(tmp_path, '[prompts]\n"Tail pull" = { de = "Zieh" }\n')) == ("default", "de")
-    assert wordings(own(tmp_path, "")) == ("default",)
+    # Gestures without own prompts have the built-in ones.
+    text = 'gestures = ["tail_pull"]\n[prompts]\n"Tail pull" = { de = "Zieh" }\n'
+    assert wordings(own(tmp_path, text)) == ("default", "child", "de", "lv", "lv-child")
+    assert load_protocol(own(tmp_path, text), "lv").prompts["Tail pull"].startswith("Vienreiz spēcīgi parauj")
+    assert load_protocol(own(tmp_path, text)).prompts["Tail pull"].startswith("One energetic pull of the tail")
+    assert wordings(own(tmp_path, 'gestures = ["Tail pull"]\n[prompts]\n"Tail pull" = "Zieh"\n')) == ("default",)
+
+
+def test_a_random_order_depends_on_the_seed_alone(tmp_path: Path) -> None:
+    path = tmp_path / "mixed.toml"
+    saved = save_protocol(path, "mixed", ("Tail pull", "Hold strong"), 2, "random")
+    assert saved == load_protocol(path)
+    first, second, again = ([(s.gesture, s.repetition) for s in replace(saved, seed=n).steps()] for n in (1, 2, 1))
+    assert first == again == [("Tail pull", 1), ("Hold strong", 2), ("Hold strong", 1), ("Tail pull", 2)]
+    assert first != second and sorted(first) == sorted(second)
+    assert Protocol.from_dict(replace(saved, seed=7).to_dict()).seed == 7
+    for gestures, repetitions in (((), 1), (("Tail pull",), 0)):
+        with pytest.raises(ConfigError, match=r"at least one|accepted are 1"):
+            save_protocol(tmp_path / "none.toml", "none", gestures, repetitions, "random")
+    assert not (tmp_path / "none.toml").exists()
 
 
 def test_a_users_own(tmp_path: Path) -> None:

@@ -215,7 +215,7 @@ def test_a_users_own_protocol_and_layout(controller: RecordController, tmp_path:
     own = tmp_path / "protocols" / "mine.toml"
     own.write_text('name = "mine"\ngesture_set = "plush-18"\ngestures = ["Tail pull"]\nrepetitions = 2\n', "utf-8")
     assert next(iter(controller.protocols())) == "plush-17"
-    assert controller.protocols()[str(own)] == "mine.toml"
+    assert controller.protocols()[str(own)] == "mine"
     assert "plush-14" in controller.layouts()
     session = controller.begin(SessionRequest(CALM, "S02", str(own), layout="plush-14", speed=SPEED))
     assert [s.step.gesture for s in session.recorder.steps()] == ["Tail pull"] * 2

@@ -115,6 +115,7 @@ def _notices(request: SessionRequest, head: SessionHead, fresh: bool) -> list[st
 def _drive(recorder: Recorder, typed: KeySource, screen: Screen, auto: bool) -> None:  # noqa: C901
     """Run the commands of pressed keys and update the screen until the session ends."""
     from plushsense.cli.terminal import END, KeyRepeatFilter
+    from plushsense.recording.session_files import Message
 
     note: str | None = None
     confirming = False
@@ -153,7 +154,8 @@ def _drive(recorder: Recorder, typed: KeySource, screen: Screen, auto: bool) -> 
         elif key in "qQ":
             if status.state == "recording" and not confirming:
                 confirming = True
-                recorder.show_message("Recording: press q again to quit and discard it, or SPACE to stop it first.")
+                sentence = "Recording: press q again to quit and discard it, or SPACE to stop it first."
+                recorder.show_message(Message(sentence))
                 continue
             return
         elif typed.script and key == ".":

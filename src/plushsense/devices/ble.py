@@ -123,7 +123,8 @@ class BleDevice(Device):
                 if frames:
                     return frames
                 self._parser.finish()
-                raise DeviceError(f"'{self.url}' went away (disconnected): was it switched off or out of reach?")
+                message = f"'{self.url}' went away (disconnected): was it switched off or out of reach?"
+                raise DeviceError(message, reason="toy_gone", url=self.url)
             at, host, data = received
             if wait:
                 self.arrived_s = at
@@ -162,9 +163,11 @@ class BleDevice(Device):
             if not opened.done():
                 broken = cause
                 if not isinstance(cause, Exception):
-                    broken = DeviceError(f"'{self.url}' broke off while it was being connected; try again.")
+                    message = f"'{self.url}' broke off while it was being connected; try again."
+                    broken = DeviceError(message, reason="toy_unreachable", url=self.url)
                 elif not isinstance(cause, DeviceError):
-                    broken = DeviceError(f"'{self.url}': {in_words(cause)}.")
+                    message = f"'{self.url}': {in_words(cause)}."
+                    broken = DeviceError(message, reason="toy_unreachable", url=self.url)
                 opened.set_exception(broken)
         finally:
             self._received.put(None)
@@ -180,7 +183,9 @@ class BleDevice(Device):
         except TimeoutError:
             raise DeviceError(
                 f"'{self.url}' was found but could not be connected within {_CONNECT_S:g} s: "
-                "is another computer or phone connected to it?"
+                "is another computer or phone connected to it?",
+                reason="toy_unreachable",
+                url=self.url,
             ) from None
         try:
             characteristic = self._characteristic(list(client.services))
@@ -215,7 +220,9 @@ class BleDevice(Device):
         described = f"named '{target.name}'" if target.address is None else f"with the address {target.address}"
         raise DeviceError(
             f"'{self.url}': no Bluetooth device {described} advertised within {target.find_s:g} s; {here}; "
-            "is it switched on, near, and not connected elsewhere?"
+            "is it switched on, near, and not connected elsewhere?",
+            reason="toy_unreachable",
+            url=self.url,
         )
 
     def _characteristic(self, services: list[Any]) -> Any:

@@ -99,11 +99,14 @@ class LslDevice(Device):
             return next(iter(found.values()))
         if found:
             sources = ", ".join(f"'{s.source_id()}' on {s.hostname()}" for s in found.values())
-            raise DeviceError(f"'{self.url}' fits {len(found)} streams, of {sources}: name one by lsl://source:ID.")
+            message = f"'{self.url}' fits {len(found)} streams, of {sources}: name one by lsl://source:ID."
+            raise DeviceError(message, reason="url_bad", url=self.url)
         there = ", ".join(f"{s.name()} ({s.type() or 'no type'})" for s in self._pylsl.resolve_streams(0.5))
         raise DeviceError(
             f"'{self.url}': no LSL stream has the {key} '{value}' within {find_s:g} s; "
-            f"{f'there are {there}' if there else 'there is none on this network'}."
+            f"{f'there are {there}' if there else 'there is none on this network'}.",
+            reason="toy_unreachable",
+            url=self.url,
         )
 
     def read(self) -> list[Frame] | None:
@@ -117,7 +120,8 @@ class LslDevice(Device):
                     return []
                 samples, stamps = self._inlet.pull_chunk(timeout=0.0, max_samples=512)
             except RuntimeError:
-                raise DeviceError(f"'{self.url}' went away: has its program ended, or is it out of reach?") from None
+                message = f"'{self.url}' went away: has its program ended, or is it out of reach?"
+                raise DeviceError(message, reason="toy_gone", url=self.url) from None
         self.arrived_s = time.perf_counter()
         host = now_ms()
         frames = [

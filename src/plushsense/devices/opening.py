@@ -59,7 +59,9 @@ class DeviceAddress:
             if key not in accepted:
                 raise ConfigError(
                     f"'{self.url}': unknown setting '{key}' of {self.scheme}://: "
-                    f"accepted are {', '.join(accepted)}.{nearest(key, accepted)}"
+                    f"accepted are {', '.join(accepted)}.{nearest(key, accepted)}",
+                    reason="url_bad",
+                    url=self.url,
                 )
 
     def whole(self, key: str, default: int, low: int = 0, high: int = 2**31 - 1) -> int:
@@ -68,7 +70,8 @@ class DeviceAddress:
         if text is None:
             return default
         if not re.fullmatch(r"\d{1,10}", text, re.ASCII) or not low <= int(text) <= high:
-            raise ConfigError(f"'{self.url}': {key} is '{text}'; accepted is a whole number, {low} to {high}.")
+            message = f"'{self.url}': {key} is '{text}'; accepted is a whole number, {low} to {high}."
+            raise ConfigError(message, reason="url_bad", url=self.url)
         return int(text)
 
     def number(self, key: str, default: float, low: float = 0.0, high: float = 1e6) -> float:
@@ -81,7 +84,8 @@ class DeviceAddress:
         except ValueError:
             value = math.nan
         if not low <= value <= high:
-            raise ConfigError(f"'{self.url}': {key} is '{text}'; accepted is a number, {low:g} to {high:g}.")
+            message = f"'{self.url}': {key} is '{text}'; accepted is a number, {low:g} to {high:g}."
+            raise ConfigError(message, reason="url_bad", url=self.url)
         return value
 
 
@@ -93,20 +97,23 @@ def parse_url(url: str) -> DeviceAddress:
     """
     text = os.fspath(url).strip()
     if not text:
-        raise ConfigError(f"No device URL was given; accepted are {EXAMPLES}.")
+        raise ConfigError(f"No device URL was given; accepted are {EXAMPLES}.", reason="no_toy")
     match = re.match(r"([A-Za-z][A-Za-z0-9+.\-]+):(//)?", text)
     if match is None or (match[2] is None and match[1].lower() not in SCHEMES):
         if Path(text).is_file():
             return DeviceAddress(text, "replay", text)
         if re.fullmatch(r"/dev/\S+|COM\d+", text):
-            raise ConfigError(f"'{text}' is a port, no recording to replay: write serial://{text}.")
+            message = f"'{text}' is a port, no recording to replay: write serial://{text}."
+            raise ConfigError(message, reason="url_bad", url=text)
         place, query = _split_query(text, text)
         return DeviceAddress(text, "replay", place, query)
     scheme = match[1].lower()
     if scheme not in SCHEMES:
         raise ConfigError(
             f"'{text}': there is no scheme '{scheme}'; accepted are {', '.join(SCHEMES)}, as in {EXAMPLES}."
-            f"{nearest(scheme, SCHEMES)}"
+            f"{nearest(scheme, SCHEMES)}",
+            reason="url_bad",
+            url=text,
         )
     place, query = _split_query(text[match.end() :], text)
     return DeviceAddress(text, scheme, place, query)
@@ -120,9 +127,11 @@ def _split_query(rest: str, url: str) -> tuple[str, dict[str, str]]:
             continue
         key, equals, value = part.partition("=")
         if not equals or not key:
-            raise ConfigError(f"'{url}': '{part}' is no setting; write key=value, joined by &.")
+            message = f"'{url}': '{part}' is no setting; write key=value, joined by &."
+            raise ConfigError(message, reason="url_bad", url=url)
         if key in query:
-            raise ConfigError(f"'{url}': the setting '{key}' stands there twice; leave one.")
+            message = f"'{url}': the setting '{key}' stands there twice; leave one."
+            raise ConfigError(message, reason="url_bad", url=url)
         query[key] = unquote(value.replace("+", " "))
     return place, query
 

@@ -28,7 +28,7 @@ class ReplayDevice(PacedDevice):
         try:
             result = (read_recording if parse_name(path.name) else read_stream)(path, layout)
         except FileFormatError as cause:
-            raise DeviceError(f"'{url}' cannot be replayed: {cause}") from None
+            raise DeviceError(f"'{url}' cannot be replayed: {cause}", reason="replay_unreadable", url=url) from None
         self.path = path
         self.warnings = result.warnings
         self.counters.malformed = result.malformed
@@ -71,6 +71,8 @@ def open_replay(address: DeviceAddress, layout: Layout) -> ReplayDevice:
     if not address.place or not path.is_file():
         raise DeviceError(
             f"'{address.url}': there is no file '{path if address.place else ''}' to replay; "
-            "give the path of a recording or of a fulldatastream.csv."
+            "give the path of a recording or of a fulldatastream.csv.",
+            reason="replay_missing",
+            url=address.url,
         )
     return ReplayDevice(address.url, layout, path, speed)

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import random
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import ConfigError, nearest
+import tomli_w
+
+from plushsense.core.errors import BadInput, ConfigError, nearest
+from plushsense.core.files import write_file
 from plushsense.core.gestures import load_gestures, plain_label
 from plushsense.core.recorder_csv import parse_name, recording_filename
 from plushsense.core.toml import builtin_names, load_table, read_named
@@ -15,10 +21,14 @@ from plushsense.core.toml import builtin_names, load_table, read_named
 ORDERS = {
     "gesture": "all repetitions of a gesture one after another, as in the paper",
     "round": "every gesture once, then every gesture again",
+    "random": "all recordings in an order that is drawn for each session, whose head stores the seed",
 }
 DEFAULT = "default"
-"""Wording used where a prompt lacks the chosen one; if both are missing, the gesture's description is the prompt."""
+"""Wording used where a prompt lacks the chosen one.
 
+A gesture without a prompt in a protocol has that of the built-in protocols, or else its description."""
+
+_MOST_REPETITIONS = 1000
 _LIMITS = {"countdown_s": (0.0, 60.0), "shortest_s": (0.0, 60.0), "longest_s": (1.0, 36_000.0)}
 
 
@@ -37,9 +47,9 @@ class Protocol:
     """The plan of a session.
 
     ``gestures`` are labels in recording order, ``prompts`` maps each to the text shown to the person, ``words`` is the
-    chosen wording of the prompts, ``order`` one of `ORDERS`, and ``nobody`` the gestures recorded without a person.
-    ``countdown_s`` is the time from the first press of the space bar to the first row. The second press stops the
-    recording, but not within ``shortest_s``; it ends automatically after ``longest_s``.
+    chosen wording of the prompts, ``order`` one of `ORDERS`, ``seed`` that of a random order, and ``nobody`` the
+    gestures recorded without a person. ``countdown_s`` is the time from the first press of the space bar to the first
+    row. The second press stops the recording, but not within ``shortest_s``; it ends automatically after ``longest_s``.
     """
 
     name: str
@@ -54,6 +64,7 @@ class Protocol:
     longest_s: float = 60.0
     words: str = DEFAULT
     nobody: tuple[str, ...] = ()
+    seed: int = 0
 
     @property
     def needs_nobody(self) -> bool:
@@ -67,11 +78,16 @@ class Protocol:
             pairs = [(g, r) for r in repetitions for g in self.gestures]
         else:
             pairs = [(g, r) for g in self.gestures for r in repetitions]
+        if self.order == "random":
+            # Python promises the same `random` for a seed in every version, but not the same `shuffle`.
+            draw = random.Random(self.seed).random
+            pairs = [pair for _, pair in sorted((draw(), pair) for pair in pairs)]
         return tuple(Step(n, g, r, self.prompts[g]) for n, (g, r) in enumerate(pairs))
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, from which `from_dict` builds the same protocol without other files."""
-        return asdict(self) | {"gestures": list(self.gestures), "nobody": list(self.nobody)}
+        table = asdict(self) | {"gestures": list(self.gestures), "nobody": list(self.nobody)}
+        return {key: value for key, value in table.items() if key != "seed" or value}
 
     @classmethod
     def from_dict(
@@ -95,8 +111,9 @@ class Protocol:
             raise ConfigError(
                 f"The {where}: order is '{file.order}'; accepted are {', '.join(ORDERS)}.{nearest(file.order, ORDERS)}"
             )
-        if not 1 <= file.repetitions <= 1000:
-            raise ConfigError(f"The {where}: repetitions is {file.repetitions}; accepted are 1 to 1000.")
+        if not 1 <= file.repetitions <= _MOST_REPETITIONS:
+            message = f"The {where}: repetitions is {file.repetitions}; accepted are 1 to {_MOST_REPETITIONS}."
+            raise ConfigError(message)
         for key, (low, high) in _LIMITS.items():
             if not low <= (value := getattr(file, key)) <= high:
                 raise ConfigError(f"The {where}: {key} is {value:g}; {low:g} to {high:g} seconds are accepted.")
@@ -123,6 +140,7 @@ class _ProtocolFile:
     longest_s: float = 60.0
     words: str = DEFAULT
     nobody: tuple[str, ...] | None = None
+    seed: int = 0
 
 
 def _resolved(file: _ProtocolFile, where: str, words: str, beside: Path | None) -> dict[str, Any]:
@@ -137,7 +155,8 @@ def _resolved(file: _ProtocolFile, where: str, words: str, beside: Path | None) 
     gestures = [gesture_set.get(label) for label in labels] or [g for g in gesture_set.gestures if not g.nobody]
     if len({g.label for g in gestures}) < len(gestures) or not gestures or file.gestures == ():
         raise ConfigError(f"The {where} must name every gesture once, and at least one: see its gestures.")
-    wordings = {DEFAULT, *(w for text in file_prompts.values() if isinstance(text, Mapping) for w in text)}
+    known = _builtin_prompts(file.gesture_set)
+    wordings = _wordings_of(file_prompts, [g.label for g in gestures], known)
     if words not in wordings:
         raise ConfigError(
             f"The {where} has no wording '{words}'; it has {', '.join(sorted(wordings))}.{nearest(words, wordings)}"
@@ -147,7 +166,9 @@ def _resolved(file: _ProtocolFile, where: str, words: str, beside: Path | None) 
     for gesture in gestures:
         text = texts.get(gesture.label, {})
         if isinstance(text, Mapping):
-            text = text.get(words) or text.get(DEFAULT) or gesture.description or gesture.label
+            builtin = known.get(gesture.label, {})
+            text = text.get(words) or text.get(DEFAULT) or builtin.get(words) or builtin.get(DEFAULT) or ""
+            text = text or gesture.description or gesture.label
         if not text.strip():
             raise ConfigError(f"The {where}: the prompt of '{gesture.label}' is {text!r}; it must be a text.")
         parsed = parse_name(recording_filename(gesture.label, 0, 0))
@@ -168,11 +189,47 @@ def protocol_names() -> tuple[str, ...]:
 
 def wordings(name_or_path: str | Path) -> tuple[str, ...]:
     """Return the wordings of a protocol's prompts, `DEFAULT` first; raise ConfigError like `load_protocol`."""
-    table, _ = read_named(name_or_path, "protocols", "protocol", ConfigError)
-    prompts = table.get("prompts")
-    texts = prompts.values() if isinstance(prompts, Mapping) else ()
-    others = {str(w) for text in texts if isinstance(text, Mapping) for w in text}
+    with _naming(name_or_path):
+        table, _ = read_named(name_or_path, "protocols", "protocol", ConfigError)
+    prompts, gestures = table.get("prompts"), table.get("gestures")
+    known = _builtin_prompts(str(table.get("gesture_set", "")))
+    labels = gestures if isinstance(gestures, list) else list(known)
+    others = _wordings_of(prompts if isinstance(prompts, Mapping) else {}, labels, known)
     return (DEFAULT, *sorted(others - {DEFAULT}))
+
+
+@cache
+def _builtin_prompts(gesture_set: str) -> dict[str, Mapping[str, str]]:
+    """Return the prompts of the built-in protocols for the gestures of a set, by label and wording."""
+    tables = [read_named(name, "protocols", "protocol", ConfigError)[0] for name in protocol_names()]
+    return {g: texts for t in tables if t["gesture_set"] == gesture_set for g, texts in t.get("prompts", {}).items()}
+
+
+def _wordings_of(prompts: Mapping[str, Any], labels: Sequence[str], known: Mapping[str, Mapping[str, str]]) -> set[str]:
+    """Return the wordings of a protocol's own prompts, and of the built-in ones for gestures that have no own text."""
+    own = {plain_label(label) for label, text in prompts.items() if isinstance(text, str)}
+    tables = [text for text in prompts.values() if isinstance(text, Mapping)]
+    tables += [known[g] for g in known if plain_label(g) in {plain_label(str(n)) for n in labels} - own]
+    return {DEFAULT, *(str(w) for table in tables for w in table)}
+
+
+def save_protocol(path: Path, name: str, gestures: Sequence[str], repetitions: int, order: str) -> Protocol:
+    """Write a protocol of gestures of plush-18, with the built-in prompts, to the new file ``path``; return it.
+
+    Raises:
+        ConfigError: if no gesture is given, or a value is out of range.
+    """
+    if not gestures:
+        raise ConfigError("A protocol needs at least one gesture: choose one.", reason="no_gestures")
+    if not 1 <= repetitions <= _MOST_REPETITIONS:
+        message = f"repetitions is {repetitions}; accepted are 1 to {_MOST_REPETITIONS}."
+        raise ConfigError(message, reason="repetitions_bad", most=_MOST_REPETITIONS)
+    table: dict[str, Any] = {"name": name, "title": name, "gesture_set": "plush-18", "gestures": list(gestures)}
+    table |= {"repetitions": repetitions, "order": order}
+    protocol = Protocol.from_dict(table)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, tomli_w.dumps(table))
+    return protocol
 
 
 def load_protocol(name_or_path: str | Path, words: str | None = None) -> Protocol:
@@ -181,6 +238,16 @@ def load_protocol(name_or_path: str | Path, words: str | None = None) -> Protoco
     Raises:
         ConfigError: for an unknown name or an unusable file.
     """
-    table, source = read_named(name_or_path, "protocols", "protocol", ConfigError)
-    beside = None if source in protocol_names() else Path(source).parent
-    return Protocol.from_dict(table, f"protocol '{source}'", words, beside)
+    with _naming(name_or_path):
+        table, source = read_named(name_or_path, "protocols", "protocol", ConfigError)
+        beside = None if source in protocol_names() else Path(source).parent
+        return Protocol.from_dict(table, f"protocol '{source}'", words, beside)
+
+
+@contextmanager
+def _naming(name_or_path: str | Path) -> Iterator[None]:
+    """Let errors in the block name the protocol."""
+    try:
+        yield
+    except BadInput as cause:
+        raise type(cause)(str(cause), reason="protocol_bad", name=Path(name_or_path).name) from None

@@ -5,7 +5,8 @@ Commands do not wait for their effects, which `plushsense.recording.states` impl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import secrets
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -20,11 +21,15 @@ from plushsense.devices.opening import open_device, parse_url
 from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.recording.plan import load_protocol
 from plushsense.recording.session import OpenSession, check_session, check_subject, new_session, next_session
-from plushsense.recording.session_files import SessionHead
+from plushsense.recording.session_files import Message, SessionHead
 from plushsense.recording.states import RecorderState, RecorderStatus, RecordingMachine, StepResult, key_of, write_error
 from plushsense.recording.writer import BackgroundWriter, StreamFile
 
-_NO_DESCRIPTOR = "Too many files are open on this computer: saving waits until some are closed. Nothing is lost."
+_NO_DESCRIPTOR = Message(
+    "Too many files are open on this computer: saving waits until some are closed. Nothing is lost.", "saving_waits"
+)
+_RECORDING = Message("Recording: space stops it, r discards it.", "recording_first")
+_CANCELLED = Message("The countdown was cancelled.", "cancelled")
 
 
 class Recorder(RecordingMachine):
@@ -106,7 +111,8 @@ class Recorder(RecordingMachine):
                 resumed=self.session.progress.resumed,
                 row=self._receiver.rows,
             )
-            self._advance("; ".join(self.session.progress.repairs), from_start=True)
+            repairs = self.session.progress.repairs
+            self._advance(Message("; ".join(repairs), "repaired", n=len(repairs)), from_start=True)
         self._reader.start()
 
     def space(self) -> None:
@@ -114,72 +120,79 @@ class Recorder(RecordingMachine):
         with self._notifying():
             if self._state == "idle":
                 if self._receiver.quality().signal == "unreadable":
-                    self._show_message(
-                        f"The toy sends lines, but none is a frame of {self.session.layout.name} "
-                        f"({len(self.session.layout.wire)} numbers): is the layout right, and the cable sound?"
+                    layout, fields = self.session.layout.name, len(self.session.layout.wire)
+                    sentence = (
+                        f"The toy sends lines, but none is a frame of {layout} ({fields} numbers): "
+                        "is the layout right, and the cable sound?"
                     )
+                    self._show_message(Message(sentence, "unreadable", layout=layout, n=fields))
                 elif self._receiver.silent:
-                    self._show_message("Nothing comes from the toy: is it switched on and near?")
+                    sentence = "Nothing comes from the toy: is it switched on and near?"
+                    self._show_message(Message(sentence, "silent"))
                 else:
                     self._begin()
             elif self._state == "countdown":
-                self._cancel("The countdown was cancelled.")
+                self._cancel(_CANCELLED)
             elif self._state == "recording" and self._take is not None:
                 if max(self._passed_s(), self._wall_s()) < self.protocol.shortest_s:
-                    self._show_message("Too early to stop: still recording.")
+                    self._show_message(Message("Too early to stop: still recording.", "too_early"))
                 else:
                     self._stop("space")
             elif self._state == "paused":
-                self._show_message("Paused: resume first (p).")
+                self._show_message(Message("Paused: resume first (p).", "paused"))
 
     def redo(self, why: str = "") -> None:
         """Record again: stop the running recording, or else discard the last one, whose file is kept."""
         with self._notifying():
             if self._state == "countdown":
-                self._cancel("The countdown was cancelled.")
+                self._cancel(_CANCELLED)
             elif self._state == "recording":
-                self._abandon("redo", "Stopped: record it again.")
+                self._abandon("redo", Message("Stopped: record it again.", "broken_off"))
             elif self._state in ("idle", "paused", "finished"):
                 key = self._plan.last
                 if key is None:
-                    self._show_message("There is no recording to repeat: go back to it (b).")
+                    sentence = "There is no recording to repeat: go back to it (b)."
+                    self._show_message(Message(sentence, "nothing_to_repeat"))
                     return
                 file = self._plan.discard(key)
                 more = {"why": why} if why else {}
                 self._log("redo", file=file, gesture=key[0], repetition=key[1], **more)
-                self._ready(f"'{key[0]}', {key[1]}, is to be recorded again; skip (s) keeps the earlier recording.")
+                sentence = f"'{key[0]}', {key[1]}, is to be recorded again; skip (s) keeps the earlier recording."
+                self._ready(Message(sentence, "again", gesture=key[0], n=key[1]))
 
     def skip(self) -> None:
         """Skip this step; if it was to be recorded again, use the earlier recording."""
         with self._notifying():
             if self._state == "countdown":
-                self._cancel("")
+                self._cancel()
             if self._state == "recording":
-                self._show_message("Recording: space stops it, r discards it.")
+                self._show_message(_RECORDING)
             elif self._state in ("idle", "paused"):
                 key = key_of(self._plan.step)
-                message = ""
+                message = Message()
                 if file := self._plan.keep(key):
                     self._log("keep", file=file, gesture=key[0], repetition=key[1])
-                    message = "The earlier recording is kept."
+                    message = Message("The earlier recording is kept.", "kept")
                 elif key not in self._plan.takes:
                     self._plan.skipped.add(key)
                     self._log_step("skip")
-                    message = f"Skipped '{key[0]}', {key[1]}; go back to it with b."
+                    sentence = f"Skipped '{key[0]}', {key[1]}; go back to it with b."
+                    message = Message(sentence, "skipped", gesture=key[0], n=key[1])
                 self._advance(message)
 
     def go(self, number: int) -> None:
         """Go to the step ``number`` (from 0); its recording, if any, is replaced only when a new one is finished."""
         with self._notifying():
             if self._state == "countdown":
-                self._cancel("")
+                self._cancel()
             if self._state == "recording":
-                self._show_message("Recording: space stops it, r discards it.")
+                self._show_message(_RECORDING)
             elif self._state in ("idle", "paused", "finished"):
                 self._plan.at = min(max(0, number), len(self._plan.steps) - 1)
                 self._log_step("go")
                 there = key_of(self._plan.step) in self._plan.takes
-                self._ready("This step is recorded: space records it again, s goes on." if there else "")
+                sentence = "This step is recorded: space records it again, s goes on."
+                self._ready(Message(sentence, "recorded_already") if there else None)
 
     def back(self) -> None:
         """Go one step back."""
@@ -194,14 +207,15 @@ class Recorder(RecordingMachine):
         """
         with self._notifying():
             if self._state == "countdown":
-                self._cancel("")
+                self._cancel()
             if self._state not in ("idle", "recording"):
                 return
             self._paused = True
             if self._state == "recording":
-                self._abandon("pause", "The pause stopped this recording: record it again.")
+                sentence = "The pause stopped this recording: record it again."
+                self._abandon("pause", Message(sentence, "broken_off_by_pause"))
             else:
-                self._enter("paused", "")
+                self._enter("paused")
             self._log("pause")
 
     def resume(self) -> None:
@@ -210,30 +224,72 @@ class Recorder(RecordingMachine):
             if self._state == "paused":
                 self._paused = False
                 self._log("resume")
-                self._ready("")
+                self._ready()
+
+    def exchange(self, device: Device) -> Device:
+        """Go on with another toy of the same layout, in the same files; return the former toy, to be closed.
+
+        A recording that waits for a toy that is away is abandoned, and its step is to be recorded again.
+
+        Raises:
+            ConfigError: while a recording runs, is counted down to or saved, or the session has ended.
+        """
+        with self._notifying():
+            running = self._state in ("countdown", "saving") or (self._state == "recording" and not self._receiver.away)
+            if running or self._closing or device.layout.wire != self.session.layout.wire:
+                message = "The toy can be exchanged only between two recordings, for one of the same layout."
+                raise ConfigError(message, reason="no_exchange")
+            former, self.device = self.device, device
+            self._receiver.exchange(device)
+            self._log("exchange", device=device.url, former=former.url, row=self._receiver.rows)
+            message_to_all = Message("The session goes on with another toy.", "exchanged")
+            over, self.over = self.over, Message()
+            if self._state == "recording":
+                self._abandon("exchange", message_to_all)
+            elif self._state == "stopped":
+                self._advance(message_to_all, from_start=True)
+            else:
+                self._show_message(message_to_all)
+            if over:
+                # The reader of a toy whose data have ended is finished.
+                self._reader = self._new_reader()
+                self._reader.start()
+            return former
+
+    def mark(self) -> None:
+        """Log the present moment by both clocks, to find it again in a video."""
+        with self._notifying():
+            last, at_ms = self._receiver.last, now_ms()
+            device_ms = None
+            if last is not None and not self._receiver.silent:
+                # At real time, the toy's clock has gone on since its last frame.
+                device_ms = last.device_ms + (at_ms - last.host_ms if self._speed == 1.0 else 0)
+            self._log_step("mark", host_ms=at_ms, device_ms=device_ms, row=self._receiver.rows)
+            self._show_message(Message("Marked for the video.", "marked"))
 
     def note(self, text: str) -> None:
         """Log a remark with the time, the current step and the last recording."""
         text = " ".join(text.split())
         with self._notifying():
             if text and (self._closing or self._state == "stopped"):
-                self._show_message("The session has ended: this note is not saved.")
+                sentence = "The session has ended: this note is not saved."
+                self._show_message(Message(sentence, "note_too_late"))
             elif text:
                 self._log_step("note", text=text, file=self._plan.last_file)
-                self._show_message("Note saved.")
+                self._show_message(Message("Note saved.", "note_saved"))
 
-    def show_message(self, text: str) -> None:
+    def show_message(self, message: Message) -> None:
         """Show a message on every display."""
         with self._notifying():
-            self._show_message(text)
+            self._show_message(message)
 
     def close(self) -> None:
         """Close the session: abandon a running recording and write all other data. Closing twice is harmless."""
         with self._notifying():
             if self._state == "countdown":
-                self._cancel("")
+                self._cancel()
             elif self._state == "recording" and not self._failed:
-                self._abandon("quit", "")
+                self._abandon("quit")
             last, self._closing = not self._closing, True
         if self._reader.is_alive():
             self._reader.join()
@@ -287,15 +343,16 @@ def speed_of(url: str) -> float:
 def prompt_virtual(recorder: Recorder) -> None:
     """Let the simulated person of a virtual toy perform each requested gesture when it is recorded.
 
-    This has no effect on other toys. Call it before the recorder starts.
+    This has no effect on other toys. Call it before the recorder starts, and after `Recorder.exchange`.
     """
-    inner = getattr(recorder.device, "inner", recorder.device)
+    device = recorder.device
+    inner = getattr(device, "inner", device)
     if not isinstance(inner, VirtualDevice):
         return
     inner.follow()
 
     def on_change(change: str, status: RecorderStatus) -> None:
-        if change == "countdown" and status.state == "countdown":
+        if change == "countdown" and status.state == "countdown" and recorder.device is device:
             inner.perform(status.step.gesture, recorder.begins_ms)
 
     recorder.subscribe(on_change)
@@ -331,7 +388,8 @@ class SessionRequest:
 def check_speed(speed: float) -> float:
     """Return ``speed`` if it is valid, else raise ConfigError."""
     if not 0.0 <= speed <= FASTEST:
-        raise ConfigError(f"--speed is {speed:g}; 0 (as fast as it can) to {FASTEST:g} is accepted.")
+        message = f"--speed is {speed:g}; 0 (as fast as it can) to {FASTEST:g} is accepted."
+        raise ConfigError(message, reason="speed_bad", speed=speed, most=FASTEST)
     return speed
 
 
@@ -352,7 +410,8 @@ def session_folder(
     if not subject and request.protocol and load_protocol(request.protocol).needs_nobody:
         subject = NOBODY
     if not subject:
-        raise ConfigError("The session has no person: give --subject with the person's code, such as S01.")
+        message = "The session has no person: give --subject with the person's code, such as S01."
+        raise ConfigError(message, reason="no_person")
     person = out / check_subject(subject)
     if session is not None:
         name = check_session(session)
@@ -360,7 +419,8 @@ def session_folder(
         name = new_session(person) if new else next_session(person)
     known = SessionHead.read(person / name)
     if known is not None and new:
-        raise ConfigError(f"The session '{person / name}' exists: leave --new off, or give another --session.")
+        message = f"The session '{person / name}' exists: leave --new off, or give another --session."
+        raise ConfigError(message, reason="session_exists", name=f"{person.name}/{name}")
     return person / name, known
 
 
@@ -383,6 +443,8 @@ def session_head(request: SessionRequest, folder: Path, fresh: bool, layout: Lay
     if not named and request.words:
         raise ConfigError("--words goes with --protocol: a continued session keeps the wording it began with.")
     protocol = load_protocol(named, request.words or None) if named else None
+    if protocol is not None and protocol.order == "random" and fresh and not protocol.seed:
+        protocol = replace(protocol, seed=1 + secrets.randbelow(2**31 - 1))
     return SessionHead(
         subject=folder.parent.name,
         session=folder.name,

@@ -24,6 +24,7 @@ from plushsense.recording.session_files import (
     SESSION_HEAD,
     SESSION_LOG,
     SIDECAR,
+    Message,
     SessionEvent,
     SessionHead,
     read_events,
@@ -54,7 +55,7 @@ class SessionProgress:
     rows: int = 0
     host_ms: int = 0
     resumed: bool = False
-    repairs: list[str] = field(default_factory=list)
+    repairs: list[Message] = field(default_factory=list)
 
 
 def check_subject(code: str) -> str:
@@ -68,7 +69,9 @@ def check_subject(code: str) -> str:
     if valid is None or is_word or _RESERVED.fullmatch(code):
         raise DatasetError(
             f"'{code}' is no code for a person: give a short one with a number in it, such as S01, never a name "
-            "(at most 16 letters and digits; keep the name that belongs to S01 on paper, away from the recordings)."
+            "(at most 16 letters and digits; keep the name that belongs to S01 on paper, away from the recordings).",
+            reason="code_bad",
+            code=code,
         )
     return code
 
@@ -77,7 +80,9 @@ def check_session(name: str) -> str:
     """Return the name of a session if it is valid as a folder name, else raise DatasetError."""
     if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}", name, re.ASCII) is None or _RESERVED.fullmatch(name):
         raise DatasetError(
-            f"'{name}' is no name for a session: give at most 32 letters and digits, such as 1 or autumn."
+            f"'{name}' is no name for a session: give at most 32 letters and digits, such as 1 or autumn.",
+            reason="session_name_bad",
+            name=name,
         )
     return name
 
@@ -131,7 +136,8 @@ class OpenSession:
                 if head is not None:
                     folder.mkdir(parents=True, exist_ok=True)
                 elif not (folder / SESSION_HEAD).is_file():
-                    raise DatasetError(f"'{folder}' holds no session: there is no {SESSION_HEAD} in it.")
+                    message = f"'{folder}' holds no session: there is no {SESSION_HEAD} in it."
+                    raise DatasetError(message, reason="session_missing", name=folder.name)
                 self._lock = FileLock(str(folder / LOCK), timeout=0, thread_local=False)
                 self._lock.acquire()
                 undo.callback(self._release)
@@ -145,11 +151,14 @@ class OpenSession:
                 undo.pop_all()
         except Timeout:
             raise DatasetError(
-                f"Another program is recording the session '{folder}': continue there, or close it first."
+                f"Another program is recording the session '{folder}': continue there, or close it first.",
+                reason="session_in_use",
+                name=f"{folder.parent.name}/{folder.name}",
             ) from None
         except (OSError, NotImplementedError) as cause:
             why = getattr(cause, "strerror", None) or cause
-            raise DatasetError(f"'{folder}' cannot be used ({why}): check the path and the disk.") from None
+            message = f"'{folder}' cannot be used ({why}): check the path and the disk."
+            raise DatasetError(message, reason="folder_unusable", folder=folder, why=why) from None
 
     def _head(self, given: SessionHead | None) -> SessionHead:
         known = SessionHead.read(self.folder)
@@ -158,7 +167,10 @@ class OpenSession:
             others = [p.name for p in self.folder.iterdir() if p.name != LOCK and not p.name.endswith(PART)]
             if others:
                 raise DatasetError(
-                    f"'{self.folder}' holds '{others[0]}' but no session: give another --session or an empty folder."
+                    f"'{self.folder}' holds '{others[0]}' but no session: give another --session or an empty folder.",
+                    reason="folder_taken",
+                    folder=self.folder,
+                    file=others[0],
                 )
             given.write(self.folder)
             return given
@@ -170,6 +182,10 @@ class OpenSession:
         for key in ("subject", "layout", "protocol", "age_group", "gender", "consent"):
             old, new = getattr(known, key), getattr(given, key)
             old_json, new_json = json.loads(json.dumps([old, new]))
+            if key == "protocol":
+                # The seed of a random order is drawn once, when a session begins.
+                for table in (old_json, new_json):
+                    table.pop("seed", None)
             if old_json == new_json or not new:
                 continue
             if old:
@@ -177,12 +193,16 @@ class OpenSession:
                 differs = f"{names[0]!r}, not {names[1]!r}" if names[0] != names[1] else "another one of that name"
                 raise DatasetError(
                     f"The session '{self.folder}' was begun with the {key.replace('_', ' ')} {differs}: "
-                    f"leave --{key.replace('_', '-')} as it was, or begin a new session (--new)."
+                    f"leave --{key.replace('_', '-')} as it was, or begin a new session (--new).",
+                    reason=f"session_{key}_differs",
+                    name=f"{self.folder.parent.name}/{self.folder.name}",
                 )
             added[key] = new
         if given.simulated and not known.simulated:
             raise DatasetError(
-                f"The session '{self.folder}' was begun with a real toy: begin a new one (--new) for a virtual toy."
+                f"The session '{self.folder}' was begun with a real toy: begin a new one (--new) for a virtual toy.",
+                reason="session_of_real_toy",
+                name=f"{self.folder.parent.name}/{self.folder.name}",
             )
         if added:
             known = replace(known, **added)
@@ -264,7 +284,8 @@ def _repair(folder: Path, layout: Layout, log: LogFile) -> SessionProgress:
             path.unlink()
     if started is not None and started not in progress.takes:
         log.write([new_event("unfinished", gesture=started[0], repetition=started[1])])
-        progress.repairs.append(f"'{started[0]}', {started[1]}, was interrupted: record it again")
+        sentence = f"'{started[0]}', {started[1]}, was interrupted: record it again"
+        progress.repairs.append(Message(sentence, "interrupted", gesture=started[0], n=started[1]))
     return progress
 
 
@@ -334,7 +355,8 @@ def _repair_stream(path: Path, layout: Layout, progress: SessionProgress, log: L
             )
             file.truncate(whole)
             os.fsync(file.fileno())
-            progress.repairs.append(f"the incomplete last line of {path.name} was removed ({size - whole} bytes)")
+            sentence = f"the incomplete last line of {path.name} was removed ({size - whole} bytes)"
+            progress.repairs.append(Message(sentence, "line_removed", file=path.name))
 
 
 def _host_ms(line: bytes, layout: Layout) -> int:
@@ -358,7 +380,8 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
         if not data.endswith(b"\n") or data.count(b"\n") != name.rows + 1:
             os.replace(path, path.with_name(path.name + TORN))
             log.write([new_event("mended", file=path.name, how=f"not whole: renamed to end in {TORN}")])
-            progress.repairs.append(f"'{path.name}' is incomplete: record it again")
+            sentence = f"'{path.name}' is incomplete: record it again"
+            progress.repairs.append(Message(sentence, "recording_incomplete", file=path.name))
             if key is not None and progress.takes.get(key) == path.name:
                 del progress.takes[key]
             continue
@@ -387,7 +410,7 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
     for key, file in list(progress.takes.items()):
         if not (folder / file).exists():
             log.write([new_event("mended", file=file, how="the recording is gone", gesture=key[0], repetition=key[1])])
-            progress.repairs.append(f"'{file}' is missing: record it again")
+            progress.repairs.append(Message(f"'{file}' is missing: record it again", "recording_missing", file=file))
             del progress.takes[key]
 
 

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import DatasetError
+from plushsense.core.errors import DatasetError, PlushSenseError
 from plushsense.core.files import write_file
 from plushsense.core.toml import load_table
 
@@ -24,6 +24,23 @@ SESSION_HEAD = "session.json"
 SESSION_LOG = "session.jsonl"
 SIDECAR = ".json"
 FORMAT_VERSION = 1
+
+
+class Message(str):
+    """Sentence for the user in English, with the key and values of its translations, as in `PlushSenseError`."""
+
+    reason: str
+    values: dict[str, object]
+
+    def __new__(cls, text: str = "", reason: str = "", **values: object) -> Message:
+        made = super().__new__(cls, text)
+        made.reason, made.values = reason, values
+        return made
+
+    @classmethod
+    def of(cls, error: PlushSenseError) -> Message:
+        """Return the sentence of an error."""
+        return cls(str(error), error.reason, **error.values)
 
 
 @dataclass(frozen=True)
@@ -59,9 +76,14 @@ class SessionHead:
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError, RecursionError) as cause:
-            raise DatasetError(f"'{path}' cannot be read ({cause}): restore it from a copy.") from None
+            raise DatasetError(
+                f"'{path}' cannot be read ({cause}): restore it from a copy.",
+                reason="session_damaged",
+                name=folder.name,
+            ) from None
         if not isinstance(table, dict) or table.pop("format", None) != FORMAT_VERSION:
-            raise DatasetError(f"'{path}' is no session head of format {FORMAT_VERSION}: check which version wrote it.")
+            message = f"'{path}' is no session head of format {FORMAT_VERSION}: check which version wrote it."
+            raise DatasetError(message, reason="session_damaged", name=folder.name)
         return load_table(table, cls, f"'{path}'", DatasetError)
 
 
@@ -71,12 +93,13 @@ class SessionEvent:
 
     Kinds, with their details: ``open`` and ``close`` (a program opened or closed the session), ``countdown``
     (``gesture``, ``repetition``, ``countdown_s``), ``start`` (of a recording, with its first row), ``take`` (finished
-    recording: ``file``, ``gesture``, ``repetition``), ``abandon`` (recording stopped on purpose, ``why``: redo, pause
-    or quit; its rows are in the stream only), ``unfinished`` (stopped by a crash), ``redo`` (``file`` is discarded),
-    ``keep`` (``file`` is used again), ``skip``, ``go`` (to another step), ``note``, ``pause``, ``resume``, ``gap``,
-    ``mended`` (repaired after a crash), ``failed``, ``finished`` (``early``: although steps are missing), ``reopened``,
-    ``renamed`` (the person's code was changed; with the former ``subject`` and ``session``). Readers ignore other
-    kinds.
+    recording: ``file``, ``gesture``, ``repetition``), ``abandon`` (recording stopped on purpose, ``why``: redo, pause,
+    exchange or quit; its rows are in the stream only), ``unfinished`` (stopped by a crash), ``redo`` (``file`` is
+    discarded), ``keep`` (``file`` is used again), ``skip``, ``go`` (to another step), ``note``, ``pause``, ``resume``,
+    ``exchange`` (another toy from ``row`` on: ``device``, ``former``), ``mark`` (a moment to find in a video:
+    ``host_ms``, ``device_ms``), ``gap``, ``mended`` (repaired after a crash), ``failed``, ``finished`` (``early``:
+    although steps are missing), ``reopened``, ``renamed`` (the person's code was changed; with the former ``subject``
+    and ``session``). Readers ignore other kinds.
     """
 
     kind: str
@@ -95,7 +118,8 @@ def read_events(folder: Path) -> Iterator[SessionEvent]:
     except FileNotFoundError:
         return
     except OSError as cause:
-        raise DatasetError(f"'{folder / SESSION_LOG}' cannot be read: {cause.strerror or cause}.") from None
+        message = f"'{folder / SESSION_LOG}' cannot be read: {cause.strerror or cause}."
+        raise DatasetError(message, reason="session_damaged", name=folder.name) from None
     for line in filter(None, lines):
         try:
             table = json.loads(line.decode("utf-8"))

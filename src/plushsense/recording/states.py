@@ -19,7 +19,7 @@ from plushsense.core.errors import DatasetError, PlushSenseError
 from plushsense.devices.base import Counters, Device, Frame, now_ms
 from plushsense.recording.plan import Step
 from plushsense.recording.session import Key, OpenSession, SessionProgress
-from plushsense.recording.session_files import SessionEvent
+from plushsense.recording.session_files import Message, SessionEvent
 from plushsense.recording.takes import AWAY_S, Ended, FrameReceiver, RecordingTake, gap_entry, sidecar
 from plushsense.recording.writer import BackgroundWriter, lacks_descriptor, save_take, to_frames
 
@@ -75,7 +75,7 @@ class RecorderStatus:
     gaps: int
     rows: int
     file: str
-    message: str
+    message: Message
     failed: str
     folder: str
     frames: int = 0
@@ -101,11 +101,11 @@ def store_take(
     saved_ms: int,
     earlier: str,
     **more: Any,
-) -> tuple[str, str]:
+) -> tuple[str, Message]:
     """Write a recording, its sidecar and its log entry; ``earlier`` is the file that it replaces, or "".
 
     Returns:
-        The name of the file, and a message for the user, or "".
+        The name of the file, and a message for the user, which may be empty.
 
     Raises:
         OSError: if the files cannot be written; no partial file is left.
@@ -120,14 +120,16 @@ def store_take(
     if earlier:
         events.append(SessionEvent("redo", saved_ms, {"file": earlier} | key))
     session.log.write(events)
-    message = ""
+    message = Message()
     if ended == "longest":
         longest_s = session.protocol.longest_s
-        message = f"Nobody stopped the recording: it ended after {longest_s:g} s; r records it again."
+        sentence = f"Nobody stopped the recording: it ended after {longest_s:g} s; r records it again."
+        message = Message(sentence, "ended_by_itself", s=longest_s)
     elif take.gaps:
         longest = max(gap["missing_ms"] for gap in take.gaps) / 1000.0
         fault = f"has a gap of {longest:.1f} s" if longest >= 0.05 else "has a jump in the toy's clock"
-        message = f"This recording {fault}; it is kept, r records it again."
+        reason = "kept_with_gap" if longest >= 0.05 else "kept_with_jump"
+        message = Message(f"This recording {fault}; it is kept, r records it again.", reason, s=longest)
     return path.name, message
 
 
@@ -137,7 +139,11 @@ def write_error(session: OpenSession, recordings: int, cause: Exception) -> Data
     remedy = "close other programs" if lacks_descriptor(cause) else "free disk space"
     return DatasetError(
         f"'{session.folder}' cannot be written any more ({why}): the session has stopped, with {recordings} recordings "
-        f"saved; {remedy}, and continue the same session."
+        f"saved; {remedy}, and continue the same session.",
+        reason="files_open" if lacks_descriptor(cause) else "disk_full",
+        folder=session.folder,
+        why=why,
+        n=recordings,
     )
 
 
@@ -262,13 +268,16 @@ class RecordingMachine:
         self._since_ms = 0.0
         self._state: RecorderState = "idle"
         self._paused = False
-        self._message = ""
-        self.over = ""
-        self._failed = ""
+        self._message = Message()
+        self.over = Message()
+        self._failed = Message()
         self._closing = False
         self._received: list[Frame] = []
         self._writer: BackgroundWriter | None = None
-        self._reader = threading.Thread(target=self._read, name="plushsense-reader", daemon=True)
+        self._reader = self._new_reader()
+
+    def _new_reader(self) -> threading.Thread:
+        return threading.Thread(target=self._read, name="plushsense-reader", daemon=True)
 
     def subscribe(self, listener: Listener) -> None:
         """Call ``listener(change, status)`` at every change, in the thread that caused it; it must not block."""
@@ -331,18 +340,18 @@ class RecordingMachine:
         step = self._plan.step
         self._log(kind, gesture=step.gesture, repetition=step.repetition, **more)
 
-    def _show_message(self, text: str) -> None:
-        self._message = text
+    def _show_message(self, message: Message) -> None:
+        self._message = message
         self._changes.append("message")
         self._changed.notify_all()
 
-    def _enter(self, state: RecorderState, message: str) -> None:
+    def _enter(self, state: RecorderState, message: Message | None = None) -> None:
         if self._failed:
             # The stream may have failed while a recording was still being saved.
             state, message = "stopped", self._failed
         self._state = state
         self._since_ms = self._receiver.toy_ms
-        self._message = message
+        self._message = message or Message()
         self._changes.append(state)
         self._changed.notify_all()
 
@@ -353,7 +362,7 @@ class RecordingMachine:
         """Return the seconds since the state was entered, by the toy's clock."""
         return (self._receiver.toy_ms - self._since_ms) / 1000.0
 
-    def _advance(self, message: str = "", from_start: bool = False) -> None:
+    def _advance(self, message: Message | None = None, from_start: bool = False) -> None:
         """Go to the next step to record; finish the session if none is left."""
         if self._plan.advance(from_start):
             self._ready(message)
@@ -362,7 +371,7 @@ class RecordingMachine:
             self._paused = False
             self._enter("stopped" if self.over else "finished", message)
 
-    def _ready(self, message: str) -> None:
+    def _ready(self, message: Message | None = None) -> None:
         if self.over:
             self._enter("stopped", self.over)
         else:
@@ -371,13 +380,13 @@ class RecordingMachine:
     def _begin(self) -> None:
         now = self._receiver.last.device_ms if self._receiver.last else None
         self._log_step("countdown", countdown_s=self.protocol.countdown_s, device_ms=now)
-        self._enter("countdown", "")
+        self._enter("countdown")
 
-    def _cancel(self, message: str) -> None:
+    def _cancel(self, message: Message | None = None) -> None:
         self._log_step("cancel")
         self._enter("idle", message)
 
-    def _abandon(self, why: str, message: str) -> None:
+    def _abandon(self, why: str, message: Message | None = None) -> None:
         take = self._take
         assert take is not None
         self._take = None
@@ -394,20 +403,26 @@ class RecordingMachine:
             take.gaps.append(gap_entry(len(take.frames), take.frames[-1], None, silent_ms, "nothing came any more"))
         self._take = None
         counters = Counters(**self.device.counters.to_dict())
-        self._enter("saving", "")
+        self._enter("saving")
         self._flush()
         if self._writer is not None:
             self._writer.submit(lambda: self._save(take, ended, counters))
 
     def _read(self) -> None:
         """Process frames as they arrive, in the reader's thread, independently of the display."""
-        over = "The toy's data have ended."
+        over = Message("The toy's data have ended.", "data_ended")
+        device = self.device
         try:
             while not self._closing:
-                frames = self.device.read()
+                device = self.device
+                frames = device.read()
+                if device is not self.device:
+                    continue
                 if frames is None:
                     break
                 with self._notifying():
+                    if device is not self.device:
+                        continue
                     for frame in frames:
                         self._receive(frame)
                     self._receiver.check_malformed()
@@ -417,11 +432,17 @@ class RecordingMachine:
                 if self._writer is not None:
                     self._writer.wait_written()
         except PlushSenseError as cause:
-            over = str(cause)
+            over = Message.of(cause)
         except Exception as cause:  # noqa: BLE001, RUF100
-            over = f"Reading the toy failed ({type(cause).__name__}: {cause}): all frames until then are kept."
+            sentence = f"Reading the toy failed ({type(cause).__name__}: {cause}): all frames until then are kept."
+            over = Message(sentence, "reading_failed", why=cause)
         with self._notifying():
             if self._closing:
+                return
+            if device is not self.device:
+                # The toy was exchanged when its data ended.
+                self._reader = self._new_reader()
+                self._reader.start()
                 return
             self.over = over
             if self._state == "recording":
@@ -439,7 +460,7 @@ class RecordingMachine:
             counters = Counters(**self.device.counters.to_dict())
             self._take = RecordingTake(self._plan.step, row, time.monotonic(), counters)
             self._log_step("start", row=row, host_ms=frame.host_ms, device_ms=frame.device_ms)
-            self._enter("recording", "")
+            self._enter("recording")
         elif self._take is not None:
             self._take.lost += missing
         self._received.append(frame)
@@ -465,13 +486,15 @@ class RecordingMachine:
         if self._take is not None:
             self._take.gaps.append(gap | {"after_row": len(self._take.frames)})
         if gap["missing_ms"] >= 1000.0 * AWAY_S:
-            message = f"The toy was disconnected for {gap['missing_ms'] / 1000.0:.1f} s"
+            away_s = gap["missing_ms"] / 1000.0
+            sentence = f"The toy was disconnected for {away_s:.1f} s"
             if self._state == "countdown":
-                self._cancel(f"{message}: press space again.")
+                self._cancel(Message(f"{sentence}: press space again.", "away_in_countdown", s=away_s))
             elif self._state == "recording":
-                self._show_message(f"{message}: this recording has a gap; r records it again.")
+                sentence += ": this recording has a gap; r records it again."
+                self._show_message(Message(sentence, "away_in_recording", s=away_s))
             else:
-                self._show_message(f"{message}.")
+                self._show_message(Message(f"{sentence}.", "away", s=away_s))
 
     def _save(self, take: RecordingTake, ended: Ended, counters: Counters) -> None:
         """Save a recording and go to the next step; runs in a thread of the background writer."""
@@ -490,7 +513,7 @@ class RecordingMachine:
         with contextlib.suppress(OSError):
             self.session.log.write([SessionEvent("failed", now_ms(), {"why": str(cause)})])
         with self._notifying():
-            self._failed = str(write_error(self.session, len(self._plan.takes), cause))
+            self._failed = Message.of(write_error(self.session, len(self._plan.takes), cause))
             self._closing = True
             self._take = None
             self._enter("stopped", self._failed)

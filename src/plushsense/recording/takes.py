@@ -213,6 +213,16 @@ class FrameReceiver:
         self._malformed = device.counters.malformed
         self._loss = LossCounter()
         self._monitor = SignalMonitor(layout, AWAY_S)
+        self._exchanged = False
+
+    def exchange(self, device: Device) -> None:
+        """Go on with another toy of the same layout; `lost` begins again with it."""
+        self._device = device
+        self._reconnects, self._malformed = device.counters.reconnects, device.counters.malformed
+        self._loss, self._monitor = LossCounter(), SignalMonitor(self._layout, AWAY_S)
+        self._last_read_s = self._last_malformed_s = float("-inf")
+        self.lost = 0
+        self._exchanged = True
 
     @property
     def away(self) -> bool:
@@ -247,8 +257,11 @@ class FrameReceiver:
         step_ms = came.device_ms - last.device_ms if last else 0
         on_host = came.host_ms - last.host_ms if last and self._real else 0
         possible_ms = self._possible_ms(on_host)
-        odd = not 0 <= step_ms <= possible_ms + JUMP_MS
-        self.toy_ms += max(min(step_ms, possible_ms), on_host, 1000.0 / self._layout.rate_hz) if odd else step_ms
+        another = self._exchanged and last is not None
+        self._exchanged = False
+        odd = another or not 0 <= step_ms <= possible_ms + JUMP_MS
+        passed_ms = 0 if another else min(step_ms, possible_ms)
+        self.toy_ms += max(passed_ms, on_host, 1000.0 / self._layout.rate_hz) if odd else step_ms
         host = came.host_ms if self._real else self._base_ms + round(self.toy_ms)
         frame = Frame(host, came.device_ms, came.values)
         counted = self._loss.push(came.device_ms)
@@ -259,7 +272,8 @@ class FrameReceiver:
         gap = None
         if last is not None and (odd or step_ms > self._layout.gap_ms or returned):
             missing_ms = max(on_host, 0 if odd else step_ms)
-            gap = gap_entry(self.rows, last, frame, missing_ms, self._reason(step_ms, odd, returned))
+            reason = "another toy" if another else self._reason(step_ms, odd, returned)
+            gap = gap_entry(self.rows, last, frame, missing_ms, reason)
             self.gaps.append(gap)
         self._monitor.push(came.device_ms)
         self.last = frame

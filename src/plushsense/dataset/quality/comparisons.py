@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -38,12 +38,12 @@ _MADE_BY = 0.9
 _AGREE = 0.6
 
 
-def usual_seconds(group: list[RecordingSummary]) -> float:
-    """Return the mean duration in seconds (the measure of the paper), without recordings that were never stopped.
+def usual_seconds(durations: Sequence[float]) -> float:
+    """Return the mean of durations in seconds (the measure of the paper), without recordings that were never stopped.
 
     One such recording of three minutes among gestures of two seconds would make half of the others look too short.
     """
-    seconds = np.array([o.seconds for o in group])
+    seconds = np.array(durations)
     return float(seconds[seconds <= NEVER_STOPPED_FACTOR * np.median(seconds)].mean())
 
 
@@ -75,7 +75,7 @@ def duration(w: DatasetSummary) -> Iterator[Issue]:
         group = [o for o in group if not _is_cut_by_the_file(o, w)]
         if len(group) < _ENOUGH:
             continue
-        mean = usual_seconds(group)
+        mean = usual_seconds([o.seconds for o in group])
         own = _by_subject(group, [o.seconds for o in group])
         for o in group:
             off = o.seconds / mean - 1 if mean else 0.0

@@ -1,7 +1,7 @@
 // Keyboard commands of a page: each press is emitted once, as `press`, with what the page showed at that moment.
 export default {
   template: '<span hidden :data-seen="seen"></span>',
-  props: { seen: String, keys: String, fields: Object },
+  props: { seen: String, keys: String, fields: Object, aliases: Object },
   mounted() {
     this.listener = (event) => this.onKey(event);
     // In the capture phase: a space must not also press the button that has the focus.
@@ -21,7 +21,11 @@ export default {
         event.stopImmediatePropagation();
         return;
       }
-      const key = event.code === "Space" ? " " : event.key.toLowerCase();
+      const typed = event.code === "Space" ? " " : event.key.toLowerCase();
+      if ((typed === " " || typed === "enter") && at.closest && at.closest("[data-own-keys]")) return;
+      // Enter presses the button that has the focus.
+      if (typed === "enter" && at.closest && at.closest("button, a[href], summary, [role=button]")) return;
+      const key = this.aliases[typed] ?? typed;
       if (this.fields[key]) {
         event.preventDefault();
         event.stopImmediatePropagation();

@@ -33,13 +33,23 @@ class Keys(Element, component="keys.js"):
         keys: the characters that are commands.
         on_press: called with the key and the state that the browser displayed when the key was pressed (see `show`).
         fields: maps a key to the CSS selector of the field that it moves the focus to.
+        aliases: maps further keys, such as "pagedown", to those commands; "enter" only while no button has the focus.
+
+    The space bar and Enter act as usual on elements inside one with the attribute ``data-own-keys``.
     """
 
-    def __init__(self, keys: str, on_press: Callable[[str, str], Any], fields: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        keys: str,
+        on_press: Callable[[str, str], Any],
+        fields: Mapping[str, str] | None = None,
+        aliases: Mapping[str, str] | None = None,
+    ) -> None:
         super().__init__()
         self._props["keys"] = keys
         self._props["seen"] = ""
         self._props["fields"] = dict(fields or {})
+        self._props["aliases"] = dict(aliases or {})
 
         def pressed(event: GenericEventArguments) -> Any:
             return on_press(str(event.args["key"]), str(event.args["seen"]))

@@ -106,6 +106,24 @@ class TappedDevice(Device):
         self.buffer = SampleBuffer(len(device.layout.channels), int(KEPT_S * device.layout.rate_hz))
         self.changed = ChangeSignal()
         self.taps: list[Callable[[list[Frame]], None]] = []
+        self._tried: list[Frame] = []
+
+    def try_out(self) -> None:
+        """Read until frames have arrived and most lines fit the layout; `read` returns these frames later.
+
+        Raises:
+            DeviceError: if the toy sends nothing within some seconds, or lines that do not fit the layout.
+        """
+        until = time.monotonic() + _TIMEOUT_S
+        while time.monotonic() < until:
+            frames = self.device.read()
+            if frames is None:
+                break
+            self._tried += frames
+            bad = self.counters.malformed
+            if len(self._tried) >= _ENOUGH and bad <= _MAX_MALFORMED * (bad + len(self._tried)):
+                return
+        raise _unfit(self.url, self.layout.name, self.counters.malformed)
 
     @property
     def inner(self) -> Device:
@@ -125,7 +143,10 @@ class TappedDevice(Device):
     def read(self) -> list[Frame] | None:
         """Read from the device, store new frames in the buffer and pass them to the taps."""
         self.device.wait_s = self.wait_s
-        frames = self.device.read()
+        frames: list[Frame] | None = self._tried
+        self._tried = []
+        if not frames:
+            frames = self.device.read()
         self.arrived_s = self.device.arrived_s
         if frames:
             self.buffer.add(frames)
@@ -141,6 +162,8 @@ class TappedDevice(Device):
 PERSONS = 25
 TEST_S = 1.0
 _TIMEOUT_S = 6.0
+# So many frames are enough to try a toy.
+_ENOUGH = 20
 # If the share of malformed lines is higher, the toy probably has another layout.
 _MAX_MALFORMED = 0.2
 _SLOW, _FAST = 0.8, 1.25
@@ -165,6 +188,21 @@ class ConnectionTest:
     def on_time(self) -> bool:
         """True if the measured frame rate is close to the rate of the layout."""
         return _SLOW <= self.frames / (self.seconds * self.rate_hz) <= _FAST
+
+
+def _unfit(url: str, layout: str, malformed: int) -> DeviceError:
+    """Return the error for a toy that sends nothing, or lines that do not fit its layout."""
+    if malformed:
+        return DeviceError(
+            f"'{url}' sends lines ({malformed}) that are no frames of the layout '{layout}': "
+            "name its layout, as in ?layout=plush-14 at the end of the address.",
+            reason="toy_unreadable",
+            url=url,
+            layout=layout,
+            lines=malformed,
+        )
+    message = f"'{url}' sent nothing within {_TIMEOUT_S:g} s: check that the toy is switched on."
+    return DeviceError(message, reason="toy_silent", url=url, s=f"{_TIMEOUT_S:g}")
 
 
 class Toys:
@@ -250,16 +288,6 @@ class Toys:
                     last = time.monotonic()
             layout, counters = device.layout, device.counters
         if first is None or last is None:
-            if counters.malformed:
-                raise DeviceError(
-                    f"'{url}' sends no frames of the layout '{layout.name}' but other lines ({counters.malformed}): "
-                    "name its layout, as in ?layout=plush-14 at the end of the address.",
-                    reason="toy_unreadable",
-                    url=url,
-                    layout=layout.name,
-                    lines=counters.malformed,
-                )
-            message = f"'{url}' sent nothing within {_TIMEOUT_S:g} s: check that the toy is switched on."
-            raise DeviceError(message, reason="toy_silent", url=url, s=f"{_TIMEOUT_S:g}")
+            raise _unfit(url, layout.name, counters.malformed)
         seconds = max(last - first, 1.0 / layout.rate_hz) * speed
         return ConnectionTest(layout.name, frames, counters.malformed, seconds, layout.rate_hz)

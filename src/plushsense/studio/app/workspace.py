@@ -20,6 +20,8 @@ from plushsense.dataset.store import DatasetHead
 from plushsense.recording.session_files import SESSION_HEAD
 
 RECORDINGS, DATASETS, BUNDLES, EXPORTS, PACKAGES = "recordings", "datasets", "bundles", "exports", "packages"
+PROTOCOLS = "protocols"
+"""Folder of the user's own recording protocols."""
 WORK, DISCARDED = "work", "discarded"
 VIRTUAL = "virtual://?person=7"
 _HEAD, _INDEX = "dataset.toml", "recordings.csv"
@@ -178,7 +180,7 @@ class Workspace:
         return place
 
     def discard(self, path: Path) -> Path:
-        """Move a session, data set or bundle of ``folder`` into `DISCARDED`, and return its new path.
+        """Move a session, data set, bundle or protocol of ``folder`` into `DISCARDED`, and return its new path.
 
         Raises:
             ConfigError: for a path outside ``folder``.
@@ -198,8 +200,8 @@ class Workspace:
         return place
 
     def discarded(self) -> list[Path]:
-        """Return the discarded sessions, data sets and bundles."""
-        patterns = (f"{RECORDINGS}/*/*", f"{DATASETS}/*", f"{BUNDLES}/*")
+        """Return the discarded sessions, data sets, bundles and protocols."""
+        patterns = (f"{RECORDINGS}/*/*", f"{DATASETS}/*", f"{BUNDLES}/*", f"{PROTOCOLS}/*")
         return [path for pattern in patterns for path in sorted((self.folder / DISCARDED).glob(pattern))]
 
     def restore(self, path: Path) -> Path:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from plushsense.core.errors import ConfigError
-from plushsense.core.layouts import layout_names
+from plushsense.core.errors import ConfigError, DatasetError, LayoutError
+from plushsense.core.layouts import Layout, layout_names
 from plushsense.core.toml import builtin_names
 from plushsense.core.version import __version__
 from plushsense.devices.opening import parse_url
+from plushsense.devices.virtual.stream import VirtualDevice
+from plushsense.recording.plan import save_protocol
 from plushsense.recording.recorder import (
     Recorder,
     SessionRequest,
@@ -35,12 +37,12 @@ from plushsense.recording.session import (
     list_sessions,
     mark_finished,
 )
-from plushsense.recording.session_files import SESSION_HEAD, SessionHead
+from plushsense.recording.session_files import SESSION_HEAD, Message, SessionHead
 from plushsense.studio.app.toys import TappedDevice
-from plushsense.studio.app.workspace import VIRTUAL, ChangeSignal, Workspace
+from plushsense.studio.app.workspace import PROTOCOLS, VIRTUAL, ChangeSignal, Workspace
 
-PROTOCOLS, LAYOUTS = "protocols", "layouts"
-"""Folders of the workspace for the user's own protocols and layouts."""
+LAYOUTS = "layouts"
+"""Folder of the workspace for the user's own layouts."""
 NO_CONSENT, PSEUDO = "no_consent", "pseudo"
 """Notices shown before recording; each is the key of a text in the table ``record``."""
 SOFTWARE = f"plushsense {__version__} studio"
@@ -54,6 +56,7 @@ class ActiveSession:
         name: ``<subject>/<session>``, as used in the address of the page.
         notices: those of `NO_CONSENT` and `PSEUDO` that apply.
         repairs: descriptions of repairs made to the files after a crash.
+        mark_first: whether the first press on the page is to mark the moment for a video.
     """
 
     name: str
@@ -61,7 +64,8 @@ class ActiveSession:
     device: TappedDevice
     request: SessionRequest
     notices: tuple[str, ...] = ()
-    repairs: tuple[str, ...] = ()
+    repairs: tuple[Message, ...] = ()
+    mark_first: bool = False
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @property
@@ -95,7 +99,8 @@ class ActiveSession:
             if number != key and number.isdecimal() and int(number) < status.steps:
                 commands[key] = lambda: recorder.go(int(number))
             if key not in commands:
-                raise ConfigError(f"'{key}' is not a command of the recorder: use space, r, s, b, p or go:<step>.")
+                message = f"'{key}' is not a command of the recorder: use space, r, s, b, p or go:<step>."
+                raise ConfigError(message, reason="command_unknown", key=key)
             if status.seen != seen:
                 return False
             commands[key]()
@@ -129,11 +134,12 @@ class RecordController:
         """Return all sessions in the studio's folder, newest first."""
         return list_sessions(self._workspace.recordings)
 
-    def begin(self, request: SessionRequest, anew: bool = False) -> ActiveSession:
+    def begin(self, request: SessionRequest, anew: bool = False, mark_first: bool = False) -> ActiveSession:
         """Start a session, or return the active session of the same person.
 
         Args:
             anew: whether to start another session even if the last one of the person is unfinished.
+            mark_first: see `ActiveSession`.
 
         Raises:
             PlushSenseError: if the request is invalid, the toy cannot be opened, or the last session is unfinished.
@@ -147,9 +153,14 @@ class RecordController:
             if known is not None:
                 raise ConfigError(
                     f"{folder.parent.name} has an unfinished session, {folder.name}: resume it, or choose to begin "
-                    "another one."
+                    "another one.",
+                    reason="session_unfinished",
+                    subject=folder.parent.name,
+                    name=f"{folder.parent.name}/{folder.name}",
                 )
-            return self._open(request, folder, None)
+            session = self._open(request, folder, None)
+            session.mark_first = mark_first
+            return session
 
     def _active_of(self, request: SessionRequest, subject: str) -> ActiveSession | None:
         """Return the active session of ``subject``, if any; first end finished ones of this person or toy."""
@@ -179,7 +190,8 @@ class RecordController:
             if known is None:
                 raise self._unknown(name)
             if is_finished(folder):
-                raise ConfigError(f"The session '{name}' is finished: begin a new one.")
+                message = f"The session '{name}' is finished: begin a new one."
+                raise ConfigError(message, reason="session_finished", name=name)
             url = device or known.device
             request = SessionRequest(device=url, subject=known.subject, speed=self.speed_for(url, known.simulated))
             self._check(request, known.device)
@@ -220,7 +232,9 @@ class RecordController:
     def _closed(self, name: str) -> Path:
         """Return the folder of a session; raise ConfigError if it is open."""
         if self.get(name) is not None:
-            raise ConfigError(f"The session '{name}' is being recorded: end it first.")
+            raise ConfigError(
+                f"The session '{name}' is being recorded: end it first.", reason="session_open", name=name
+            )
         return self._folder(name)
 
     def close_session(self, name: str) -> None:
@@ -270,23 +284,38 @@ class RecordController:
         """Return the layouts to choose from; keys are names or paths, values are titles."""
         return {n: n for n in layout_names()} | self._own_files(LAYOUTS)
 
+    def save_protocol(self, name: str, gestures: Sequence[str], repetitions: int, order: str) -> Path:
+        """Save a protocol of one's own, and return its path.
+
+        Raises:
+            ConfigError: for a name that cannot be used or exists, without gestures, or for invalid repetitions.
+        """
+        place = self._workspace.new(PROTOCOLS, f"{name.strip()}.toml" if name.strip() else "")
+        save_protocol(place, place.stem, gestures, repetitions, order)
+        return place
+
     def _own_files(self, folder: str) -> dict[str, str]:
-        return {str(p): p.name for p in sorted((self._workspace.folder / folder).glob("*.toml"))}
+        return {str(p): p.stem for p in sorted((self._workspace.folder / folder).glob("*.toml"))}
 
     def _check(self, request: SessionRequest, known_device: str = "") -> None:
         """Raise ConfigError if the toy, protocol or layout is unknown or refers to a file that was not allowed."""
         check_speed(request.speed)
         if request.protocol and request.protocol not in self.protocols():
-            raise ConfigError(f"'{request.protocol}' is not a protocol of this studio: choose one from the list.")
+            message = f"'{request.protocol}' is not a protocol of this studio: choose one from the list."
+            raise ConfigError(message, reason="protocol_unknown")
         if request.layout and request.layout not in self.layouts():
-            raise ConfigError(f"'{request.layout}' is not a layout of this studio: choose one from the list.")
-        address = parse_url(request.device)
-        given = request.device in (*self.toys(), known_device)
+            message = f"'{request.layout}' is not a layout of this studio: choose one from the list."
+            raise ConfigError(message, reason="layout_unknown")
+        self._check_toy(request.device, known_device)
+
+    def _check_toy(self, url: str, *known: str) -> None:
+        """Raise ConfigError if a toy's URL is invalid, or refers to a file that was not allowed."""
+        address = parse_url(url)
+        given = url in (*self.toys(), *known)
         is_file = address.scheme == "replay" or address.query.get("layout", "plush-15") not in self.layouts()
         if is_file and not given:
-            raise ConfigError(
-                f"'{request.device}' refers to a file: start the studio with --device {request.device} to use it."
-            )
+            message = f"'{url}' refers to a file: start the studio with --device {url} to use it."
+            raise ConfigError(message, reason="toy_is_file", url=url)
 
     def _folder(self, name: str) -> Path:
         folder = self._workspace.inside(self._workspace.recordings / name)
@@ -295,11 +324,66 @@ class RecordController:
         return folder
 
     def _unknown(self, name: str) -> ConfigError:
-        return ConfigError(f"There is no session '{name}' in '{self._workspace.recordings}'.")
+        message = f"There is no session '{name}' in '{self._workspace.recordings}'."
+        return ConfigError(message, reason="session_unknown", name=name)
+
+    def _tried(self, url: str, speed: float, layout: Layout | str | None) -> TappedDevice:
+        """Open a toy, and wait until it has sent frames.
+
+        Raises:
+            DeviceError: if the toy cannot be opened, or sends no frames of the layout.
+        """
+        try:
+            device = TappedDevice(open_toy(with_speed(url, speed), layout))
+        except LayoutError as cause:
+            raise LayoutError(str(cause), reason="layout_bad", name=layout) from None
+        if isinstance(device.inner, VirtualDevice):
+            # Its person waits for what is requested.
+            device.inner.follow()
+        try:
+            device.try_out()
+        except BaseException:
+            device.close()
+            raise
+        return device
+
+    def exchange(self, name: str, url: str) -> None:
+        """Go on with another toy of the same layout in an active session; the former one stays if this fails.
+
+        Raises:
+            PlushSenseError: if there is no such session, it is recording, or the toy cannot be used.
+        """
+        with self._opening:
+            session = self.get(name)
+            if session is None:
+                raise self._unknown(name)
+            recorder, former = session.recorder, session.device
+            self._check_toy(url, session.head.device)
+            if is_virtual(url) and not session.head.simulated:
+                message = f"The session '{name}' was begun with a real toy: begin a new one for a virtual toy."
+                raise DatasetError(message, reason="session_of_real_toy", name=name)
+            if self.speed_for(url, session.head.simulated) != session.request.speed:
+                message = f"'{url}' has another speed than the session '{name}'."
+                raise ConfigError(message, reason="other_speed", url=url)
+            if url == session.request.device:
+                if recorder.status().state != "stopped":
+                    raise ConfigError(f"The session '{name}' uses '{url}' already.", reason="same_toy", url=url)
+                # A port can be opened only once.
+                former.close()
+            device = self._tried(url, session.request.speed, recorder.session.layout)
+            try:
+                recorder.exchange(device)
+            except BaseException:
+                device.close()
+                raise
+            session.device, session.request = device, replace(session.request, device=url)
+            prompt_virtual(recorder)
+            former.close()
+        self._changed()
 
     def _open(self, request: SessionRequest, folder: Path, known: SessionHead | None) -> ActiveSession:
         layout = session_layout(request, folder, known)
-        device = TappedDevice(open_toy(with_speed(request.device, request.speed), layout))
+        device = self._tried(request.device, request.speed, layout)
         try:
             head = session_head(request, folder, known is None, device.layout, SOFTWARE)
             notices = ((PSEUDO, is_pseudo_terminal(request, known or head)), (NO_CONSENT, lacks_consent(known or head)))

@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from nicegui import run, ui
 
-from plushsense.core.errors import ConfigError, PlushSenseError
-from plushsense.devices.opening import list_devices
+from plushsense.core.errors import ConfigError, DeviceError, LayoutError, PlushSenseError
 from plushsense.recording.plan import DEFAULT, wordings
-from plushsense.recording.recorder import PROTOCOL, SessionRequest, is_virtual
+from plushsense.recording.recorder import PROTOCOL, SessionRequest
 from plushsense.recording.session import SessionSummary
 from plushsense.studio.app.shell import Page, address, button, html, named, query, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.pages.record.child import CHILD, show_child
+from plushsense.studio.pages.record.choices import ProtocolForm, ToyChoice, toy_name
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.session import collect, show_session
 from plushsense.studio.widgets.elements import ask, change_files, item_menu, summary
 
 _LISTED = 8
-_SCAN_S = 3.0
-
-
-def toy_name(words: Words, url: str) -> str:
-    """Return the text for a toy in a list: its URL, marked if the toy is virtual."""
-    return f"{words('record.virtual_toy')} · {url}" if is_virtual(url) else url
+_CODE_ERRORS = ("no_person", "code_bad", "session_unfinished", "session_in_use")
+_PROTOCOL_ERRORS = ("protocol_bad", "protocol_unknown")
+_TOY_ERRORS = ("url_bad", "no_toy", "toy_is_file", "session_of_real_toy")
 
 
 async def show(page: Page) -> None:
@@ -33,6 +32,9 @@ async def show(page: Page) -> None:
     chosen = query()
     active = controller.active_sessions()
     session = controller.get(chosen.get("session", ""))
+    if chosen.get("view") == CHILD:
+        show_child(page, controller, chosen.get("session", ""))
+        return
     if session is None and not chosen and len(active) == 1:
         session = active[0]
     if session is not None:
@@ -119,7 +121,7 @@ class _SessionLists:
         words, name, controller = self._page.words, session.name, self._controller
         with tag(ui.row().classes("w-full items-center"), f"unfinished-{name}"):
             if session.head is None or session.protocol is None:
-                ui.label(f"{name}: {session.error}").classes("flex-grow")
+                ui.label(words("errors.session_damaged", name=name)).classes("flex-grow")
                 return
             self._describe(session)
             toys = list(dict.fromkeys([session.head.device, *controller.toys()]))
@@ -127,7 +129,17 @@ class _SessionLists:
             toy = ui.select(titles, value=toys[0], label=words("record.toy")).style("width: 24rem; max-width: 100%")
             named(toy.props("outlined dense"), f"{words('record.toy')}: {name}")
             go_on = button("", words("record.go_on"), None, "unelevated", about=name)
-            go_on.on_click(lambda: _open_session(self._page, go_on, lambda: controller.resume(name, str(toy.value))))
+
+            def refused(error: PlushSenseError) -> bool:
+                if _is_of_toy(error):
+                    toy.error = words.error(error)
+                return bool(toy.error)
+
+            def resume() -> Any:
+                toy.error = None
+                return _open_session(self._page, go_on, lambda: controller.resume(name, str(toy.value)), refused)
+
+            go_on.on_click(resume)
             self._menu(session)
 
     def _describe(self, session: SessionSummary) -> None:
@@ -181,13 +193,29 @@ class _SessionLists:
         self.fill(await run.io_bound(self._controller.sessions) or [])
 
 
-async def _open_session(page: Page, begin: ui.button, work: Callable[[], ActiveSession]) -> None:
-    """Open the toy, which may take a while, and go to the session; show an error message if that fails."""
+def _is_of_toy(error: PlushSenseError) -> bool:
+    return isinstance(error, DeviceError | LayoutError) or error.reason in _TOY_ERRORS
+
+
+async def _open_session(
+    page: Page, begin: ui.button, work: Callable[[], ActiveSession], refused: Callable[[PlushSenseError], bool]
+) -> None:
+    """Open the toy, which may take a while, and go to the session.
+
+    Args:
+        refused: shows an error beside the field that it is about; if it returns False, the error is shown as a message.
+    """
     begin.disable()
     page.say(page.words("record.opening"))
     try:
         with page.show_errors():
-            session = await run.io_bound(work)
+            try:
+                session = await run.io_bound(work)
+            except PlushSenseError as error:
+                page.say("")
+                if refused(error):
+                    return
+                raise
             if session is not None:
                 ui.navigate.to(address("record", session=session.name))
     finally:
@@ -199,7 +227,6 @@ class _Form:
 
     def __init__(self, page: Page, controller: RecordController) -> None:
         self._page, self._controller, words = page, controller, page.words
-        protocols = controller.protocols()
         with tag(ui.column().classes("ps-card w-full"), "new-session"):
             html(words("record.new"), "h2")
             with ui.row().classes("w-full items-start"):
@@ -208,15 +235,13 @@ class _Form:
                 self._age = self._input("age_group", "age_hint")
                 self._gender = self._input("gender", "gender_hint")
             with ui.row().classes("w-full items-start"):
-                titles = {key: words.get(f"record.protocol_{key}", name) for key, name in protocols.items()}
-                self._protocol = self._select(titles, "protocol", PROTOCOL)
+                self._protocol = self._select(self._titles(), "protocol", PROTOCOL)
                 self._protocol.on_value_change(self._choose_words)
                 self._words = self._select({DEFAULT: DEFAULT}, "wording", DEFAULT)
+                self._discard = button("discard-protocol", words("record.discard_protocol"), self._discard_protocol)
+            ProtocolForm(page, controller, lambda path: self._list_protocols(str(path)))
             with ui.row().classes("w-full items-start"):
-                toys = controller.toys()
-                self._toy = self._select({u: toy_name(words, u) for u in toys}, "toy", toys[0])
-                self._look = button("", words("record.look"), self._look_for_toys)
-                self._other = self._input("other_toy", "other_toy_hint")
+                self._toy = ToyChoice(page, controller.toys())
             with ui.element("details").classes("w-full"):
                 summary(words("record.more"))
                 with ui.column():
@@ -224,6 +249,7 @@ class _Form:
                     self._layout = self._select(layouts, "layout", "")
                     self._simulated = ui.checkbox(words("record.is_virtual"))
                     self._anew = ui.checkbox(words("record.anew"))
+                    self._mark = tag(ui.checkbox(words("record.mark_first")), "mark-first")
             self._begin = button("begin", words("record.begin"), self._begin_session, "unelevated size=lg")
         self._choose_words()
 
@@ -239,36 +265,38 @@ class _Form:
         named(field, label)
         return tag(field, key).style("width: 27rem; max-width: 100%")
 
+    def _titles(self) -> dict[str, str]:
+        words = self._page.words
+        return {key: words.get(f"record.protocol_{key}", name) for key, name in self._controller.protocols().items()}
+
+    def _list_protocols(self, chosen: str = PROTOCOL) -> None:
+        self._protocol.set_options(self._titles(), value=chosen)
+        self._choose_words()
+
+    async def _discard_protocol(self) -> None:
+        chosen, workspace = Path(str(self._protocol.value)), self._page.workspace
+
+        async def refresh() -> None:
+            self._list_protocols(str(chosen) if chosen.is_file() else PROTOCOL)
+
+        message = self._page.words("shell.discarded", name=chosen.stem)
+        await change_files(self._page, lambda: workspace.discard(chosen), message, refresh, workspace.restore)
+
     def _choose_words(self) -> None:
         """Update the selectable wordings to those of the chosen protocol; preselect the page's language."""
+        self._protocol.error = None
+        self._discard.set_visibility(str(self._protocol.value).endswith(".toml"))
         try:
             known = wordings(str(self._protocol.value))
         except PlushSenseError as refusal:
-            self._page.say(str(refusal), "error")
+            self._protocol.error = self._page.words.error(refusal)
             known = (DEFAULT,)
         language = self._page.words.language
         value = language if language in known else DEFAULT
         self._words.set_options({w: self._page.words.get(f"record.wording_{w}", w) for w in known}, value=value)
 
-    async def _look_for_toys(self) -> None:
-        words = self._page.words
-        self._look.disable()
-        self._page.say(words("record.looking", s=f"{_SCAN_S:g}"))
-        try:
-            listing = await run.io_bound(list_devices, _SCAN_S)
-        finally:
-            self._look.enable()
-        if listing is None:
-            return
-        known = dict.fromkeys(self._controller.toys())
-        options = {u: toy_name(words, u) for u in known} | {
-            d.url: f"{d.name} · {d.url}" for d in listing.devices if d.url not in known
-        }
-        self._toy.set_options(options, value=self._toy.value)
-        self._page.say(" ".join([words("record.found", n=len(options)), *listing.notes]))
-
     def _request(self) -> SessionRequest:
-        toy = str(self._other.value or "").strip() or str(self._toy.value)
+        toy = self._toy.url
         simulated = bool(self._simulated.value)
         return SessionRequest(
             device=toy,
@@ -285,13 +313,36 @@ class _Form:
 
     async def _begin_session(self) -> Any:
         with self._page.show_errors():
-            request = self._request()
-            anew = bool(self._anew.value)
-            await _open_session(self._page, self._begin, lambda: self._controller.begin(request, anew))
+            for field in (self._subject, self._protocol):
+                field.error = None
+            self._toy.show_error("")
+            try:
+                request = self._request()
+            except PlushSenseError as error:
+                if self._refused(error):
+                    return
+                raise
+            anew, mark = bool(self._anew.value), bool(self._mark.value)
+            work = partial(self._controller.begin, request, anew, mark)
+            await _open_session(self._page, self._begin, work, self._refused)
+
+    def _refused(self, error: PlushSenseError) -> bool:
+        """Show an error beside the field that it is about; return whether there is one."""
+        sentence = self._page.words.error(error)
+        if error.reason in _CODE_ERRORS:
+            self._subject.error = sentence
+        elif error.reason in _PROTOCOL_ERRORS:
+            self._protocol.error = sentence
+        elif _is_of_toy(error):
+            self._toy.show_error(sentence)
+        else:
+            return False
+        return True
 
 
 def _short(value: Any) -> str:
     text = " ".join(str(value or "").split())
     if len(text) > 100:
-        raise ConfigError(f"'{text[:20]}…' is too long: at most 100 characters.")
+        message = f"'{text[:20]}…' is too long: at most 100 characters."
+        raise ConfigError(message, reason="text_long", text=f"{text[:20]}…", most=100)
     return text

@@ -1,0 +1,130 @@
+"""Choices before and during a session: the toy, and one's own protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from nicegui import run, ui
+
+from plushsense.core.errors import PlushSenseError
+from plushsense.core.gestures import load_gestures
+from plushsense.devices.opening import list_devices
+from plushsense.recording.plan import ORDERS
+from plushsense.recording.recorder import is_virtual
+from plushsense.studio.app.shell import Page, button, html, named, tag
+from plushsense.studio.app.words import Words
+from plushsense.studio.pages.record.controller import RecordController
+from plushsense.studio.widgets.elements import summary
+
+_SCAN_S = 3.0
+
+
+def toy_name(words: Words, url: str) -> str:
+    """Return the text for a toy in a list: its URL, marked if the toy is virtual."""
+    return f"{words('record.virtual_toy')} · {url}" if is_virtual(url) else url
+
+
+class ToyChoice:
+    """A list of toys, a button that searches for more, and a field for any other address.
+
+    Args:
+        urls: the toys to choose from; the first one is chosen.
+        prefix: beginning of the names by which tests find the elements.
+    """
+
+    def __init__(self, page: Page, urls: Sequence[str], prefix: str = "") -> None:
+        self._page, self._urls, words = page, urls, page.words
+        label = words("record.toy")
+        self._list = ui.select({u: toy_name(words, u) for u in urls}, value=urls[0], label=label)
+        named(tag(self._list, f"{prefix}toy"), label).style("width: 27rem; max-width: 100%")
+        self._look = button(f"{prefix}look", words("record.look"), self._search)
+        self._other = ui.input(label=words("record.other_toy")).props(
+            f'outlined hint="{words("record.other_toy_hint")}"'
+        )
+        tag(self._other, f"{prefix}other_toy").classes("w-64")
+        self._list.on_value_change(lambda: self.show_error(""))
+        self._other.on_value_change(lambda: self.show_error(""))
+
+    @property
+    def url(self) -> str:
+        """The address that was typed, or else the chosen toy."""
+        return str(self._other.value or "").strip() or str(self._list.value)
+
+    def show_error(self, sentence: str) -> None:
+        """Show an error beside the field from which the toy was taken; "" removes it."""
+        typed = bool(str(self._other.value or "").strip())
+        for field, is_source in ((self._other, typed), (self._list, not typed)):
+            field.error = sentence if sentence and is_source else None
+
+    async def _search(self) -> None:
+        words = self._page.words
+        self._look.disable()
+        self._page.say(words("record.looking", s=f"{_SCAN_S:g}"))
+        try:
+            listing = await run.io_bound(list_devices, _SCAN_S)
+        finally:
+            self._look.enable()
+        if listing is None:
+            return
+        options = {u: toy_name(words, u) for u in dict.fromkeys(self._urls)}
+        options |= {d.url: f"{d.name} · {d.url}" for d in listing.devices if d.url not in options}
+        self._list.set_options(options, value=self._list.value)
+        self._page.say(" ".join([words("record.found", n=len(options)), *listing.notes]))
+
+
+_GESTURES = "plush-18"
+_MOST = 20
+_NAME_ERRORS = ("name_exists", "name_bad")
+
+
+class ProtocolForm:
+    """A folded form; ``saved`` is called with the path of a new protocol."""
+
+    def __init__(self, page: Page, controller: RecordController, saved: Callable[[Path], None]) -> None:
+        self._page, self._controller, self._saved = page, controller, saved
+        words = page.words
+        with tag(ui.element("details").classes("w-full"), "own-protocol") as self._box:
+            summary(words("record.own_protocol"))
+            with ui.column().classes("w-full q-pt-sm"):
+                html(words("record.own_gestures"), "h3").props('id="own-gestures"')
+                with named(ui.row().classes("w-full ps-no-gap").props("role=group"), words("record.own_gestures")):
+                    self._gestures = {
+                        label: tag(ui.checkbox(words.gesture(label)).style("width: 16rem"), f"own-{label}")
+                        for label in load_gestures(_GESTURES).labels
+                    }
+                self._lacking = ui.label().classes("ps-bad").props("role=alert")
+                with ui.row().classes("w-full items-start"):
+                    self._repetitions = ui.number(
+                        words("record.own_repetitions"), value=3, min=1, max=_MOST, step=1, format="%d"
+                    )
+                    tag(self._repetitions, "own-repetitions").classes("w-64")
+                    orders = {order: words(f"record.order_{order}") for order in ORDERS}
+                    label = words("record.own_order")
+                    self._order = tag(ui.select(orders, value="gesture", label=label), "own-order").classes("w-96")
+                    named(self._order, label)
+                with ui.row().classes("w-full items-start"):
+                    self._name = tag(ui.input(words("record.own_name")), "own-name").classes("w-64")
+                    button("own-save", words("record.own_save"), self._save)
+
+    def _save(self) -> None:
+        words = self._page.words
+        self._name.error, self._repetitions.error, self._lacking.text = None, None, ""
+        chosen = [label for label, box in self._gestures.items() if box.value]
+        repetitions = int(self._repetitions.value or 0)
+        try:
+            path = self._controller.save_protocol(str(self._name.value or ""), chosen, repetitions, self._order.value)
+        except PlushSenseError as error:
+            sentence = words.error(error)
+            if error.reason in _NAME_ERRORS:
+                self._name.error = sentence
+            elif error.reason == "repetitions_bad":
+                self._repetitions.error = sentence
+            else:
+                self._lacking.text = sentence
+            return
+        for box in self._gestures.values():
+            box.value = False
+        self._name.value = ""
+        ui.run_javascript(f"getHtmlElement({self._box.id}).open = false")
+        self._saved(path)
