@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError, FileFormatError, ForgottenError
+from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, Gesture, plain_label
 from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_bytes, read_recording, read_stream
 from plushsense.dataset.files import (
@@ -32,6 +33,7 @@ from plushsense.dataset.quality.checking import import_flags
 from plushsense.dataset.quality.findings import PARTLY_THERE
 from plushsense.dataset.quality.measurements import Examination, usual_rows
 from plushsense.dataset.store import (
+    HEAD,
     RECORDINGS,
     STREAMS,
     Dataset,
@@ -136,6 +138,30 @@ def write_index_files(dataset: Dataset, stamp: dict[str, Any] | None = None) -> 
     write_index(dataset.path / STREAMS_INDEX, dataset.streams, StreamInfo)
     write_index(dataset.path / RECORDINGS_INDEX, dataset.recordings, RecordingInfo)
     write_stamp(dataset.path, stamp)
+
+
+def change_head(folder: Path, change: Callable[[DatasetHead], DatasetHead]) -> DatasetHead:
+    """Replace ``dataset.toml`` atomically by ``change`` of its present contents, and return the new head.
+
+    The index stays valid unless the layout or the gesture set changes.
+
+    Raises:
+        DatasetError: if the folder is no data set, or the file cannot be written. It is unchanged then.
+    """
+    try:
+        with Generation.of(folder).writing():
+            before, fresh = DatasetHead.read(folder), is_index_fresh(folder)
+            head = change(before)
+            if head != before:
+                write_file(folder / HEAD, head.to_toml())
+                if fresh and (head.layout, head.gestures) == (before.layout, before.gestures):
+                    write_stamp(folder, current_stamp(folder))
+    except OSError as cause:
+        why = cause.strerror or str(cause)
+        raise DatasetError(
+            f"'{folder / HEAD}' cannot be written: {why}.", reason="head_not_written", folder=folder.name, why=why
+        ) from None
+    return head
 
 
 def build_index(folder: Path, head: DatasetHead, progress: Progress | None = None) -> IndexBuild:

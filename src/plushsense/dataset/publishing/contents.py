@@ -145,11 +145,15 @@ class ContentsWriter:
         self.notes: list[str] = []
         if self.labelled and not options.streams:
             raise DatasetError(
-                f"'{dataset.path}' holds its recordings as parts of streams: it cannot be published without streams."
+                f"'{dataset.path}' holds its recordings as parts of streams: it cannot be published without streams.",
+                reason="streams_needed",
             )
         self.kept = [r for r in dataset.recordings if options.excluded or self.labelled or not r.excluded]
         if not self.kept:
-            raise DatasetError(f"'{dataset.path}' has no recording left to publish: every one is excluded.")
+            raise DatasetError(
+                f"'{dataset.path}' has no recording left to publish: every one is excluded.",
+                reason="nothing_to_publish",
+            )
         self.streams = dataset.streams if options.streams else []
         clocks = (HOST_MS, DEVICE_MS) if self._all_have_host() else (DEVICE_MS,)
         columns = (*clocks, *dataset.layout.names, *(("label",) if self.labelled else ()))
