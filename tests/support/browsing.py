@@ -43,7 +43,7 @@ _START_S = 60.0
 _WAIT_MS = 60_000
 _SETTLE_MS = 200
 _POLL_MS = 25
-DESK, TABLET = (1280, 800), (820, 1180)
+DESK, TABLET, PHONE = (1280, 800), (820, 1180), (390, 844)
 
 
 # Importing takes longer than starting: a server process imports once, and every studio is forked from it.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError, FileFormatError, ForgottenError
 from plushsense.core.files import write_file
-from plushsense.core.gestures import NOBODY, Gesture, plain_label
+from plushsense.core.gestures import NOBODY, Gesture, GestureSet, plain_label
 from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_bytes, read_recording, read_stream
 from plushsense.dataset.files import (
     RECORDINGS_INDEX,
@@ -87,7 +87,7 @@ def open_dataset(path: str | Path) -> Dataset:
         if is_same_raw_data(folder, stamp):
             # Only the marks changed, so the raw files need not be read again.
             built = IndexBuild(_indexed(folder, head, generation))
-            built.dataset.recordings = apply_marks(built.dataset.recordings, read_marks(folder))
+            built.dataset.recordings = apply_marks(built.dataset.recordings, read_marks(folder), head.gestures)
         else:
             built = build_index(folder, head)
     except OSError as cause:
@@ -185,7 +185,7 @@ def build_index(folder: Path, head: DatasetHead, progress: Progress | None = Non
         if progress is not None:
             progress(done + 1, len(files))
     infos = _recordings_from_files(folder, head, recordings, streams) + _recordings_from_labels(folder, head, streams)
-    infos = sorted(apply_marks(infos, read_marks(folder)), key=lambda r: r.id)
+    infos = sorted(apply_marks(infos, read_marks(folder), head.gestures), key=lambda r: r.id)
     stream_infos = [_stream_info(folder, head, s) for s in streams]
     return IndexBuild(Dataset(folder, head, infos, stream_infos, generation), unreadable)
 
@@ -331,6 +331,7 @@ def _recordings_from_files(
                 subject=_subject(read.subject, known),
                 session=session,
                 gesture=label,
+                recorded=label,
                 first_row=0,
                 stream=stream_id,
                 stream_row=stream_row,
@@ -396,6 +397,7 @@ def _recordings_from_labels(folder: Path, head: DatasetHead, streams: list[_RawF
                     subject=_subject(read.subject, gesture),
                     session=_stream_session(folder, read),
                     gesture=label,
+                    recorded=label,
                     first_row=first,
                     stream=_stream_id(folder, read),
                     stream_row=first,
@@ -405,13 +407,22 @@ def _recordings_from_labels(folder: Path, head: DatasetHead, streams: list[_RawF
     return infos
 
 
-def apply_marks(infos: Iterable[RecordingInfo], marks: dict[str, MarkState]) -> list[RecordingInfo]:
-    """Return the recordings as ``marks`` trim and exclude them."""
+def apply_marks(
+    infos: Iterable[RecordingInfo], marks: dict[str, MarkState], gestures: GestureSet
+) -> list[RecordingInfo]:
+    """Return the recordings as ``marks`` trim, exclude and relabel them; ``gestures`` is the set of the data set."""
     out = []
     for info in infos:
         mark = marks.get(info.id, MarkState())
         stop = info.rows if mark.stop < 0 else min(mark.stop, info.rows)
-        out.append(replace(info, excluded=mark.excluded, start=min(mark.start, stop), stop=stop))
+        gesture, subject = mark.gesture or info.recorded, info.subject
+        if gesture != info.gesture:
+            subject = _subject(info.id.split("/", 1)[0], gestures.find(gesture))
+        out.append(
+            replace(
+                info, excluded=mark.excluded, start=min(mark.start, stop), stop=stop, gesture=gesture, subject=subject
+            )
+        )
     return out
 
 

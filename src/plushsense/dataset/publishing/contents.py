@@ -335,6 +335,8 @@ class ContentsWriter:
             identity = ids[recording.id]
             if (mark.start, mark.stop) != (0, -1):
                 marks.append(Mark(identity, "trim", "", start=mark.start, stop=mark.stop))
+            if mark.gesture:
+                marks.append(Mark(identity, "relabel", "", gesture=mark.gesture))
             if mark.excluded:
                 marks.append(Mark(identity, "exclude", ""))
             marks += [Mark(identity, "accept", "", check=check) for check in sorted(mark.accepted)]
@@ -359,6 +361,12 @@ class ContentsWriter:
         if trimmed:
             self.notes.append(
                 f"Trimmed: {_count(trimmed, 'recording')}; the files hold all rows, start and stop say which remain."
+            )
+        relabelled = sum(r.gesture != r.recorded for r in published.recordings)
+        if relabelled:
+            self.notes.append(
+                f"Relabelled: {_count(relabelled, 'recording')}; the files are named after the gesture that was asked "
+                "for, the tables state the one that was made."
             )
         renamed = [code for code, public in self.codes.items() if code != public]
         if renamed:
