@@ -45,15 +45,15 @@ class RecordingFilter:
     check: str = ""
     text: str = ""
 
-    def fits(self, row: ReviewedRecording) -> bool:
-        """Return whether a recording meets all conditions."""
+    def fits(self, row: ReviewedRecording, word: Callable[[str], str] = str) -> bool:
+        """Return whether a recording meets all conditions; ``word`` translates the messages of findings."""
         return (
             self.person in ("", row.info.subject)
             and self.gesture in ("", row.info.gesture)
             and self._state_fits(row)
             and self._severity_fits(row)
             and (not self.check or any(f.check == self.check for f in row.findings))
-            and self._text_fits(row)
+            and self._text_fits(row, word)
         )
 
     def _state_fits(self, row: ReviewedRecording) -> bool:
@@ -66,9 +66,9 @@ class RecordingFilter:
             return not self.severity or not row.worst
         return bool(row.worst) and SEVERITIES.index(row.worst) <= SEVERITIES.index(self.severity)
 
-    def _text_fits(self, row: ReviewedRecording) -> bool:
+    def _text_fits(self, row: ReviewedRecording, word: Callable[[str], str]) -> bool:
         text = self.text.strip().casefold()
-        return any(text in s.casefold() for s in (row.id, *(f.message for f in row.findings)))
+        return any(text in s.casefold() for s in (row.id, *(word(f.message) for f in row.findings if text)))
 
     @classmethod
     def of(cls, query: Mapping[str, str]) -> RecordingFilter:
@@ -102,9 +102,10 @@ def filter_and_sort(
     only: Collection[str] | None = None,
     by: str = "recording",
     down: bool = False,
+    word: Callable[[str], str] = str,
 ) -> list[str]:
     """Return the sorted ids of the recordings that pass ``filter`` and, unless ``only`` is None, are in ``only``."""
-    fitting = [r for r in rows if (only is None or r.id in only) and filter.fits(r)]
+    fitting = [r for r in rows if (only is None or r.id in only) and filter.fits(r, word)]
     fitting.sort(key=lambda r: r.id, reverse=down and by == "recording")
     if by != "recording":
         fitting.sort(key=SORTS[by], reverse=down)
@@ -229,7 +230,7 @@ class ReviewController:
                 **{s: words(f"review.from_{s}") for s in SEVERITIES},
                 NO_FINDING: words("review.no_finding"),
             },
-            "check": {c: c for c in CHECKS if "recording" in CHECKS[c].scope},
+            "check": {c: words.get(f"checks.{c}", c) for c in CHECKS if "recording" in CHECKS[c].scope},
         }
         self._fields: dict[str, Any] = {}
         for key, choices in options.items():
@@ -289,7 +290,8 @@ class ReviewController:
 
     def arrange(self) -> None:
         """Filter and sort the recordings again."""
-        self.order = filter_and_sort(self.review.rows.values(), self.filter, self.only, self.by, self.down)
+        rows, word = self.review.rows.values(), self.words.sentence
+        self.order = filter_and_sort(rows, self.filter, self.only, self.by, self.down, word)
 
     async def _filtered(self, key: str, value: Any) -> None:
         self.filter = replace(self.filter, **{key: str(value or "")})
@@ -348,7 +350,7 @@ class ReviewController:
         """Return the ids of up to ``count`` recordings that follow in the order and still pass the filter."""
         rows = self.review.rows
         start = self.order.index(self.current) + 1 if self.current in self.order else 0
-        fitting = (i for i in self.order[start:] if i in rows and self.filter.fits(rows[i]))
+        fitting = (i for i in self.order[start:] if i in rows and self.filter.fits(rows[i], self.words.sentence))
         return list(itertools.islice(fitting, count))
 
     async def next(self) -> None:

@@ -12,6 +12,7 @@ from plushsense.studio.app.shell import LINES, address, button, tag
 from plushsense.studio.pages.review.controller import DURATIONS, ReviewController
 from plushsense.studio.pages.review.plot import ReviewPlot
 from plushsense.studio.pages.review.signals import GestureOverlay
+from plushsense.studio.pages.review.table_view import check_name
 from plushsense.studio.widgets.elements import link, table
 
 _MAX_OUTLIERS = 30
@@ -98,7 +99,7 @@ class GestureOverlayView:
                 with ui.row().classes("items-center no-wrap w-full"):
                     dash = ui.element("span").style("width: 22px; height: 4px; flex: none")
                     dash.style(f"background: {colours[c.recording]}")
-                    text = f"{c.recording}: {c.why}"
+                    text = f"{c.recording}: {', '.join(check_name(words, check) for check in c.why.split(', '))}"
                     name = button("", text, lambda c=c: desk.open(c.recording), "flat dense align=left")
                     name.style("overflow-wrap: anywhere; text-align: left").classes("flex-grow")
             if len(outliers) > _MAX_OUTLIERS:

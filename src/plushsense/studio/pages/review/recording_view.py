@@ -12,6 +12,7 @@ from plushsense.studio.pages.review.plot import ReviewPlot, curve_styles
 from plushsense.studio.pages.review.signals import ACTIVITY, ALL
 from plushsense.studio.pages.review.table_view import (
     SIGNS,
+    advice,
     ask_gesture,
     ask_reason,
     finding_button,
@@ -246,13 +247,13 @@ class RecordingView:
             for f in row.findings:
                 with ui.column().classes("w-full ps-no-gap").props(f'data-check="{f.check}"'):
                     ui.label(finding_text(words, f)).classes("text-bold")
-                    ui.label(f.message)
+                    ui.label(words.sentence(f.message))
                     if f.accepted:
                         with ui.row().classes("items-center"):
                             ui.label(f"✓ {words('review.accepted_finding')}").classes("ps-dim")
                             finding_button(desk, f, row.id).classes("ps-act")
                     else:
-                        ui.label(f"→ {f.action}").classes("ps-dim")
+                        ui.label(f"→ {advice(words, f)}").classes("ps-dim")
                         finding_button(desk, f, row.id).classes("ps-act")
 
     # Commands -----------------------------------------------------------------------------------------------------

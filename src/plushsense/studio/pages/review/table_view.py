@@ -66,6 +66,12 @@ def check_name(words: Words, check: str) -> str:
     return words.get(f"checks.{check}", check)
 
 
+def advice(words: Words, finding: Finding) -> str:
+    """Return what a check advises to do about a finding, in this language."""
+    of_stream = words.get(f"advice.{finding.check}-stream") if finding.stream else ""
+    return of_stream or words.get(f"advice.{finding.check}", finding.action)
+
+
 def finding_button(desk: ReviewController, finding: Finding, recording: str = "") -> ui.button:
     """Add a button that accepts or reopens a finding; with ``recording``, it works only while that is displayed."""
 
@@ -289,7 +295,9 @@ class RecordingTableView:
             for f in findings:
                 with ui.row().classes("w-full items-center no-wrap"):
                     ui.label(finding_text(words, f)).style("min-width: 140px")
-                    ui.label(f"{f.about or words('review.dataset')}: {f.message}").classes("flex-grow")
+                    ui.label(f"{f.about or words('review.dataset')}: {words.sentence(f.message)}").classes(
+                        "flex-grow ps-break"
+                    )
                     finding_button(desk, f)
 
     # Selection ----------------------------------------------------------------------------------------------------
