@@ -14,9 +14,11 @@ from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import CsvFormat, load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset import index
+from plushsense.dataset.files import is_index_fresh
 from plushsense.dataset.importing.importers import import_recordings
-from plushsense.dataset.index import open_dataset
+from plushsense.dataset.index import change_head, open_dataset
 from plushsense.dataset.marks import Mark, append_marks
+from plushsense.dataset.publishing.package import missing_statements
 from plushsense.dataset.store import Dataset, DatasetHead
 from plushsense.recording.simulate import simulate
 
@@ -202,3 +204,20 @@ def test_the_label_may_be_any_column(tmp_path: Path) -> None:
     import_recordings(tmp_path / "src", tmp_path / "DS", layout=layout)
     dataset = open_dataset(tmp_path / "DS")
     assert [(r.gesture, dataset.read(r).values[0, 0]) for r in dataset.recordings] == [("A", 0), ("B", 5)]
+
+
+def test_a_change_of_the_head_is_atomic_and_keeps_the_index(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def entitle(head: DatasetHead) -> DatasetHead:
+        return replace(head, consent="all agreed", about=replace(head.about, title="Touch"))
+
+    assert missing_statements(change_head(folder, entitle)) == ["description", "creators", "licence", "contact"]
+    assert DatasetHead.read(folder).about.title == "Touch" and is_index_fresh(folder)
+    before = (folder / "dataset.toml").read_bytes()
+
+    def full(*args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(DatasetError, match="No space left") as refused:
+        change_head(folder, lambda head: replace(head, licence="MIT"))
+    assert refused.value.reason == "head_not_written" and (folder / "dataset.toml").read_bytes() == before

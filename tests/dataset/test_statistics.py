@@ -10,7 +10,7 @@ from plushsense.core.recorder_csv import Frames, recording_filename, write_recor
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
-from plushsense.dataset.statistics import SummaryStatistics, channel_table, duration_table
+from plushsense.dataset.statistics import SummaryStatistics, channel_table, duration_bands, duration_table
 from plushsense.dataset.store import Dataset, PersonInfo, write_people
 
 ACCEL = load_layout("accel-3")
@@ -81,3 +81,12 @@ def test_channels_by_gesture(dataset: Dataset) -> None:
     x = np.concatenate([np.arange(n) for n in (100, 200, 300, 400)])
     assert table["Wave", "x"].mean == pytest.approx(x.mean())
     assert table["Wave", "x"].sd == pytest.approx(x.std())
+
+
+def test_the_band_of_the_paper_around_the_mean(dataset: Dataset) -> None:
+    tap, wave = duration_bands(dataset)
+    assert (tap.gesture, tap.outliers, wave.statistics.median) == ("Tap", [], pytest.approx(2.5, rel=0.01))
+    assert (wave.low_s, wave.high_s) == (pytest.approx(0.6 * wave.mean_s), pytest.approx(1.4 * wave.mean_s))
+    outside = [i for i, s in wave.seconds.items() if abs(s / wave.mean_s - 1) > 0.4]
+    assert wave.outliers == outside and len(outside) == 2
+    assert duration_bands(dataset, 0.7)[1].outliers == []

@@ -43,7 +43,7 @@ def run_task(task: Any, **spec: Any) -> tuple[dict[str, Any], list[dict[str, Any
 def test_pseudonyms_then_the_advice_is_gone(few: Path) -> None:
     workspace = Workspace(few)
     found = DatasetFacts.of(workspace.datasets()[0])
-    assert found.dataset is not None and found.problem == ""
+    assert found.dataset is not None and found.problem is None
     assert (len(found.dataset.subjects), len(found.dataset.recordings), found.dataset.head.simulated) == (3, 9, True)
     assert found.own_codes == ("P01", "P02", "P03") and found.own_dates
     place, key = workspace.new("datasets", "shared"), workspace.folder / "keys" / "people.csv"
@@ -68,7 +68,7 @@ def test_columns_and_a_broken_data_set(few: Path) -> None:
     (folder / PEOPLE).write_text("subject,age_group,gender,consent,handedness\nP01,10-12,f,A1,left\n", "utf-8")
     assert DatasetFacts.of(folder).columns == ("handedness",)
     (folder / "dataset.toml").write_text("format = 9\n", "utf-8")
-    assert "has the format 9" in DatasetFacts.of(folder).problem
+    assert "has the format 9" in str(DatasetFacts.of(folder).problem)
 
 
 def test_a_package_by_the_tasks(few: Path, publish_tools: None, monkeypatch: pytest.MonkeyPatch) -> None:

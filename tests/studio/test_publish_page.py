@@ -11,7 +11,9 @@ from typing import Any
 
 import pytest
 
+from plushsense.dataset.about import Creator
 from plushsense.dataset.publishing.checking import VALIDATORS
+from plushsense.dataset.store import DatasetHead
 from support.browsing import TABLET, axe, connected, marked
 
 Fixture = Callable[..., Any]
@@ -23,15 +25,25 @@ def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture,
     browser = look()
     page = browser.open(f"{url}/publish")
     assert "Nothing is uploaded" in marked(page, "danger").inner_text()
-    assert "does not state yet: contact" in marked(page, "lacks").inner_text()
+    assert "does not state yet: title, description, authors, contact" in marked(page, "lacks").inner_text()
     marked(page, "do").click()
-    assert "cannot be published without licence, contact and consent" in marked(page, "message").inner_text()
+    page.get_by_text("Give a title.").wait_for()
+    for missing in ("Describe the data", "Name at least one author", "A name and an e-mail address"):
+        assert page.locator(".q-field--error").filter(has_text=missing).count() == 1
+    assert not (few / "packages").exists()
     assert axe(page) == []
-    marked(page, "contact-name").fill("Ada")
-    marked(page, "contact-mail").fill("nonsense")
-    marked(page, "do").click()
-    marked(page, "message").get_by_text("cannot be used").wait_for()
+    statements = {"data-title": "Touch", "description": "Virtual people touch a toy.", "contact-name": "Ada"}
+    for name, value in (
+        statements | {"creator-name": "Byron, Ada", "creator-orcid": "1234", "contact-mail": "x"}
+    ).items():
+        marked(page, name).fill(value)
+    marked(page, "save").click()
+    page.get_by_text("“1234” is no ORCID iD").wait_for()
+    page.get_by_text("“x” is no e-mail address").wait_for()
+    marked(page, "creator-orcid").fill("0000-0002-1825-0097")
     marked(page, "contact-mail").fill("ada@example.org")
+    marked(page, "creator-add").click()
+    marked(page, "creator-name").nth(1).fill("Institute of Touch")
     marked(page, "with-key").click()
     marked(page, "name").fill("one")
     marked(page, "do").click()
@@ -44,13 +56,23 @@ def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture,
     assert all(name in answers for name in VALIDATORS) and answers.count("✓ passed") == len(VALIDATORS)
     assert "recognises the right one of 3 people" in marked(page, "recognised").inner_text()
     assert "These people are virtual" in marked(page, "recognised").inner_text()
-    assert "Ada (" in marked(page, "citation").inner_text()
+    assert "Byron, Ada; Institute of Touch (" in marked(page, "citation").inner_text()
+    # What was entered is stored in the data set, is there after the reload, and can be changed again.
+    assert marked(page, "creator-orcid").nth(0).input_value() == "0000-0002-1825-0097"
+    marked(page, "creator-remove").nth(1).click()
+    marked(page, "save").click()
+    marked(page, "message").get_by_text("Saved in the data set").wait_for()
+    about = DatasetHead.read(few / "datasets" / "virtual").about
+    assert about.creators == (Creator("Byron, Ada", "0000-0002-1825-0097"),) and about.title == "Touch"
     assert axe(page) == []
     shots(page, "publish-done")
     key, made = few / "keys" / "virtual.key", few / "packages" / "one.zip"
     command = [sys.executable, "-m", "plushsense", "publish", str(few / "datasets" / "virtual")]
-    said = ("--contact", "Ada <ada@example.org>", "--key", str(key))
-    subprocess.run([*command, str(tmp_path / "two"), *said], check=True, capture_output=True)
+    marked(page, "creator-add").click()
+    marked(page, "creator-name").nth(1).fill("Institute of Touch")
+    marked(page, "save").click()
+    marked(page, "message").get_by_text("Saved in the data set").wait_for()
+    subprocess.run([*command, str(tmp_path / "two"), "--key", str(key)], check=True, capture_output=True)
     assert made.read_bytes() == (tmp_path / "two.zip").read_bytes(), "the command makes the same package, byte for byte"
     with page.expect_download() as loaded:
         marked(page, "download").click()
@@ -61,7 +83,7 @@ def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture,
         shutil.copy(made, few / "packages" / "two.zip")
         marked(page, "name").fill(name)
         marked(page, "do").click()
-        marked(page, "message").get_by_text("exists already").wait_for()
+        page.locator(".q-field--error").get_by_text(f"“{name}").wait_for()
         marked(page, "message").get_by_role("button").click()
     made.unlink()
     (few / "packages" / "one" / "gestures.csv").write_text("Shake\n", "utf-8")
@@ -84,14 +106,14 @@ def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, shots: Fix
     url = studio(home=few).url
     browser = look()
     page = browser.open(f"{url}/publish")
-    assert "licence, contact, consent statement" in marked(page, "lacks").inner_text()
     marked(page, "do").click()
-    assert "consent = " in marked(page, "message").inner_text()
+    page.get_by_text("State what the people consented to.").wait_for()
+    page.get_by_text("Choose a licence.").wait_for()
     marked(page, "rename").get_by_text("Make a copy with pseudonyms").click()
     marked(page, "rename-name").fill("shared")
     marked(page, "rename-key").fill("../people.csv")
     marked(page, "rename-do").click()
-    marked(page, "message").get_by_text("cannot be a name").wait_for()
+    page.get_by_text("“../people.csv” cannot be a name").wait_for()
     marked(page, "rename-key").fill("people.csv")
     assert axe(page) == []
     shots(page, "publish-pseudonyms")
@@ -103,9 +125,9 @@ def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, shots: Fix
 
     marked(page, "licence").click()
     page.get_by_role("option", name="CC-BY-4.0: ").click()
-    marked(page, "contact-name").fill("Ada")
+    for name in ("data-title", "description", "creator-name", "contact-name", "consent"):
+        marked(page, name).fill("all agreed")
     marked(page, "contact-mail").fill("ada@example.org")
-    marked(page, "consent").fill("all agreed")
     marked(page, "name").fill("stopped")
     marked(page, "do").click()
     marked(page, "stop").click()
@@ -122,7 +144,7 @@ def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, shots: Fix
     marked(page, "ended").get_by_text("cannot be created").wait_for(timeout=60_000)
     page.goto(f"{url}/publish?name=nothing")
     connected(page)
-    assert "There is no package 'nothing'" in marked(page, "message").inner_text()
+    assert "There is no package “nothing”" in marked(page, "message").inner_text()
     assert browser.complaints == []
 
 

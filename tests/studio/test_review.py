@@ -16,7 +16,7 @@ from plushsense.dataset.marks import Mark, append_marks, read_marks
 from plushsense.dataset.trimming import row_times_s, suggest_trims
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.review.review import Reviews
-from support.browsing import DESK, TABLET, axe, connected, marked
+from support.browsing import DESK, PHONE, TABLET, axe, connected, marked
 from support.reviewed import ROW_S, made, marks, raw_hash, streamed
 
 if TYPE_CHECKING:
@@ -327,6 +327,7 @@ def test_the_table_filters_sorts_and_says_what_it_shows(
     rows.first.wait_for()
     checked(page)
     assert rows.count() == 24
+    marked(page, "filters").click()
     marked(page, "filter-person").click()
     page.get_by_role("option", name="P2", exact=True).click()
     page.wait_for_function("() => document.querySelectorAll('[data-test=table] tbody tr').length === 8")
@@ -341,11 +342,110 @@ def test_the_table_filters_sorts_and_says_what_it_shows(
     page.wait_for_function("() => document.querySelectorAll('[data-test=table] tbody tr').length === 1")
     assert "✕ excluded" in page.locator("[data-test=table] tbody").inner_text()
     page = look().open(url + "/review")
-    page.get_by_role("button", name="Duration").click()
+    page.locator("thead").get_by_role("button", name="Duration").click()
     page.wait_for_selector("th[aria-sort=ascending]:has-text('Duration')")
-    page.get_by_role("button", name="Duration").click()
+    page.locator("thead").get_by_role("button", name="Duration").click()
     page.wait_for_selector("th[aria-sort=descending]")
     assert "7.50 s" in page.locator("[data-test=table] tbody tr").first.inner_text()
+
+
+def test_decisions_about_many_recordings(waves: Path, studio: Fixture, look: Fixture) -> None:
+    raw = raw_hash(waves)
+    browser = look()
+    page = browser.open(studio(home=waves.parents[1]).url + "/review")
+    boxes = page.locator("tbody .ps-check input")
+    boxes.first.wait_for()
+    checked(page)
+
+    def done(text: str) -> None:
+        marked(page, "message").get_by_text(text).wait_for()
+
+    # A click, and a Shift-click that selects what lies between.
+    boxes.nth(1).click()
+    boxes.nth(4).click(modifiers=["Shift"])
+    marked(page, "chosen").get_by_text("Selected: 4").wait_for()
+    marked(page, "relabel-selected").click()
+    marked(page, "relabel-go").wait_for()
+    assert axe(page) == []
+    marked(page, "new-gesture").click()
+    page.get_by_role("option", name="Rest").click()
+    marked(page, "relabel-go").click()
+    done("Recordings changed: 4")
+    assert page.get_by_text("recorded as Wave").count() == 4
+    assert {m["action"] for m in marks(waves)} == {"relabel"} and len(marks(waves)) == 4
+    assert axe(page) == []
+    marked(page, "message").get_by_role("button", name="Undo").click()
+    done("Undone: setting another gesture. Recordings: 4")
+    assert all(r.gesture == r.recorded for r in open_dataset(waves).recordings)
+    # All that the filter shows; excluded with one reason, and included again.
+    marked(page, "filters").click()
+    marked(page, "filter-person").click()
+    page.get_by_role("option", name="P2", exact=True).click()
+    marked(page, "select-none").click()
+    marked(page, "select-all").get_by_text("(8)").click()
+    marked(page, "chosen").get_by_text("Selected: 8").wait_for()
+    marked(page, "exclude-selected").click()
+    page.get_by_role("button", name="recorded twice").click()
+    done("Recordings changed: 8")
+    assert sum(r.excluded for r in open_dataset(waves).recordings) == 8
+    marked(page, "include-selected").click()
+    done("Recordings changed: 8")
+    marked(page, "undo-list").click()
+    done("Undone: including again. Recordings: 8")
+    marked(page, "undo-list").click()
+    done("Undone: excluding. Recordings: 8")
+    assert not any(r.excluded for r in open_dataset(waves).recordings)
+    # How many, before the click; and the same number is taken back.
+    many = int(marked(page, "accept-sure").inner_text().rpartition(" ")[2])
+    marked(page, "sure").fill("0")
+    page.wait_for_function(
+        "(n) => Number(document.querySelector('[data-test=accept-sure]').textContent.split(': ')[1]) > n", arg=many - 1
+    )
+    all_of_them = int(marked(page, "accept-sure").inner_text().rpartition(" ")[2])
+    assert all_of_them == 7
+    marked(page, "accept-sure").click()
+    done("Recordings changed: 7")
+    assert sum(r.start > 0 for r in open_dataset(waves).recordings) == 7
+    marked(page, "message").get_by_role("button", name="Undo").click()
+    done("Undone: trim. Recordings: 7")
+    assert not any(r.start for r in open_dataset(waves).recordings) and raw_hash(waves) == raw
+    assert browser.complaints == []
+
+
+def test_durations_with_an_adjustable_band(waves: Path, studio: Fixture, look: Fixture, shots: Fixture) -> None:
+    url = studio(home=waves.parents[1]).url
+    longest = max(open_dataset(waves).recordings, key=lambda r: r.rows).id
+    for language, dark, size in (("lv", True, PHONE), ("en", False, DESK)):
+        browser = look(size, dark, language)
+        page = browser.open(url + "/review?view=durations&gesture=Wave")
+        marked(page, "duration-outliers").get_by_text(longest).wait_for()
+        assert axe(page) == []
+        shots(page, f"review-durations-{language}-{'dark' if dark else 'light'}")
+        assert page.evaluate("() => document.documentElement.scrollWidth <= window.innerWidth")
+        assert browser.complaints == []
+    assert "Recordings: 21. Mean 2.74 s, median 2.50 s" in marked(page, "durations-summary").inner_text()
+    marked(page, "band").fill("190")
+    marked(page, "duration-outliers").get_by_text("There are no outliers").wait_for()
+    marked(page, "band").fill("40")
+    marked(page, "select-outliers").click()
+    marked(page, "chosen").get_by_text("Selected: 1").wait_for()
+    marked(page, "view").get_by_role("button", name="Durations").click()
+    over = page.locator("[data-test=durations-plot] .u-over")
+    box = over.bounding_box()
+    assert box is not None
+    # The longest was recorded last.
+    over.click(position={"x": int(box["width"]) - 2, "y": int(box["height"] * 0.3)})
+    assert opened(page) == longest
+    # The plot has half of the window, and what decides is in sight.
+    plot = page.locator(f"{PLOT} canvas").bounding_box()
+    assert plot is not None and plot["height"] >= 400
+    marked(page, "relabel").click()
+    marked(page, "new-gesture").click()
+    page.get_by_role("option", name="Rest").click()
+    marked(page, "relabel-go").click()
+    page.get_by_text("Rest (recorded as Wave)").wait_for()
+    page.keyboard.press("u")
+    page.get_by_text("Undone: setting another gesture").wait_for()
 
 
 def test_overlays_name_what_stands_out(waves: Path, studio: Fixture, look: Fixture, shots: Fixture) -> None:
@@ -403,7 +503,7 @@ def test_links_from_other_pages(waves: Path, studio: Fixture, look: Fixture) -> 
     browser = look()
     page = browser.open(started.url + reviews.address(waves, ids[3:6], "Wave taken for Rest"))
     page.wait_for_function("() => document.querySelectorAll('[data-test=table] tbody tr').length === 3")
-    assert "Only 3 linked recordings. Wave taken for Rest" in marked(page, "selection").inner_text()
+    assert "Only the linked recordings (3). Wave taken for Rest" in marked(page, "selection").inner_text()
     marked(page, "start").click()
     assert opened(page) == ids[3]
     checked(page)
@@ -414,7 +514,7 @@ def test_links_from_other_pages(waves: Path, studio: Fixture, look: Fixture) -> 
     assert [m["recording"] for m in marks(waves)] == ids[3:6]
     page = browser.open(started.url + reviews.address(waves, [*ids, *(f"P9/gone_{i}" for i in range(99))], "many"))
     page.wait_for_function(f"() => document.querySelectorAll('[data-test=table] tbody tr').length === {len(ids)}")
-    assert "99 of the linked recordings are not in this data set" in marked(page, "message").inner_text()
+    assert "not in this data set: 99" in marked(page, "message").inner_text()
     page = browser.open(started.url + "/review?recording=P1/none")
     page.get_by_text("There is no recording 'P1/none'").wait_for()
     page = browser.open(started.url + "/review?selection=0000")

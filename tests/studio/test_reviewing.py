@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, MarkState, append_marks, read_marks
-from plushsense.dataset.trimming import suggest_trims
+from plushsense.dataset.trimming import decide_trims, suggest_trims
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.review import signals as review_signals
 from plushsense.studio.pages.review.controller import DONE, NO_FINDING, TO_DO, RecordingFilter, filter_and_sort
@@ -73,7 +74,7 @@ def test_accepting_marks_the_suggestion_and_undo_brings_all_back(review: Review)
     review.set(second, start=20)
     assert review.rows[second].state == "draft"
     assert review.accept(VISIT, second, ME)
-    assert review.exclude(VISIT, third, ME, "broken off")
+    assert review.exclude(VISIT, [third], ME, "broken off")
     said = [(m["recording"], m["action"], m["start"], m["how"], m["who"], m["why"]) for m in marks(review.path)]
     assert said == [
         (first, "trim", suggested, "suggested", ME, ""),
@@ -117,7 +118,7 @@ def test_two_windows_do_not_fight(review: Review) -> None:
     assert review.undo("left", ME) is None, "the other window's decision is not mine to take back"
     assert review.standing(second).trimmed
     review.accept("left", first, ME)
-    review.exclude("right", first, ME, "odd")
+    review.exclude("right", [first], ME, "odd")
     review.set(second, start=3)
     review.accept("left", second, ME)
     append_marks(review.path, [Mark(second, "trim", "somebody", start=44, how="hand")])
@@ -150,7 +151,7 @@ def test_drafts_stay_inside_and_keep_something(review: Review) -> None:
     assert review.kept_rows(first) == (0, 250)
     assert review.drop(first)
     assert review.kept_rows(first) == (start, 250)
-    review.exclude(VISIT, first, ME, "odd")
+    review.exclude(VISIT, [first], ME, "odd")
     with pytest.raises(DatasetError, match="take it back in"):
         review.set(first, start=3)
 
@@ -179,7 +180,7 @@ def test_findings_are_accepted_with_a_reason_and_taken_back(review: Review) -> N
 
 def test_a_decision_makes_the_check_old_and_checking_renews_it(review: Review) -> None:
     odd = next(r.id for r in review.rows.values() if any(f.check == "duration" for f in r.open))
-    review.exclude(VISIT, odd, ME, "too long")
+    review.exclude(VISIT, [odd], ME, "too long")
     assert review.unchecked == 1
     review.check()
     review.prepared.wait(60.0)
@@ -249,7 +250,7 @@ def test_an_overlay_names_what_stands_out(review: Review) -> None:
     height = overlay.curves[-1][at]
     if not np.isnan(height):
         assert overlay.nearest(float(overlay.x[at]), float(height)) == overlay.drawn[-1].recording
-    review.exclude(VISIT, longest, ME, "too long")
+    review.exclude(VISIT, [longest], ME, "too long")
     assert longest not in [c.recording for c in review.overlay("Wave").drawn]
 
 
@@ -294,3 +295,41 @@ def test_a_folder_that_cannot_be_written_loses_nothing(review: Review) -> None:
 def test_places_outside_are_refused(workspace: Workspace) -> None:
     with pytest.raises(ConfigError, match="outside"):
         workspace.part(Reviews).open("../elsewhere")
+
+
+def test_one_undo_for_decisions_about_many(review: Review) -> None:
+    first, second, third, *rest = waves(review)
+    raw = raw_hash(review.path)
+    assert review.exclude(VISIT, [first], ME, "odd") == 1
+    assert review.exclude(VISIT, [first, second, third], ME, "odd") == 2
+    review.include("elsewhere", [second], "you")
+    undone = review.undo(VISIT, ME)
+    assert undone is not None and list(undone.before) == [third], "what was changed elsewhere stays"
+    assert [review.standing(i).excluded for i in (first, second, third)] == [True, False, False]
+    assert review.relabel(VISIT, [second, third], "Rest", ME, "seen") == 2
+    row = review.rows[third]
+    assert (row.info.gesture, row.info.recorded, review.unchecked) == ("Rest", "Wave", 3)
+    with pytest.raises(DatasetError, match="has no gesture"):
+        review.relabel(VISIT, [second, third], "Nod", ME)
+    assert review.undo(VISIT, ME) is not None and review.rows[third].info.gesture == "Wave"
+    assert review.undo(VISIT, ME) is not None and not review.standing(first).excluded
+    assert review.undo(VISIT, ME) is None and raw_hash(review.path) == raw
+    assert len(rest) > 3
+
+
+def test_all_sure_suggestions_are_accepted_and_taken_back_at_once(review: Review) -> None:
+    ids = list(review.rows)
+    sorted_by = sorted(r.confidence for r in review.rows.values() if r.state == "suggested")
+    above = sorted_by[len(sorted_by) // 2]
+    surer = review.surer_than(above, ids)
+    assert 0 < len(surer) < len(sorted_by) and surer == [i for i in ids if review.rows[i].confidence >= above > 0]
+    # The library decides alike.
+    trims = decide_trims(Path(shutil.copytree(review.path, review.path.parent / "copy")), above=above, who=ME)
+    assert sorted(trims.accepted.marked) == sorted(surer)
+    by_hand = surer[0]
+    review.set(by_hand, start=3)
+    review.accept(VISIT, by_hand, ME)
+    assert review.accept_above(VISIT, ids, ME, above) == len(surer) - 1
+    assert review.rows[by_hand].state == "adjusted" and review.rows[surer[1]].state == "accepted"
+    assert review.undo(VISIT, ME) is not None and review.surer_than(above, ids) == surer[1:]
+    assert review.rows[by_hand].state == "adjusted"

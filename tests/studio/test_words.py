@@ -16,6 +16,7 @@ import pytest
 from plushsense.core import errors
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import load_gestures
+from plushsense.dataset.quality.checking import CHECKS
 from plushsense.studio.app.words import LANGUAGES, Words
 
 
@@ -88,6 +89,47 @@ def test_every_reason_of_an_error_has_a_text_with_its_values() -> None:
         assert text, f"{place}: errors.{reason.value} has no text"
         assert None in given or fields(text) <= set(given), place
     assert reasons > 10
+
+
+def sentences() -> Iterator[tuple[str, ast.Call]]:
+    """Yield every `Sentence` that the source makes, with its place."""
+    package = Path(str(resources.files("plushsense")))
+    for module in sorted(package.rglob("*.py")):
+        for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Sentence" and len(node.args) > 1:
+                yield f"{module.relative_to(package).as_posix()}:{node.lineno}", node
+
+
+def reasons(node: ast.expr) -> list[str]:
+    """Return the possible values of an expression, as patterns."""
+    if isinstance(node, ast.Constant):
+        return [str(node.value)]
+    if isinstance(node, ast.IfExp):
+        return [*reasons(node.body), *reasons(node.orelse)]
+    if isinstance(node, ast.JoinedStr):
+        parts = [[v.value] if isinstance(v, ast.Constant) else ["[a-z_]*"] for v in node.values]
+        return ["".join(str(part) for each in parts for part in each)]
+    return []
+
+
+def test_every_sentence_of_the_library_has_a_text_with_its_values() -> None:
+    known, used = Words("en").table("sentences"), set[str]()
+    for place, call in sentences():
+        given = {keyword.arg for keyword in call.keywords}
+        patterns = reasons(call.args[1])
+        assert patterns, place
+        for pattern in patterns:
+            fitting = [key for key in known if re.fullmatch(pattern, key)]
+            assert fitting, f"{place}: sentences.{pattern} has no text"
+            used |= set(fitting)
+            assert None in given or all(fields(known[key]) <= given for key in fitting), place
+    assert used == set(known)
+
+
+def test_every_check_has_a_name_and_advice_in_each_language() -> None:
+    for language in LANGUAGES:
+        words = Words(language)
+        assert all(words.get(f"checks.{name}") and words.get(f"advice.{name}") for name in CHECKS)
 
 
 def test_every_error_of_the_studio_has_a_reason() -> None:

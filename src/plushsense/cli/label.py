@@ -1,4 +1,6 @@
-"""Implement ``plushsense label DATASET [STREAM] [--from S --to S --as LABEL | --undo | --import FILE]``."""
+"""Implement ``plushsense label DATASET``: ``[STREAM] [--from S --to S --as LABEL | --undo | --import FILE]``, or
+``--recording ID --as GESTURE | --undo``.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,7 @@ from dataclasses import asdict
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, say, table
+from plushsense.core.errors import ConfigError
 
 _LINES = 40
 
@@ -14,6 +17,8 @@ _LINES = 40
 def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.labelling import decide_labels, write_stretches
 
+    if args.recording:
+        return _relabel(args)
     done = decide_labels(
         args.dataset,
         args.stream,
@@ -43,4 +48,19 @@ def run(args: argparse.Namespace) -> int:
     listing = [table(("stream", "start s", "stop s", "label"), rows), ""] if 0 < len(rows) <= _LINES else []
     totals = "".join(f"; {label} {total:.0f} s" for label, total in sorted(seconds.items()))
     emit(args, result, [*listing, f"{len(rows)} labelled stretches{totals}"])
+    return 0
+
+
+def _relabel(args: argparse.Namespace) -> int:
+    from plushsense.dataset.index import open_dataset
+    from plushsense.dataset.labelling import relabel
+    from plushsense.dataset.trimming import find_recordings
+
+    gesture = getattr(args, "as") or ""
+    if bool(gesture) == args.undo:
+        raise ConfigError("Give the gesture that was made with --as GESTURE, or --undo to restore the recorded one.")
+    dataset = open_dataset(args.dataset)
+    chosen = [r.id for r in find_recordings(dataset, args.recording)]
+    changed = relabel(dataset, chosen, gesture, **options(args, "who", "why"))
+    emit(args, {"relabelled": list(changed)}, [f"relabelled {len(changed)} of {len(chosen)} recordings"])
     return 0

@@ -123,9 +123,12 @@ def new_folder(dest: Path, error: type[BadInput], last: str = "") -> Iterator[Pa
         with syncing_folder(real.parent) as sync:
             sync()
     except OSError as cause:
-        where = f" at '{cause.filename}'" if cause.filename else ""
+        where, why = f" at '{cause.filename}'" if cause.filename else "", cause.strerror or str(cause)
         raise error(
-            f"'{dest}' cannot be created ({cause.strerror or cause}{where}): check the path and the disk."
+            f"'{dest}' cannot be created ({why}{where}): check the path and the disk.",
+            reason="not_created",
+            name=dest.name,
+            why=why,
         ) from None
     finally:
         if scratch is not None:

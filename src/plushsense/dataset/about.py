@@ -33,10 +33,12 @@ class Creator:
 
     def __post_init__(self) -> None:
         if not self.name.strip():
-            raise DatasetError("a creator has no name: give one.")
+            raise DatasetError("a creator has no name: give one.", reason="creator_without_name")
         if self.orcid and not _is_orcid(self.orcid):
             raise DatasetError(
-                f"'{self.orcid}' is no ORCID iD: sixteen digits like 0000-0002-1825-0097, the last one a check digit."
+                f"'{self.orcid}' is no ORCID iD: sixteen digits like 0000-0002-1825-0097, the last one a check digit.",
+                reason="no_orcid",
+                orcid=self.orcid,
             )
 
 
@@ -49,7 +51,9 @@ class Contact:
 
     def __post_init__(self) -> None:
         if self.email and not _EMAIL.fullmatch(self.email):
-            raise DatasetError(f"'{self.email}' is no e-mail address: name@place.tld is accepted.")
+            raise DatasetError(
+                f"'{self.email}' is no e-mail address: name@place.tld is accepted.", reason="no_mail", mail=self.email
+            )
 
     def __bool__(self) -> bool:
         return bool(self.name and self.email)

@@ -17,7 +17,7 @@ from plushsense.dataset.store import HEAD, PEOPLE, RECORDINGS, STREAMS
 RECORDINGS_INDEX = "recordings.csv"
 STREAMS_INDEX = "streams.csv"
 STAMP = "index.json"
-STAMP_VERSION = 2
+STAMP_VERSION = 3
 
 
 def raw_files(folder: Path) -> list[tuple[str, Path]]:

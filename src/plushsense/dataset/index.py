@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError, FileFormatError, ForgottenError
-from plushsense.core.gestures import NOBODY, Gesture, plain_label
+from plushsense.core.files import write_file
+from plushsense.core.gestures import NOBODY, Gesture, GestureSet, plain_label
 from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_bytes, read_recording, read_stream
 from plushsense.dataset.files import (
     RECORDINGS_INDEX,
@@ -32,6 +33,7 @@ from plushsense.dataset.quality.checking import import_flags
 from plushsense.dataset.quality.findings import PARTLY_THERE
 from plushsense.dataset.quality.measurements import Examination, usual_rows
 from plushsense.dataset.store import (
+    HEAD,
     RECORDINGS,
     STREAMS,
     Dataset,
@@ -85,7 +87,7 @@ def open_dataset(path: str | Path) -> Dataset:
         if is_same_raw_data(folder, stamp):
             # Only the marks changed, so the raw files need not be read again.
             built = IndexBuild(_indexed(folder, head, generation))
-            built.dataset.recordings = apply_marks(built.dataset.recordings, read_marks(folder))
+            built.dataset.recordings = apply_marks(built.dataset.recordings, read_marks(folder), head.gestures)
         else:
             built = build_index(folder, head)
     except OSError as cause:
@@ -138,6 +140,30 @@ def write_index_files(dataset: Dataset, stamp: dict[str, Any] | None = None) -> 
     write_stamp(dataset.path, stamp)
 
 
+def change_head(folder: Path, change: Callable[[DatasetHead], DatasetHead]) -> DatasetHead:
+    """Replace ``dataset.toml`` atomically by ``change`` of its present contents, and return the new head.
+
+    The index stays valid unless the layout or the gesture set changes.
+
+    Raises:
+        DatasetError: if the folder is no data set, or the file cannot be written. It is unchanged then.
+    """
+    try:
+        with Generation.of(folder).writing():
+            before, fresh = DatasetHead.read(folder), is_index_fresh(folder)
+            head = change(before)
+            if head != before:
+                write_file(folder / HEAD, head.to_toml())
+                if fresh and (head.layout, head.gestures) == (before.layout, before.gestures):
+                    write_stamp(folder, current_stamp(folder))
+    except OSError as cause:
+        why = cause.strerror or str(cause)
+        raise DatasetError(
+            f"'{folder / HEAD}' cannot be written: {why}.", reason="head_not_written", folder=folder.name, why=why
+        ) from None
+    return head
+
+
 def build_index(folder: Path, head: DatasetHead, progress: Progress | None = None) -> IndexBuild:
     """Read every raw file, locate the recordings in their streams and apply the marks, without writing anything."""
     generation = Generation.of(folder)
@@ -159,7 +185,7 @@ def build_index(folder: Path, head: DatasetHead, progress: Progress | None = Non
         if progress is not None:
             progress(done + 1, len(files))
     infos = _recordings_from_files(folder, head, recordings, streams) + _recordings_from_labels(folder, head, streams)
-    infos = sorted(apply_marks(infos, read_marks(folder)), key=lambda r: r.id)
+    infos = sorted(apply_marks(infos, read_marks(folder), head.gestures), key=lambda r: r.id)
     stream_infos = [_stream_info(folder, head, s) for s in streams]
     return IndexBuild(Dataset(folder, head, infos, stream_infos, generation), unreadable)
 
@@ -305,6 +331,7 @@ def _recordings_from_files(
                 subject=_subject(read.subject, known),
                 session=session,
                 gesture=label,
+                recorded=label,
                 first_row=0,
                 stream=stream_id,
                 stream_row=stream_row,
@@ -370,6 +397,7 @@ def _recordings_from_labels(folder: Path, head: DatasetHead, streams: list[_RawF
                     subject=_subject(read.subject, gesture),
                     session=_stream_session(folder, read),
                     gesture=label,
+                    recorded=label,
                     first_row=first,
                     stream=_stream_id(folder, read),
                     stream_row=first,
@@ -379,13 +407,22 @@ def _recordings_from_labels(folder: Path, head: DatasetHead, streams: list[_RawF
     return infos
 
 
-def apply_marks(infos: Iterable[RecordingInfo], marks: dict[str, MarkState]) -> list[RecordingInfo]:
-    """Return the recordings as ``marks`` trim and exclude them."""
+def apply_marks(
+    infos: Iterable[RecordingInfo], marks: dict[str, MarkState], gestures: GestureSet
+) -> list[RecordingInfo]:
+    """Return the recordings as ``marks`` trim, exclude and relabel them; ``gestures`` is the set of the data set."""
     out = []
     for info in infos:
         mark = marks.get(info.id, MarkState())
         stop = info.rows if mark.stop < 0 else min(mark.stop, info.rows)
-        out.append(replace(info, excluded=mark.excluded, start=min(mark.start, stop), stop=stop))
+        gesture, subject = mark.gesture or info.recorded, info.subject
+        if gesture != info.gesture:
+            subject = _subject(info.id.split("/", 1)[0], gestures.find(gesture))
+        out.append(
+            replace(
+                info, excluded=mark.excluded, start=min(mark.start, stop), stop=stop, gesture=gesture, subject=subject
+            )
+        )
     return out
 
 

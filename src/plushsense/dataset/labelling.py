@@ -1,5 +1,7 @@
 """Label stretches of streams by marks: practised gestures, handling of the toy, and rest; read and write them as CSV.
 
+`relabel` states by a mark that another gesture was made than a recording is named after.
+
 Times are in seconds of the device clock since the first frame of the stream (`row_times_s`). Rows of located recordings
 need no label: they keep the gesture of the recording, whatever the marks say (`Dataset.stretches`).
 """
@@ -138,6 +140,41 @@ def label_stretches(
             new.append(s)
     append_marks(dataset.path, marks)
     return new
+
+
+def relabel(
+    dataset: Dataset, recordings: Iterable[str], gesture: str, who: str | None = None, why: str = ""
+) -> tuple[str, ...]:
+    """State that ``gesture`` was made in ``recordings`` (ids); "" restores the recorded one.
+
+    The raw files stay as they are. ``dataset`` is not updated: open it again.
+
+    Returns:
+        The ids of the recordings whose gesture changes.
+
+    Raises:
+        DatasetError: for a gesture that is not in the gesture set, or an unknown recording. No mark is written then.
+    """
+    known, standing = {r.id: r for r in dataset.recordings}, read_marks(dataset.path)
+    label = ""
+    if gesture:
+        found = dataset.gestures.find(gesture)
+        if found is None:
+            raise DatasetError(
+                f"'{dataset.head.name}' has no gesture '{gesture}': accepted are {', '.join(dataset.gestures.labels)}."
+                f"{nearest(gesture, dataset.gestures.labels)}",
+                reason="unknown_gesture",
+                gesture=gesture,
+            )
+        label = found.label
+    marks = []
+    for identity in recordings:
+        (identity,) = match_ids(identity, known, "recording")
+        new = "" if label == known[identity].recorded else label
+        if new != standing.get(identity, MarkState()).gesture:
+            marks.append(Mark(identity, "relabel", author_name(who), why, gesture=new))
+    append_marks(dataset.path, marks)
+    return tuple(mark.recording for mark in marks)
 
 
 def unlabel(

@@ -19,7 +19,7 @@ from plushsense.core.toml import load_table
 MARKS = "marks.jsonl"
 BY_HAND, SUGGESTED = "hand", "suggested"
 _LOCK_S = 30.0
-ACTIONS = ("trim", "untrim", "exclude", "include", "accept", "unaccept", "label", "unlabel")
+ACTIONS = ("trim", "untrim", "exclude", "include", "accept", "unaccept", "label", "unlabel", "relabel")
 HANDLING, REST, PRACTICE = "handling", "rest", "practice:"
 """Labels of a stretch; the name of a gesture follows `PRACTICE`."""
 
@@ -29,11 +29,13 @@ class Mark:
     """Decision about a recording or a stream.
 
     The action ``trim`` keeps the rows from ``start`` to before ``stop`` (-1: the end), ``exclude`` removes the
-    recording from use, ``accept`` states that the findings of ``check`` are known and no fault; ``untrim``, ``include``
-    and ``unaccept`` undo them. ``label`` states what happens in the rows from ``start`` to before ``stop`` of a stream,
-    and replaces earlier labels of these rows; ``unlabel`` removes labels. ``recording`` is the id of a recording,
-    stream or person, or "" for the whole data set. The attribute ``label`` is `HANDLING` (the toy is picked up, turned
-    or put down), `REST` (nobody touches it), or `PRACTICE` and a gesture.
+    recording from use, ``accept`` states that the findings of ``check`` are known and no fault; ``untrim``,
+    ``include`` and ``unaccept`` undo them. ``label`` states what happens in the rows from ``start`` to before
+    ``stop`` of a stream, and replaces earlier labels of these rows; ``unlabel`` removes labels. ``relabel`` states
+    that another ``gesture`` was made than the recording is named after; with the gesture "" it is the recorded one
+    again. ``recording`` is the id of a recording, stream or person, or "" for the whole data set. The attribute
+    ``label`` is `HANDLING` (the toy is picked up, turned or put down), `REST` (nobody touches it), or `PRACTICE` and
+    a gesture.
     ``how`` is the origin of a trim: "hand" (set by a person) or "suggested" (a suggestion that was accepted); "" in
     older marks counts as "hand".
     """
@@ -48,6 +50,7 @@ class Mark:
     check: str = ""
     how: str = ""
     label: str = ""
+    gesture: str = ""
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ class MarkState:
     """State of a recording or a stream after all its marks.
 
     ``accepted`` holds the checks whose findings are accepted; ``how`` is that of the current trim. ``stretches`` of a
-    stream are ordered and do not overlap.
+    stream are ordered and do not overlap. ``gesture`` is "" if it is the recorded one.
     """
 
     excluded: bool = False
@@ -84,6 +87,7 @@ class MarkState:
     accepted: frozenset[str] = frozenset()
     how: str = ""
     stretches: tuple[LabelledStretch, ...] = ()
+    gesture: str = ""
 
     @property
     def trimmed(self) -> bool:
@@ -116,6 +120,8 @@ def _refuse_contradictions(mark: Mark, where: str) -> None:
             f"{where}: a mark '{mark.action}' with label '{mark.label}'; only the action label has one: {HANDLING}, "
             f"{REST}, or {PRACTICE} and a gesture."
         )
+    if mark.gesture and mark.action != "relabel":
+        raise DatasetError(f"{where}: a mark '{mark.action}' with gesture '{mark.gesture}'; only relabel has one.")
     if mark.action == "label" and mark.stop < 0:
         raise DatasetError(f"{where}: a mark 'label' without stop; it needs the row after its last one.")
 
@@ -136,8 +142,8 @@ def match_ids(pattern: str, known: Iterable[str], kind: str) -> list[str]:
 
 
 def mark_line(mark: Mark) -> str:
-    """Return a mark as a line of ``marks.jsonl``; only marks with a label have that key, as in older versions."""
-    table = {key: value for key, value in asdict(mark).items() if key != "label" or value}
+    """Return a mark as a line of ``marks.jsonl``, without an empty label or gesture, as in older versions."""
+    table = {key: value for key, value in asdict(mark).items() if key not in ("label", "gesture") or value}
     return json.dumps(table, ensure_ascii=False) + "\n"
 
 
@@ -260,6 +266,8 @@ def apply_mark(now: MarkState, mark: Mark) -> MarkState:
             return replace(now, excluded=True)
         case "include":
             return replace(now, excluded=False)
+        case "relabel":
+            return replace(now, gesture=mark.gesture)
         case "accept":
             return replace(now, accepted=now.accepted | {mark.check})
         case "label" | "unlabel":
@@ -280,6 +288,8 @@ def inverse_marks(mark: Mark, before: MarkState, who: str, why: str = "") -> lis
             return [Mark(mark.recording, "untrim", who, why)]
         case "exclude" | "include":
             return [Mark(mark.recording, "exclude" if before.excluded else "include", who, why)]
+        case "relabel":
+            return [Mark(mark.recording, "relabel", who, why, gesture=before.gesture)]
         case "label" | "unlabel":
             replaced = [s for s in before.stretches if s.outside(mark.start, mark.stop) != [s]]
             return [

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.gestures import NOBODY
+from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR
 from plushsense.dataset.store import PEOPLE, UNKNOWN_SUBJECT, Dataset, PersonInfo, RecordingInfo, read_people
 
 NOT_GIVEN = "not said"
@@ -87,6 +88,46 @@ def duration_table(dataset: Dataset, by: str | None = None) -> list[Duration]:
             cells.items(), key=lambda cell: (_class_order(dataset, cell[0][0]), cell[0])
         )
     ]
+
+
+@dataclass(frozen=True)
+class DurationBand:
+    """Durations of the recordings of a gesture, and the band around their mean; outliers lie outside of it.
+
+    ``seconds`` are the durations by recording id, in the order of recording. ``mean_s`` leaves out recordings that were
+    never stopped, like the check ``duration``; ``statistics`` are of all.
+    """
+
+    gesture: str
+    seconds: dict[str, float]
+    statistics: SummaryStatistics
+    mean_s: float
+    low_s: float
+    high_s: float
+
+    @property
+    def outliers(self) -> list[str]:
+        """Ids of the recordings outside the band."""
+        return [i for i, s in self.seconds.items() if not self.low_s <= s <= self.high_s]
+
+
+def duration_bands(dataset: Dataset, share: float = 0.4) -> list[DurationBand]:
+    """Return the durations of the used recordings after trimming by gesture, in class order.
+
+    Args:
+        share: half the height of the band, as a share of the mean (the paper: 0.4).
+    """
+    groups: dict[str, dict[str, float]] = {}
+    for r in sorted(dataset.used, key=lambda r: (r.epoch_ms, r.id)):
+        if r.rate_hz > 0:
+            groups.setdefault(r.gesture, {})[r.id] = (r.stop - r.start) / r.rate_hz
+    bands = []
+    for gesture in sorted(groups, key=lambda g: (_class_order(dataset, g), g)):
+        seconds = np.array(list(groups[gesture].values()))
+        mean = float(seconds[seconds <= NEVER_STOPPED_FACTOR * np.median(seconds)].mean())
+        statistics = SummaryStatistics.of(seconds.tolist())
+        bands.append(DurationBand(gesture, groups[gesture], statistics, mean, mean * (1 - share), mean * (1 + share)))
+    return bands
 
 
 def _class_order(dataset: Dataset, gesture: str) -> int:

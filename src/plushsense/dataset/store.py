@@ -151,7 +151,8 @@ class RecordingInfo(_Row):
     """A row of the recording index.
 
     The recording is rows ``first_row`` to ``first_row + rows`` of ``file``, of which ``start`` to ``stop`` remain after
-    trimming. It begins at ``stream_row`` of ``stream`` (−1: not found). ``start_ms`` is the device clock at the first
+    trimming. ``recorded`` is the gesture that it is named after, ``gesture`` the one that marks state, by default the
+    same. It begins at ``stream_row`` of ``stream`` (−1: not found). ``start_ms`` is the device clock at the first
     row, ``epoch_ms`` the wall clock.
     """
 
@@ -172,6 +173,7 @@ class RecordingInfo(_Row):
     excluded: bool
     flags: tuple[str, ...]
     sha256: str
+    recorded: str = ""
 
 
 @dataclass(frozen=True)

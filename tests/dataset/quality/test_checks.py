@@ -32,6 +32,7 @@ from plushsense.dataset.quality.findings import CheckLimits, Issue
 from plushsense.dataset.quality.measurements import Examination
 from plushsense.dataset.store import Dataset
 from plushsense.recording.simulate import simulate
+from plushsense.studio.app.words import Words
 
 PLUSH = load_layout("plush-15")
 LABELS = ("Back stroke 1", "Head stroke 1", "Tail tap 1", "Hold strong")
@@ -391,6 +392,11 @@ def test_a_planted_fault_is_found_where_it_is(name: str, plant: Callable[[Path],
     assert {f.about for f in found} == {about}, [f"{f.check} {f.about}: {f.message}" for f in result.findings]
     assert all(f.action and f.message and f.severity for f in found)
     assert all(0 <= a < b for f in found for a, b in f.rows)
+    for f in result.findings:
+        english, latvian = (Words(language).sentence(f.message) for language in ("en", "lv"))
+        assert f.message.reason and english != f.message and latvian not in (english, f.message)
+        # Numbers have a decimal comma; ids of files may have points.
+        assert not re.search(r"(?<![\w./])\d+\.\d", latvian), latvian
 
 
 def test_every_check_has_a_planted_fault() -> None:

@@ -353,7 +353,7 @@ def create_dataset(
         if marks := [Mark(i, "exclude", RECORDER, why) for i, why in account.set_aside_reasons().items() if why]:
             append_marks(work, marks)
         (work / HEAD).write_text(head.to_toml(), encoding="utf-8")
-        infos = apply_marks(built.dataset.recordings, read_marks(work))
+        infos = apply_marks(built.dataset.recordings, read_marks(work), head.gestures)
         write_index_files(Dataset(work, head, infos, built.dataset.streams))
         account.check()
     dataset = Dataset(dest, head, infos, built.dataset.streams)

@@ -259,9 +259,9 @@ def redact_marks(
             findings.add(path.name, "a mark was left out: it is torn, or nobody is known by its recording", number)
             continue
         new = renamed(identity)
-        # A label names a gesture, which is no personal data.
-        kept = {k: v for k, v in table.items() if k == "label"}
-        rest = {k: v for k, v in table.items() if k not in ("recording", "label")}
+        # A label is or names a gesture, which is no personal data.
+        kept = {k: v for k, v in table.items() if k in ("label", "gesture")}
+        rest = {k: v for k, v in table.items() if k not in ("recording", *kept)}
         line = {"recording": new} | words.value(rest, where=(path.name, 0)) | kept
         out.append((new, json.dumps(line, ensure_ascii=False) + "\n"))
     return "".join(line for _, line in sorted(out, key=lambda pair: pair[0]))

@@ -145,11 +145,15 @@ class ContentsWriter:
         self.notes: list[str] = []
         if self.labelled and not options.streams:
             raise DatasetError(
-                f"'{dataset.path}' holds its recordings as parts of streams: it cannot be published without streams."
+                f"'{dataset.path}' holds its recordings as parts of streams: it cannot be published without streams.",
+                reason="streams_needed",
             )
         self.kept = [r for r in dataset.recordings if options.excluded or self.labelled or not r.excluded]
         if not self.kept:
-            raise DatasetError(f"'{dataset.path}' has no recording left to publish: every one is excluded.")
+            raise DatasetError(
+                f"'{dataset.path}' has no recording left to publish: every one is excluded.",
+                reason="nothing_to_publish",
+            )
         self.streams = dataset.streams if options.streams else []
         clocks = (HOST_MS, DEVICE_MS) if self._all_have_host() else (DEVICE_MS,)
         columns = (*clocks, *dataset.layout.names, *(("label",) if self.labelled else ()))
@@ -331,6 +335,8 @@ class ContentsWriter:
             identity = ids[recording.id]
             if (mark.start, mark.stop) != (0, -1):
                 marks.append(Mark(identity, "trim", "", start=mark.start, stop=mark.stop))
+            if mark.gesture:
+                marks.append(Mark(identity, "relabel", "", gesture=mark.gesture))
             if mark.excluded:
                 marks.append(Mark(identity, "exclude", ""))
             marks += [Mark(identity, "accept", "", check=check) for check in sorted(mark.accepted)]
@@ -355,6 +361,12 @@ class ContentsWriter:
         if trimmed:
             self.notes.append(
                 f"Trimmed: {_count(trimmed, 'recording')}; the files hold all rows, start and stop say which remain."
+            )
+        relabelled = sum(r.gesture != r.recorded for r in published.recordings)
+        if relabelled:
+            self.notes.append(
+                f"Relabelled: {_count(relabelled, 'recording')}; the files are named after the gesture that was asked "
+                "for, the tables state the one that was made."
             )
         renamed = [code for code, public in self.codes.items() if code != public]
         if renamed:

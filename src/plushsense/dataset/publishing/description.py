@@ -49,7 +49,9 @@ def find_licence(spdx: str) -> Licence:
             return licence
     raise DatasetError(
         f"'{spdx}' is no licence that can be published under: accepted are the SPDX names {', '.join(LICENCES)}."
-        f"{nearest(spdx.replace(' ', '-'), LICENCES)}"
+        f"{nearest(spdx.replace(' ', '-'), LICENCES)}",
+        reason="no_licence",
+        licence=spdx,
     )
 
 

@@ -122,13 +122,33 @@ def complete_head(
         lines, flags = zip(*missing, strict=True)
         raise DatasetError(
             f"'{where}' cannot be published without licence, contact and consent statement: set in '{where / HEAD}'  "
-            f"{'  and  '.join(lines)}  or give  {' '.join(flags)}"
+            f"{'  and  '.join(lines)}  or give  {' '.join(flags)}",
+            reason="statements_missing",
         )
     if not _VERSION.fullmatch(head.version):
         raise DatasetError(
-            f"'{where / HEAD}' has the version '{head.version}': three numbers are accepted, like 1.0.0."
+            f"'{where / HEAD}' has the version '{head.version}': three numbers are accepted, like 1.0.0.",
+            reason="version_bad",
+            version=head.version,
         )
     return replace(head, licence=find_licence(head.licence).spdx)
+
+
+def missing_statements(head: DatasetHead) -> list[str]:
+    """Return which of title, description, creators, licence, contact and consent a data set does not state yet.
+
+    A package can be made without the first three, but then nobody is cited but the contact (see `PublishResult`).
+    """
+    about = head.about
+    given = {
+        "title": about.title.strip(),
+        "description": about.description.strip(),
+        "creators": about.creators,
+        "licence": head.licence,
+        "contact": about.contact,
+        "consent": head.consent.strip(),
+    }
+    return [key for key, value in given.items() if not value]
 
 
 def require_validators() -> None:
@@ -146,9 +166,17 @@ def check_output_folder(dataset: Dataset, out: Path) -> Path:
     real = out.resolve()
     target = real.with_name(real.name + ".zip")
     if real.exists() and (not real.is_dir() or any(real.iterdir())):
-        raise DatasetError(f"'{out}' already holds something: give a new or empty folder, nothing is overwritten.")
+        raise DatasetError(
+            f"'{out}' already holds something: give a new or empty folder, nothing is overwritten.",
+            reason="name_exists",
+            name=out.name,
+        )
     if target.exists():
-        raise DatasetError(f"'{target}' is already there: nothing is overwritten, give another OUT.")
+        raise DatasetError(
+            f"'{target}' is already there: nothing is overwritten, give another OUT.",
+            reason="name_exists",
+            name=target.name,
+        )
     if dataset.path.resolve() in (real, *real.parents):
         raise DatasetError(f"'{out}' lies in the data set itself: give a folder elsewhere.")
     return target

@@ -11,6 +11,7 @@ from typing import Any
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
 from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_recording, read_stream
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.marks import Mark, match_ids, read_marks
 from plushsense.dataset.quality import comparisons, recordings
 from plushsense.dataset.quality.findings import SEVERITIES, CheckLimits, Finding, Issue, Severity
@@ -86,7 +87,7 @@ def import_flags(examined: Examination) -> list[str]:
     """Return the messages of the ``at_import`` checks for one recording or stream, without those of severity info."""
     scope = _S if examined.stream else _R
     return [
-        issue.message
+        str(issue.message)
         for check in CHECKS.values()
         if check.at_import and not check.compares and scope in check.scope
         for issue in check.run(examined)
@@ -285,8 +286,14 @@ def _merge_common(findings: list[Finding], recordings: int) -> Iterator[Finding]
         yield Finding(
             check=check,
             severity=min((f.severity for f in findings if f.check == check), key=SEVERITIES.index),
-            message=f"so in {concerned[check]} of {recordings} recordings, for instance {first.recording}: "
-            f"{first.message}",
+            message=Sentence(
+                f"so in {concerned[check]} of {recordings} recordings, for instance {first.recording}: {first.message}",
+                "in_most",
+                n=concerned[check],
+                of=recordings,
+                recording=first.recording,
+                message=first.message,
+            ),
             action=first.action,
         )
 

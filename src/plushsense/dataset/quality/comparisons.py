@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from plushsense.core.gestures import NOBODY
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.quality.findings import PARTLY_THERE, Issue
 from plushsense.dataset.quality.measurements import (
     LEVEL_KINDS,
@@ -85,9 +86,20 @@ def duration(w: DatasetSummary) -> Iterator[Issue]:
             median = float(np.median(own[o.info.subject]))
             habit = bool(median) and len(own[o.info.subject]) >= 3 and abs(o.seconds / median - 1) <= share
             others = "as this person's others do (their median " if habit else "this person's median is "
-            yield Issue(
+            message = (
                 f"lasts {o.seconds:.2f} s, {abs(off) * 100:.0f} % {'more' if off > 0 else 'less'} than the mean of its "
-                f"gesture ({mean:.2f} s){',' if habit else ';'} {others}{median:.2f} s{')' if habit else ''}",
+                f"gesture ({mean:.2f} s){',' if habit else ';'} {others}{median:.2f} s{')' if habit else ''}"
+            )
+            sentence = Sentence(
+                message,
+                f"duration_{'more' if off > 0 else 'less'}{'_habit' if habit else ''}",
+                seconds=round(o.seconds, 2),
+                percent=round(abs(off) * 100),
+                mean=round(mean, 2),
+                median=round(median, 2),
+            )
+            yield Issue(
+                sentence,
                 about=o.info.id,
                 severity="info" if habit else None,
             )
@@ -102,8 +114,10 @@ def flat(w: DatasetSummary) -> Iterator[Issue]:
     constant = np.array([o.runs >= o.rows for o in long])
     always = constant.mean(axis=0) > 0.5
     for c in np.flatnonzero(always):
+        n, of = int(constant[:, c].sum()), len(long)
+        message = f"channel {names[c]} does not change in {n} of {of} recordings"
         yield Issue(
-            f"channel {names[c]} does not change in {int(constant[:, c].sum())} of {len(long)} recordings",
+            Sentence(message, "flat_in_most", channel=names[c], n=n, of=of),
             channels=(int(c),),
             severity="warning",
         )
@@ -111,17 +125,24 @@ def flat(w: DatasetSummary) -> Iterator[Issue]:
         dead = np.flatnonzero((o.runs >= o.rows) & ~always)
         if len(dead):
             stream = isinstance(o.info, StreamInfo)
-            yield Issue(
+            message = (
                 f"{_channels(names, dead)} {'has' if len(dead) == 1 else 'have'} one value throughout"
-                f"{' the session' if stream else ''}",
+                f"{' the session' if stream else ''}"
+            )
+            yield Issue(
+                Sentence(message, "flat_stream" if stream else "flat", channels=_names(names, dead)),
                 () if stream else ((o.first_row, o.first_row + o.rows),),
                 tuple(dead.tolist()),
                 o.info.id,
             )
 
 
+def _names(names: tuple[str, ...], at: np.ndarray) -> list[str]:
+    return [names[c] for c in at[:4]] + (["…"] if len(at) > 4 else [])
+
+
 def _channels(names: tuple[str, ...], at: np.ndarray) -> str:
-    listed = ", ".join(names[c] for c in at[:4]) + (", …" if len(at) > 4 else "")
+    listed = ", ".join(_names(names, at))
     return f"channel {listed}" if len(at) == 1 else f"{len(at)} channels ({listed})"
 
 
@@ -138,9 +159,14 @@ def stuck(w: DatasetSummary) -> Iterator[Issue]:
             continue
         c = int(affected[np.argmax(run_ms[affected])])
         first = int(o.run_at[c]) + o.first_row
-        yield Issue(
+        seconds, usual = float(run_ms[c]) / 1000, float(w.usual_run_ms[c]) / 1000
+        message = (
             f"{_channels(names, affected)} {'holds' if len(affected) == 1 else 'hold'} one value for up to "
-            f"{run_ms[c] / 1000:.1f} s (from row {first + 1}); usual is {w.usual_run_ms[c] / 1000:.2f} s",
+            f"{seconds:.1f} s (from row {first + 1}); usual is {usual:.2f} s"
+        )
+        values = {"seconds": round(seconds, 1), "row": first + 1, "usual": round(usual, 2)}
+        yield Issue(
+            Sentence(message, "stuck", channels=_names(names, affected), **values),
             ((first, first + int(o.runs[c])),),
             tuple(affected.tolist()),
             o.info.id,
@@ -170,9 +196,13 @@ def saturated(w: DatasetSummary) -> Iterator[Issue]:
             continue
         c = int(affected[np.argmax(run_ms[affected])])
         first = int(o.top_at[c]) + o.first_row
-        yield Issue(
+        message = (
             f"{_channels(names, affected)} {'stays' if len(affected) == 1 else 'stay'} at the highest or lowest value, "
-            f"{names[c]} for {run_ms[c]:.0f} ms at {o.top[c]:g} (from row {first + 1}), {o.top_rows[c]} rows in all",
+            f"{names[c]} for {run_ms[c]:.0f} ms at {o.top[c]:g} (from row {first + 1}), {o.top_rows[c]} rows in all"
+        )
+        values = {"ms": round(float(run_ms[c])), "value": float(o.top[c]), "row": first + 1, "rows": int(o.top_rows[c])}
+        yield Issue(
+            Sentence(message, "saturated", channels=_names(names, affected), channel=names[c], **values),
             ((first, first + int(o.top_runs[c])),),
             tuple(affected.tolist()),
             o.info.id,
@@ -195,9 +225,14 @@ def drift(w: DatasetSummary) -> Iterator[Issue]:
         affected = np.array([c for c in level if abs(share[c]) > w.limits.drift], dtype=np.int64)
         if len(affected):
             c = int(affected[np.argmax(np.abs(share[affected]))])
-            yield Issue(
+            percent, by = round(float(abs(share[c])) * 100), round(float(change[c]))
+            message = (
                 f"the baseline of {_channels(layout.names, affected)} drifts over {key}, {layout.names[c]} by "
-                f"{change[c]:+.0f}: {abs(share[c]) * 100:.0f} % of its signal when touched",
+                f"{by:+d}: {percent} % of its signal when touched"
+            )
+            channels = _names(layout.names, affected)
+            yield Issue(
+                Sentence(message, "drift", channels=channels, channel=layout.names[c], by=f"{by:+d}", percent=percent),
                 channels=tuple(affected.tolist()),
                 about=about,
             )
@@ -242,9 +277,10 @@ def no_onset(w: DatasetSummary) -> Iterator[Issue]:
                 and o.seconds >= _SHORTEST_S
                 and not never_stopped(o, group)
             ):
+                percent = round(100 * float(peak) / usual)
+                message = f"no onset is visible: the strongest moment has {percent} % of what is usual for this gesture"
                 yield Issue(
-                    f"no onset is visible: the strongest moment has {100 * peak / usual:.0f} % of what is usual for "
-                    "this gesture",
+                    Sentence(message, "no_onset", percent=percent),
                     about=o.info.id,
                 )
 
@@ -283,9 +319,13 @@ def several_gestures(w: DatasetSummary) -> Iterator[Issue]:
             if len(parts) > 1:
                 rows = tuple((a * o.hop + o.first_row, b * o.hop + o.first_row) for a, b in parts)
                 still = max((b[0] - a[1]) * o.period_ms / 1000 for a, b in itertools.pairwise(rows))
+                n, row = len(parts), rows[1][0] + 1
+                message = (
+                    f"{n} separate gestures in one recording, with up to {still:.1f} s of stillness between "
+                    f"(second from row {row})"
+                )
                 yield Issue(
-                    f"{len(parts)} separate gestures in one recording, with up to {still:.1f} s of stillness between "
-                    f"(second from row {rows[1][0] + 1})",
+                    Sentence(message, "several_gestures", n=n, seconds=round(still, 1), row=row),
                     rows,
                     about=o.info.id,
                 )
@@ -299,7 +339,8 @@ def duplicate(w: DatasetSummary) -> Iterator[Issue]:
     for o in (*sorted(varying, key=lambda o: o.info.id), *w.streams):
         original = originals.setdefault(o.content or o.info.sha256, o.info.id)
         if original != o.info.id:
-            yield Issue(f"the same content as {original}", about=o.info.id)
+            message = Sentence(f"the same content as {original}", "duplicate", original=original)
+            yield Issue(message, about=o.info.id)
 
 
 def overlap(w: DatasetSummary) -> Iterator[Issue]:
@@ -315,8 +356,9 @@ def overlap(w: DatasetSummary) -> Iterator[Issue]:
         if open_at is not None and open_at[0] == now[0]:
             shared = min(open_at[2], now[2]) - now[1]
             if shared > _OVERLAP * (now[2] - now[1]):
+                of, other = now[2] - now[1], open_at[3].info.id
                 yield Issue(
-                    f"{shared} of its {now[2] - now[1]} rows are in {open_at[3].info.id} too",
+                    Sentence(f"{shared} of its {of} rows are in {other} too", "overlap", n=shared, of=of, other=other),
                     ((0, shared),),
                     about=now[3].info.id,
                 )
@@ -341,34 +383,45 @@ def missing(w: DatasetSummary) -> Iterator[Issue]:
     cells = Counter(n for counts in people.values() for n in counts.values())
     if not cells:
         return
-    short: dict[str, list[str]] = {}
+    short: dict[str, list[Sentence]] = {}
     for gesture in sorted({g for counts in people.values() for g in counts}):
         made = Counter(counts[gesture] for counts in people.values() if counts[gesture])
         if made.total() < _MADE_BY * len(people):
             continue
         agreed = made if made.total() >= 3 else cells
-        usual, n = max(agreed.items(), key=lambda item: (item[1], item[0]))
-        if n < _AGREE * agreed.total():
+        usual, times = max(agreed.items(), key=lambda item: (item[1], item[0]))
+        if times < _AGREE * agreed.total():
             continue
         for subject, counts in people.items():
             if counts[gesture] < usual:
-                short.setdefault(subject, []).append(f"{counts[gesture]} of {usual} '{gesture}'")
+                n = counts[gesture]
+                lack = Sentence(f"{n} of {usual} '{gesture}'", "missing_gesture", n=n, usual=usual, gesture=gesture)
+                short.setdefault(subject, []).append(lack)
     for subject in sorted(short):
         listed = short[subject]
         more = f" and {len(listed) - 6} more gestures" if len(listed) > 6 else ""
-        yield Issue(f"{subject} has {', '.join(listed[:6])}{more}", about=subject)
+        message = f"{subject} has {', '.join(listed[:6])}{more}"
+        missed = [*listed[:6], *(["…"] if more else [])]
+        yield Issue(Sentence(message, "missing", person=subject, listed=missed), about=subject)
 
 
 def _balance(counts: dict[str, int], noun: str, factor: float) -> Iterator[Issue]:
     """Report the names whose count is more than ``factor`` times above or below the median."""
     usual = float(np.median(list(counts.values()))) if counts else 0.0
-    odd = [f"{name} {n}" for name, n in counts.items() if usual and (n * factor < usual or n > factor * usual)]
+    key = "gesture" if noun == "gestures" else "person"
+    odd = [
+        Sentence(f"{name} {n}", f"count_of_{key}", n=n, **{key: name})
+        for name, n in counts.items()
+        if usual and (n * factor < usual or n > factor * usual)
+    ]
     if odd:
-        yield Issue(
+        listed = [*odd[:8], *(["…"] if len(odd) > 8 else [])]
+        message = (
             f"{len(odd)} of {len(counts)} {noun} have far fewer or more recordings than the median ({usual:.0f}): "
-            + ", ".join(odd[:8])
-            + (", …" if len(odd) > 8 else "")
+            f"{', '.join(listed)}"
         )
+        values = {"n": len(odd), "of": len(counts), "usual": round(usual), "listed": listed}
+        yield Issue(Sentence(message, f"balance_of_{noun}", **values))
 
 
 def class_balance(w: DatasetSummary) -> Iterator[Issue]:
@@ -393,10 +446,11 @@ def not_in_stream(w: DatasetSummary) -> Iterator[Issue]:
         # Recordings of the untouched toy have the subject nobody but are in the folder of the session's person.
         folder = o.info.id.split("/", 1)[0]
         if o.info.stream_row < 0 and (folder, o.info.session) in streamed:
-            yield Issue("not found in the session's stream", about=o.info.id)
+            yield Issue(Sentence("not found in the session's stream", "not_in_stream"), about=o.info.id)
         for flag in o.info.flags:
             if flag.startswith(PARTLY_THERE):
-                yield Issue(flag, about=o.info.id)
+                rows = int(flag.removeprefix(PARTLY_THERE).split()[0])
+                yield Issue(Sentence(flag, "partly_in_stream", rows=rows), about=o.info.id)
 
 
 def unknown_label(w: DatasetSummary) -> Iterator[Issue]:
@@ -406,7 +460,6 @@ def unknown_label(w: DatasetSummary) -> Iterator[Issue]:
     for label, n in sorted(counts.items()):
         gesture = w.dataset.gestures.find(label)
         if gesture is None or gesture.affect == "none":
-            yield Issue(
-                f"the label '{label}' ({n} recording{'s' if n > 1 else ''}) is not in the gesture set "
-                f"'{w.dataset.gestures.name}': no affect"
-            )
+            name, counted = w.dataset.gestures.name, f"{n} recording{'s' if n > 1 else ''}"
+            message = f"the label '{label}' ({counted}) is not in the gesture set '{name}': no affect"
+            yield Issue(Sentence(message, "unknown_label", label=label, n=n, set=name))

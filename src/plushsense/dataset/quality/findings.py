@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Literal, Self
 
 from plushsense.core.errors import ConfigError, nearest
+from plushsense.core.sentences import Sentence
 
 Severity = Literal["info", "warning", "error"]
 PARTLY_THERE = "only its first"
@@ -76,7 +77,7 @@ class Issue:
     unless it differs from that of the check.
     """
 
-    message: str
+    message: Sentence
     rows: tuple[tuple[int, int], ...] = ()
     channels: tuple[int, ...] = ()
     about: str = ""
@@ -97,7 +98,7 @@ class Finding:
     gesture: str = ""
     check: str
     severity: Severity
-    message: str
+    message: Sentence
     action: str
     accepted: bool = False
     rows: tuple[tuple[int, int], ...] = ()

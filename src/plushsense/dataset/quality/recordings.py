@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.quality.findings import CheckLimits, Issue, Severity
 from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, Examination
 
@@ -38,13 +39,16 @@ def _weight(share: float, limits: CheckLimits) -> Severity | None:
 def rows_against_name(s: Examination) -> Iterator[Issue]:
     rows = len(s.frames) if s.rows_in_file is None else s.rows_in_file
     if s.rows_named is not None and s.rows_named != rows:
-        yield Issue(f"holds {rows} rows, but its name states {s.rows_named}")
+        message = f"holds {rows} rows, but its name states {s.rows_named}"
+        yield Issue(Sentence(message, "rows_differ", rows=rows, named=s.rows_named))
 
 
 def never_stopped(s: Examination) -> Iterator[Issue]:
     if s.usual_rows is not None and len(s.frames) > NEVER_STOPPED_FACTOR * s.usual_rows:
+        rows, usual = len(s.frames), round(s.usual_rows)
+        message = f"holds {rows} rows where this gesture usually has {usual}: never stopped?"
         yield Issue(
-            f"holds {len(s.frames)} rows where this gesture usually has {s.usual_rows:.0f}: never stopped?",
+            Sentence(message, "never_stopped", rows=rows, usual=usual),
             ((s.first_row, s.first_row + len(s.frames)),),
         )
 
@@ -57,9 +61,10 @@ def garbage(s: Examination) -> Iterator[Issue]:
     if rows.any():
         channels = np.flatnonzero(outside.any(axis=0)).tolist()
         names = [s.layout.names[c] for c in channels]
+        n, row = int(outside.sum()), s.row(int(np.argmax(rows)))
+        message = f"{_plural(n, 'value')} outside the valid range ({', '.join(names)}; first in row {row})"
         yield Issue(
-            f"{_plural(int(outside.sum()), 'value')} outside the valid range "
-            f"({', '.join(names)}; first in row {s.row(int(np.argmax(rows)))})",
+            Sentence(message, "out_of_range", n=n, channels=names, row=row),
             _ranges(np.flatnonzero(rows), s),
             tuple(channels),
             severity=_weight(float(rows.mean()), s.limits),
@@ -69,9 +74,11 @@ def garbage(s: Examination) -> Iterator[Issue]:
 def blank_rows(s: Examination) -> Iterator[Issue]:
     rows = ~s.frames.values.any(axis=1)
     if s.layout.n_channels > 1 and rows.any():
+        n, row = int(rows.sum()), s.row(int(np.argmax(rows)))
         yield Issue(
-            f"{_plural(int(rows.sum()), 'row')} in which every channel reads 0 "
-            f"(first row {s.row(int(np.argmax(rows)))})",
+            Sentence(
+                f"{_plural(n, 'row')} in which every channel reads 0 (first row {row})", "blank_rows", n=n, row=row
+            ),
             _ranges(np.flatnonzero(rows), s),
             severity=_weight(float(rows.mean()), s.limits),
         )
@@ -92,9 +99,12 @@ def spikes(s: Examination) -> Iterator[Issue]:
     far &= (values[1:-1] >= s.layout.valid_min_int) & (values[1:-1] <= s.layout.valid_max_int)
     rows = np.flatnonzero(far.any(axis=1)) + 1
     if len(rows):
+        n, row = len(rows), s.row(rows[0])
+        message = (
+            f"{_plural(n, 'row')} in which a value jumps far away and back (first row {row}): a reading that failed?"
+        )
         yield Issue(
-            f"{_plural(len(rows), 'row')} in which a value jumps far away and back "
-            f"(first row {s.row(rows[0])}): a reading that failed?",
+            Sentence(message, "spikes", n=n, row=row),
             _ranges(rows, s),
             severity=_weight(len(rows) / len(values), s.limits),
         )
@@ -102,12 +112,12 @@ def spikes(s: Examination) -> Iterator[Issue]:
 
 def malformed(s: Examination) -> Iterator[Issue]:
     if s.malformed:
-        yield Issue(f"{_plural(s.malformed, 'malformed line')} left out")
+        yield Issue(Sentence(f"{_plural(s.malformed, 'malformed line')} left out", "malformed", n=s.malformed))
 
 
 def cut_line(s: Examination) -> Iterator[Issue]:
     if s.cut:
-        yield Issue("the last line is cut off: left out")
+        yield Issue(Sentence("the last line is cut off: left out", "cut_line"))
 
 
 def format_duration(ms: float) -> str:
@@ -125,17 +135,21 @@ def clock_reset(s: Examination) -> Iterator[Issue]:
         # The first rows of a stream may be old ones from the buffer of the serial port.
         of_stream = "info" if len(back) and back.max() < _LEFT_OVER else "warning"
     if len(back):
+        n, row, by = len(back), s.row(back[0]), format_duration(-int(s.steps[back[0]]))
+        message = f"the device clock runs backwards {n}× (first after row {row}, by {by})"
         yield Issue(
-            f"the device clock runs backwards {len(back)}× (first after row {s.row(back[0])}, "
-            f"by {format_duration(-int(s.steps[back[0]]))})",
+            Sentence(message, "clock_back", n=n, row=row, by=by),
             _ranges(back, s, 2),
             severity=of_stream,
         )
     if len(s.jumps):
-        most = int(s.steps[s.jumps].max())
+        n, row, most = len(s.jumps), s.row(s.jumps[0]), format_duration(int(s.steps[s.jumps].max()))
+        message = (
+            f"the device clock leaps ahead {n}× (first after row {row}, at most {most}) while hardly any time passes "
+            "on the computer"
+        )
         yield Issue(
-            f"the device clock leaps ahead {len(s.jumps)}× (first after row {s.row(s.jumps[0])}, at most "
-            f"{format_duration(most)}) while hardly any time passes on the computer",
+            Sentence(message, "clock_ahead", n=n, row=row, most=most),
             _ranges(s.jumps, s, 2),
             severity="info" if s.jumps.max() < _LEFT_OVER else of_stream,
         )
@@ -145,8 +159,10 @@ def gaps(s: Examination) -> Iterator[Issue]:
     if len(s.gaps):
         longest = int(s.steps[s.gaps].max())
         at = int(s.gaps[int(np.argmax(s.steps[s.gaps]))])
+        n, limit, row = len(s.gaps), round(s.gap_ms), s.row(at)
+        message = f"{_plural(n, 'gap')} over {limit} ms, the longest {longest} ms (after row {row})"
         yield Issue(
-            f"{_plural(len(s.gaps), 'gap')} over {s.gap_ms:.0f} ms, the longest {longest} ms (after row {s.row(at)})",
+            Sentence(message, "gaps", n=n, limit=limit, longest=longest, row=row),
             _ranges(s.gaps, s, 2),
             severity="error" if not s.stream and longest > s.limits.long_gap_ms else None,
         )
@@ -165,8 +181,10 @@ def lost_frames(s: Examination) -> Iterator[Issue]:
     lost = int(missing[long].sum())
     share = lost / (lost + len(s.frames))
     if lost >= _FEW_LOST and share > s.limits.lost:
+        of = lost + len(s.frames)
+        message = f"about {lost} of {of} frames are lost ({100 * share:.1f} %) by the device clock"
         yield Issue(
-            f"about {lost} of {lost + len(s.frames)} frames are lost ({100 * share:.1f} %) by the device clock",
+            Sentence(message, "lost_frames", n=lost, of=of, percent=round(100 * share, 1)),
             _ranges(long, s, 2),
         )
 
@@ -176,10 +194,10 @@ def jitter(s: Examination) -> Iterator[Issue]:
         return
     low, high = s.spread_ms
     if s.jitters:
-        yield Issue(
-            f"the time between frames varies from {low:.0f} to {high:.0f} ms (median {s.period_ms:.0f} ms)"
-            + (": frames are stamped several at once" if s.in_bursts else "")
-        )
+        message = f"the time between frames varies from {low:.0f} to {high:.0f} ms (median {s.period_ms:.0f} ms)"
+        message += ": frames are stamped several at once" if s.in_bursts else ""
+        values = {"low": round(low), "high": round(high), "median": round(s.period_ms)}
+        yield Issue(Sentence(message, "jitter_bursts" if s.in_bursts else "jitter", **values))
 
 
 def rate(s: Examination) -> Iterator[Issue]:
@@ -191,7 +209,8 @@ def rate(s: Examination) -> Iterator[Issue]:
         return
     measured = 1000.0 * len(even) / float(even.sum())
     if abs(measured - nominal) > s.limits.rate * nominal:
-        yield Issue(f"measured {measured:.1f} Hz, but the rate of the layout is {nominal:g} Hz")
+        message = f"measured {measured:.1f} Hz, but the rate of the layout is {nominal:g} Hz"
+        yield Issue(Sentence(message, "rate", measured=round(measured, 1), nominal=nominal))
 
 
 def resumed(s: Examination) -> Iterator[Issue]:
@@ -206,8 +225,12 @@ def resumed(s: Examination) -> Iterator[Issue]:
     longest = float(quiet[at].max())
     # The time zone of the recorder, and so midnight, is unknown: guess from the length of the pause.
     days = longest > _NIGHT_MS
+    n, most, row = len(at), format_duration(longest), s.row(at[0])
+    message = (
+        f"goes on after a pause {n}× (the longest {most} by the computer's clock, first after row {row}"
+        f"{', most likely on another day' if days else ''})"
+    )
     yield Issue(
-        f"goes on after a pause {len(at)}× (the longest {format_duration(longest)} by the computer's clock, "
-        f"first after row {s.row(at[0])}{', most likely on another day' if days else ''})",
+        Sentence(message, "resumed_days" if days else "resumed", n=n, most=most, row=row),
         _ranges(at, s, 2),
     )

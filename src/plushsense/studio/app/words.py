@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import PlushSenseError
+from plushsense.core.sentences import Sentence
 
 LANGUAGES = {"en": "English", "lv": "Latviešu"}
 """Maps language code to name; ``<code>.toml`` is the name of the files of texts."""
@@ -61,6 +62,28 @@ class Words:
         if text is not None:
             return text.format(**(values or {}))
         return self._texts["errors.other"].format(message=message) if message else ""
+
+    def sentence(self, sentence: str) -> str:
+        """Return a `Sentence` of the library in this language; one without a text is quoted in English."""
+        if not isinstance(sentence, Sentence):
+            return sentence
+        text = self._texts.get(f"sentences.{sentence.reason}")
+        if text is None:
+            return self._texts["errors.other"].format(message=str(sentence))
+        return text.format(**{key: self._value(key, value) for key, value in sentence.values.items()})
+
+    def _value(self, key: str, value: object) -> str:
+        if isinstance(value, list | tuple):
+            return ", ".join(self._value(key, each) for each in value)
+        if isinstance(value, float):
+            return f"{value:.10g}".replace(".", self._texts["shell.decimal_point"])
+        return (
+            self.gesture(str(value))
+            if key == "gesture"
+            else self.sentence(value)
+            if isinstance(value, str)
+            else str(value)
+        )
 
     def unit(self, unit: str) -> str:
         """Return the name of a unit in this language, or ``unit`` itself if it has none."""

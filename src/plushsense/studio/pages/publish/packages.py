@@ -44,7 +44,7 @@ class DatasetFacts:
     """Facts of a data set to consider before publication.
 
     Attributes:
-        dataset: the data set, or None if it cannot be read; ``problem`` is then the error message.
+        dataset: the data set, or None if it cannot be read; ``problem`` is then the reason.
         columns: columns of the table of people that are published only on request.
         own_codes: codes of people that were not drawn at random by ``pseudonymise``.
         own_dates: whether the recordings may have their true dates.
@@ -52,7 +52,7 @@ class DatasetFacts:
 
     path: Path
     dataset: Dataset | None = None
-    problem: str = ""
+    problem: PlushSenseError | None = None
     columns: tuple[str, ...] = ()
     own_codes: tuple[str, ...] = ()
     own_dates: bool = False
@@ -64,7 +64,7 @@ class DatasetFacts:
             dataset = open_dataset(path)
             people = read_people(path)
         except PlushSenseError as refusal:
-            return cls(path, problem=str(refusal))
+            return cls(path, problem=refusal)
         columns = {c for p in people.values() for c in p.more} - set(PUBLIC_COLUMNS)
         return cls(
             path,
@@ -227,7 +227,7 @@ class PackagesSection:
         words = self.words
         with self.page.show_errors():
             if name not in (await run.io_bound(lambda: packages_of(self.workspace)) or []):
-                raise ConfigError(f"There is no package '{name}' in this studio: choose one from the list.")
+                raise ConfigError(f"There is no package '{name}' in this studio.", reason="no_package", name=name)
             package = await run.io_bound(lambda: PackageFacts.of(self.workspace, name))
             assert package is not None
             job = newest_validation(self.workspace.part(Jobs), package)
@@ -237,12 +237,26 @@ class PackagesSection:
                 text(words("publish.one", name=name), "h2")
                 if package.simulated:
                     notice(words("shell.simulation"))
+                self._take(package)
                 self._answers(package, job)
                 with tag(ui.column().classes("ps-card w-full"), "recognised"):
                     text(words("publish.recognised"), "h3")
                     for sentence in reidentification_text(words, package.reidentification):
                         text(sentence)
                 self._contents(package)
+
+    def _take(self, package: PackageFacts) -> None:
+        words = self.words
+        with tag(ui.column().classes("ps-card ps-next w-full"), "take"):
+            text(words("publish.take"), "h3")
+            if package.zip is not None:
+                message = words("publish.download", size=size(package.zip.stat().st_size))
+                download = ui.link(message, download_address(PACKAGES, package.name)).classes("ps-link")
+                tag(download.props("download"), "download")
+            else:
+                notice(words("publish.no_zip"))
+            text(words("publish.by_hand"))
+            text(str(package.place), classes="ps-path ps-break")
 
     def _answers(self, package: PackageFacts, job: StudioJob | None) -> None:
         words = self.words
@@ -302,15 +316,6 @@ class PackagesSection:
                 tag(text(package.citation), "citation")
                 if "doi.org" not in package.citation:
                     text(words("publish.no_doi"), classes="ps-dim")
-            text(words("publish.take"), "h3")
-            if package.zip is not None:
-                message = words("publish.download", size=size(package.zip.stat().st_size))
-                download = ui.link(message, download_address(PACKAGES, package.name)).classes("ps-link")
-                tag(download.props("download"), "download")
-            else:
-                notice(words("publish.no_zip"))
-            text(words("publish.by_hand"))
-            text(str(package.place), classes="ps-path")
 
 
 def newest_validation(jobs: Jobs, package: PackageFacts) -> StudioJob | None:

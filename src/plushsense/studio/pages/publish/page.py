@@ -9,59 +9,15 @@ from typing import Any
 from nicegui import run, ui
 
 from plushsense.core.errors import ConfigError
-from plushsense.dataset.publishing.description import LICENCES
-from plushsense.dataset.publishing.package import complete_head
-from plushsense.dataset.store import Dataset, DatasetHead
-from plushsense.studio.app.jobs import Jobs, StudioJob
-from plushsense.studio.app.shell import Page, address, button, query, tag
+from plushsense.dataset.store import Dataset
+from plushsense.studio.app.jobs import StudioJob
+from plushsense.studio.app.shell import Page, address, button, focus, query, tag
 from plushsense.studio.app.workspace import DATASETS, PACKAGES, plain_name
 from plushsense.studio.pages.publish.packages import KEYS, DatasetFacts, PackagesSection, missing_extras
+from plushsense.studio.pages.publish.statements import Field, StatementsForm, beside, watched
 from plushsense.studio.widgets.elements import WorkPanel, facts, notice, scroll_to, style, text, titles
 
 _MAX_CODES = 5
-
-
-class StatementsForm:
-    """Fields for licence, contact and consent, pre-filled from the data set or the last publication."""
-
-    def __init__(self, page: Page, path: Path, head: DatasetHead) -> None:
-        words, contact = page.words, head.about.contact
-        jobs = page.workspace.part(Jobs).all("publish")
-        last = next((j.spec for j in jobs if j.spec["dataset"] == str(path)), {})
-        name, _, mail = str(last.get("contact", "")).rstrip(">").partition(" <")
-        text(words("publish.statements"), "h3")
-        given = {"licence": head.licence, "contact": contact.email, "consent": head.consent}
-        missing = [words(f"publish.lacks_{key}") for key, value in given.items() if not value]
-        message = words("publish.lacks", what=", ".join(missing)) if missing else words("publish.lacks_nothing")
-        tag(text(message), "lacks")
-        licences = {s: s if s == each.title else f"{s}: {each.title}" for s, each in LICENCES.items()}
-        value = head.licence or last.get("licence") or None
-        if value is not None:
-            # Display a current licence even if it is not in the list and will be rejected.
-            licences.setdefault(value, value)
-        licence = ui.select(licences, value=value, label=words("publish.licence"), with_input=False).classes("w-full")
-        self._licence = tag(licence, "licence")
-        text(words("publish.licence_about"), classes="ps-dim")
-        with ui.row().classes("w-full"):
-            who = ui.input(words("publish.contact_name"), value=contact.name or name).classes("col-grow")
-            self._name = tag(who, "contact-name")
-            where = ui.input(words("publish.contact_mail"), value=contact.email or mail).classes("col-grow")
-            self._mail = tag(where.props("type=email"), "contact-mail")
-        text(words("publish.contact_about"), classes="ps-dim")
-        consent = ui.textarea(words("publish.consent"), value=head.consent or last.get("consent", ""))
-        self._consent = tag(consent.props("autogrow").classes("w-full"), "consent")
-        text(words("publish.consent_about"), classes="ps-dim")
-        self._save = tag(ui.checkbox(words("publish.save")), "save")
-
-    def values(self) -> dict[str, Any]:
-        """Return the values as arguments of `publish_dataset`."""
-        name, mail = (self._name.value or "").strip(), (self._mail.value or "").strip()
-        return {
-            "licence": self._licence.value or "",
-            "contact": f"{name} <{mail}>" if name or mail else "",
-            "consent": (self._consent.value or "").strip(),
-            "save": bool(self._save.value),
-        }
 
 
 class PseudonymsForm:
@@ -86,11 +42,11 @@ class PseudonymsForm:
         with tag(ui.expansion(words("publish.rename")).classes("w-full"), "rename"):
             text(words("publish.rename_about"))
             name = page.workspace.free_name(DATASETS, f"{chosen.path.name}-shared")
-            self._name = tag(ui.input(words("publish.rename_name"), value=name).props("maxlength=64"), "rename-name")
+            self.name = tag(ui.input(words("publish.rename_name"), value=name).props("maxlength=64"), "rename-name")
             key = ui.input(words("publish.rename_key"), value=f"{chosen.path.name}-people.csv").props("maxlength=64")
-            self._key = tag(key, "rename-key")
-            for field in (self._name, self._key):
-                field.classes("w-full")
+            self.key = tag(key, "rename-key")
+            for field in (self.name, self.key):
+                watched(field.classes("w-full"))
             text(words("publish.key_place", folder=str(page.workspace.folder / KEYS)), classes="ps-dim")
             self._listed = tag(ui.textarea(words("publish.rename_words")).props("autogrow").classes("w-full"), "words")
             self._drop = tag(ui.checkbox(words("publish.rename_drop")), "drop-notes")
@@ -99,7 +55,7 @@ class PseudonymsForm:
 
     async def _go(self) -> None:
         listed = [line.strip() for line in (self._listed.value or "").splitlines() if line.strip()]
-        name, key = (self._name.value or "").strip(), (self._key.value or "").strip()
+        name, key = (self.name.value or "").strip(), (self.key.value or "").strip()
         await self._start(name, key, listed, bool(self._drop.value))
 
 
@@ -162,17 +118,19 @@ class _Publishing:
         self._rest.clear()
         with self._rest:
             if chosen.dataset is None:
-                tag(notice(chosen.problem, "error"), "dataset-problem")
+                problem = words.error(chosen.problem) if chosen.problem is not None else ""
+                tag(notice(problem, "error"), "dataset-problem")
                 return
             if chosen.dataset.head.simulated:
                 notice(words("shell.simulation"))
             tag(facts(self._facts_of(chosen.dataset)), "dataset-facts")
-            PseudonymsForm(self.page, chosen, self._pseudonymise)
+            self.pseudonyms = PseudonymsForm(self.page, chosen, self._pseudonymise)
             self.statements = StatementsForm(self.page, chosen.path, chosen.dataset.head)
             self._choices(chosen)
             name = ui.input(words("publish.name"), value=self._free_name(chosen.path.name)).props("maxlength=64")
-            self._name = tag(name.classes("w-full"), "name")
-            self._button = button("do", words("publish.do"), self._start, "", icon="inventory_2")
+            self._name = watched(tag(name.classes("w-full"), "name"))
+            with ui.row().classes("w-full ps-bottom"):
+                self._button = button("do", words("publish.do"), self._start, "", icon="inventory_2")
         self._allow()
 
     def _facts_of(self, dataset: Dataset) -> list[tuple[str, str]]:
@@ -206,7 +164,7 @@ class _Publishing:
         self._keep = tag(ui.checkbox(words("publish.with_key")), "with-key")
         text(words("publish.with_key_about"), classes="ps-dim").style("margin: -12px 0 0 40px")
         field = ui.input(words("publish.key"), value=f"{chosen.path.name}.key").props("maxlength=64").classes("w-full")
-        self._key = tag(field.bind_visibility_from(self._keep, "value"), "key")
+        self._key = watched(tag(field.bind_visibility_from(self._keep, "value"), "key"))
         where = text(words("publish.key_place", folder=str(self.workspace.folder / KEYS)), classes="ps-dim")
         where.bind_visibility_from(self._keep, "value")
 
@@ -218,26 +176,28 @@ class _Publishing:
             self._button.set_enabled("publish" not in self.lacking and not self.work.running("publish"))
 
     async def _start(self) -> None:
-        chosen = self.dataset
+        chosen, words = self.dataset, self.words
         assert chosen is not None
         self.page.say("")
         with self.page.show_errors():
             dataset = self.workspace.inside(chosen.path)
-            place = self.workspace.new(PACKAGES, self._name.value or "")
-            if place.with_name(f"{place.name}.zip").exists():
-                raise ConfigError(f"'{place.name}.zip' exists already: give another name, nothing is replaced.")
-            statements = self.statements.values()
-            # Check the statements now, while the form is visible; otherwise errors appear only in the job.
-            head = await run.io_bound(lambda: DatasetHead.read(dataset))
-            assert head is not None
-            complete_head(head, dataset, statements["licence"], statements["contact"], statements["consent"])
+            if not await self.statements.save():
+                return
+            place, key = Path(), Path()
+            with beside(words, self._name):
+                place = self.workspace.new(PACKAGES, self._name.value or "")
+                if (packed := place.with_name(f"{place.name}.zip")).exists():
+                    raise ConfigError(f"'{packed.name}' exists already.", reason="name_exists", name=packed.name)
+            with beside(words, self._key):
+                key = self._key_path((self._key.value or "").strip()) if self._keep.value else key
+            if self._ask_again(self._name, self._key):
+                return
             spec = {
                 "dataset": str(dataset),
                 "place": str(place),
-                **statements,
                 **{key: bool(box.value) for key, box in self._switches.items()},
                 "columns": [name for name, box in self._columns.items() if box.value],
-                "key": str(self._key_path((self._key.value or "").strip())) if self._keep.value else "",
+                "key": str(key) if self._keep.value else "",
             }
             await self.work.start("publish", spec)
 
@@ -249,18 +209,25 @@ class _Publishing:
         return self.workspace.new(KEYS, name)
 
     async def _pseudonymise(self, name: str, key: str, words: list[str], drop_notes: bool) -> None:
-        chosen = self.dataset
+        chosen, form = self.dataset, self.pseudonyms
         assert chosen is not None
         self.page.say("")
         with self.page.show_errors():
-            spec: dict[str, Any] = {
-                "dataset": str(self.workspace.inside(chosen.path)),
-                "place": str(self.workspace.new(DATASETS, name)),
-                "key": str(self._key_path(key)),
-                "words": words,
-                "drop_notes": drop_notes,
-            }
-            await self.work.start("pseudonymise", spec)
+            spec: dict[str, Any] = {"dataset": str(self.workspace.inside(chosen.path))}
+            with beside(self.words, form.name):
+                spec["place"] = str(self.workspace.new(DATASETS, name))
+            with beside(self.words, form.key):
+                spec["key"] = str(self._key_path(key))
+            if not self._ask_again(form.name, form.key):
+                await self.work.start("pseudonymise", spec | {"words": words, "drop_notes": drop_notes})
+
+    def _ask_again(self, *fields: Field) -> bool:
+        """Move the focus to the first of ``fields`` with an error; return whether there is one."""
+        wrong = [field for field in fields if field.error]
+        if wrong:
+            focus(wrong[0])
+            self.page.say(self.words("publish.see_fields"), "error")
+        return bool(wrong)
 
     # Jobs -----------------------------------------------------------------------------------------------------
 

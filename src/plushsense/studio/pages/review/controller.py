@@ -16,11 +16,11 @@ from nicegui import background_tasks, context, run, ui
 from plushsense.core.errors import PlushSenseError
 from plushsense.dataset.quality.checking import CHECKS, author_name
 from plushsense.dataset.quality.findings import SEVERITIES
-from plushsense.studio.app.shell import Page, address, on_change, set_address, tag
+from plushsense.studio.app.shell import Page, address, button, on_change, set_address, tag
 from plushsense.studio.pages.review.review import EXCLUDED, LABELLED, LOOKING, STATES, Review, ReviewedRecording
 
-TABLE, ONE, OVERLAY, STREAM = "table", "one", "overlay", "stream"
-VIEWS = (TABLE, ONE, OVERLAY, STREAM)
+TABLE, ONE, OVERLAY, DURATIONS, STREAM = "table", "one", "overlay", "durations", "stream"
+VIEWS = (TABLE, ONE, OVERLAY, DURATIONS, STREAM)
 WHO_COOKIE = "plushsense_who"
 _AHEAD = 4
 _LOOK_S = 1.5
@@ -45,15 +45,15 @@ class RecordingFilter:
     check: str = ""
     text: str = ""
 
-    def fits(self, row: ReviewedRecording) -> bool:
-        """Return whether a recording meets all conditions."""
+    def fits(self, row: ReviewedRecording, word: Callable[[str], str] = str) -> bool:
+        """Return whether a recording meets all conditions; ``word`` translates the messages of findings."""
         return (
             self.person in ("", row.info.subject)
             and self.gesture in ("", row.info.gesture)
             and self._state_fits(row)
             and self._severity_fits(row)
             and (not self.check or any(f.check == self.check for f in row.findings))
-            and self._text_fits(row)
+            and self._text_fits(row, word)
         )
 
     def _state_fits(self, row: ReviewedRecording) -> bool:
@@ -66,9 +66,9 @@ class RecordingFilter:
             return not self.severity or not row.worst
         return bool(row.worst) and SEVERITIES.index(row.worst) <= SEVERITIES.index(self.severity)
 
-    def _text_fits(self, row: ReviewedRecording) -> bool:
+    def _text_fits(self, row: ReviewedRecording, word: Callable[[str], str]) -> bool:
         text = self.text.strip().casefold()
-        return any(text in s.casefold() for s in (row.id, *(f.message for f in row.findings)))
+        return any(text in s.casefold() for s in (row.id, *(word(f.message) for f in row.findings if text)))
 
     @classmethod
     def of(cls, query: Mapping[str, str]) -> RecordingFilter:
@@ -102,9 +102,10 @@ def filter_and_sort(
     only: Collection[str] | None = None,
     by: str = "recording",
     down: bool = False,
+    word: Callable[[str], str] = str,
 ) -> list[str]:
     """Return the sorted ids of the recordings that pass ``filter`` and, unless ``only`` is None, are in ``only``."""
-    fitting = [r for r in rows if (only is None or r.id in only) and filter.fits(r)]
+    fitting = [r for r in rows if (only is None or r.id in only) and filter.fits(r, word)]
     fitting.sort(key=lambda r: r.id, reverse=down and by == "recording")
     if by != "recording":
         fitting.sort(key=SORTS[by], reverse=down)
@@ -112,7 +113,7 @@ def filter_and_sort(
 
 
 class ReviewView(Protocol):
-    """Interface of the views of the page: the table, one recording, the overlay of a gesture, and one stream."""
+    """Interface of the views of the page: the table, one recording, two of a gesture, and one stream."""
 
     @property
     def place(self) -> ui.element:
@@ -134,6 +135,7 @@ class ReviewController:
         stream: id of the displayed stream, "" for none.
         order: sorted ids that passed the filter when it was set; `next` skips those that no longer pass.
         first_row: index in ``order`` of the first row on the current page of the table.
+        selected: ids of the recordings that are selected in the table, for decisions about all of them.
         ends: whether accepting a suggestion also accepts the suggested stop.
     """
 
@@ -153,6 +155,8 @@ class ReviewController:
         self.order: list[str] = []
         self.trail: list[str] = []
         self.first_row = 0
+        self.selected: dict[str, None] = {}
+        self._anchor = ""
         self.ends = False
         self.only: dict[str, None] | None = None
         self.title = ""
@@ -192,15 +196,22 @@ class ReviewController:
         with ui.row().classes("w-full items-center ps-small-gap"):
             shown = [v for v in VIEWS if v != STREAM or self.streams]
             toggle = ui.toggle({v: words(f"review.view_{v}") for v in shown}, value=self.view)
-            toggle.props(f'no-caps unelevated aria-label="{words("review.view")}"').classes("ps-toggle")
+            toggle.props(f'no-caps unelevated aria-label="{words("review.view")}"').classes("ps-toggle ps-wrap")
             self.toggle = tag(toggle, "view")
             self.toggle.on_value_change(lambda e: self.turn_to(str(e.value)))
+            self._fold = button("filters", "", self._fold_filters, "outline", icon="filter_list")
+            self._fold.props("aria-expanded=false")
+        self._drawer = tag(ui.row().classes("w-full items-center ps-small-gap"), "filter-drawer")
+        with self._drawer:
             self._filters()
+        self._drawer.set_visibility(False)
+        self._label_fold()
         if self.only is not None:
             with tag(ui.row().classes("w-full items-center ps-message ps-message-info"), "selection"):
                 ui.label(words("review.selection", n=len(self.only), title=self.title or "")).classes("flex-grow")
                 ui.link(words("review.show_all"), address("review", dataset=review.path)).style("color: inherit")
-        self.page_slot = ui.element("div")
+        # Out of the flow, so that it leaves no gap.
+        self.page_slot = ui.element("div").style("position: absolute")
         self.views = {name: view(self) for name, view in views.items()}
         on_change(review.changed, self.changed)
         ui.timer(_LOOK_S, self._look)
@@ -219,7 +230,7 @@ class ReviewController:
                 **{s: words(f"review.from_{s}") for s in SEVERITIES},
                 NO_FINDING: words("review.no_finding"),
             },
-            "check": {c: c for c in CHECKS if "recording" in CHECKS[c].scope},
+            "check": {c: words.get(f"checks.{c}", c) for c in CHECKS if "recording" in CHECKS[c].scope},
         }
         self._fields: dict[str, Any] = {}
         for key, choices in options.items():
@@ -235,6 +246,14 @@ class ReviewController:
         self.filter = replace(
             self.filter, **{k: "" for k in options if getattr(self.filter, k) and self._fields[k].value is None}
         )
+
+    def _fold_filters(self) -> None:
+        self._drawer.set_visibility(not self._drawer.visible)
+        self._fold.props(f"aria-expanded={str(self._drawer.visible).lower()}")
+
+    def _label_fold(self) -> None:
+        active = len(self.filter.query())
+        self._fold.set_text(self.words("review.filters_active", n=active) if active else self.words("review.filters"))
 
     async def begin(self, recording: str) -> None:
         """Open the initial view with ``recording``, or the first recording if that is "" or unknown."""
@@ -271,10 +290,12 @@ class ReviewController:
 
     def arrange(self) -> None:
         """Filter and sort the recordings again."""
-        self.order = filter_and_sort(self.review.rows.values(), self.filter, self.only, self.by, self.down)
+        rows, word = self.review.rows.values(), self.words.sentence
+        self.order = filter_and_sort(rows, self.filter, self.only, self.by, self.down, word)
 
     async def _filtered(self, key: str, value: Any) -> None:
         self.filter = replace(self.filter, **{key: str(value or "")})
+        self._label_fold()
         self.arrange()
         self.first_row = 0
         if self.current not in self.order:
@@ -329,7 +350,7 @@ class ReviewController:
         """Return the ids of up to ``count`` recordings that follow in the order and still pass the filter."""
         rows = self.review.rows
         start = self.order.index(self.current) + 1 if self.current in self.order else 0
-        fitting = (i for i in self.order[start:] if i in rows and self.filter.fits(rows[i]))
+        fitting = (i for i in self.order[start:] if i in rows and self.filter.fits(rows[i], self.words.sentence))
         return list(itertools.islice(fitting, count))
 
     async def next(self) -> None:
@@ -365,6 +386,44 @@ class ReviewController:
             await self.go(self.order[self.order.index(self.current) - 1], remember=remember)
 
     # Deciding -----------------------------------------------------------------------------------------------------
+
+    async def select(self, identities: Iterable[str]) -> None:
+        """Select exactly these recordings, and show them in the table."""
+        self.selected = dict.fromkeys(identities)
+        if not set(self.selected) <= set(self.order):
+            for field in self._fields.values():
+                field.value = None
+            self.filter = RecordingFilter()
+            self.arrange()
+        if self.selected:
+            self.first_row = self.order.index(next(iter(self.selected))) if self.order else 0
+        await self.turn_to(TABLE)
+
+    def toggle_selected(self, identity: str, through: bool) -> None:
+        """Select a recording, or no longer; ``through``: all from the one that was clicked before to this one."""
+        on = identity not in self.selected
+        places = [self.order.index(i) for i in (self._anchor, identity) if through and i in self.order]
+        for each in self.order[min(places) : max(places) + 1] if len(places) == 2 else [identity]:
+            if on:
+                self.selected[each] = None
+            else:
+                self.selected.pop(each, None)
+        self._anchor = identity
+
+    async def decide_all(self, decision: Callable[[], int], action: str) -> bool:
+        """Call ``decision`` about several recordings; report how many it changed, with a button to undo it.
+
+        Args:
+            action: the kind of mark that it makes.
+        """
+        async with self._turn:
+            with self.page.show_errors():
+                changed = await run.io_bound(decision)
+                what = self.words(f"review.did_{action}")
+                text = self.words("review.decided_all", what=what, n=changed or 0)
+                self.page.say(text, "good" if changed else "info", self.undo if changed else None)
+                return True
+        return False
 
     async def decide(self, recording: str, decision: Callable[[], Any], *, move: bool = False) -> None:
         """Call ``decision``, which is about ``recording``; with ``move``, go to the next recording after success.
@@ -404,7 +463,10 @@ class ReviewController:
                 if last is None:
                     self.page.say(self.words("review.nothing_to_undo"))
                     return
-                action = self.words(f"review.did_{last.action}")
+                action, n = self.words(f"review.did_{last.action}"), len(last.before)
+                if n > 1:
+                    self.page.say(self.words("review.undone_all", what=action, n=n))
+                    return
                 self.page.say(self.words("review.undone", what=action, id=last.recording))
                 if self.view == ONE and last.recording in self.review.infos:
                     await self.go(last.recording)
@@ -433,7 +495,7 @@ class ReviewController:
 
     def _update_progress(self) -> None:
         prepared = self.review.prepared
-        text = prepared.message
+        text = self.words.error(prepared.error) if prepared.error is not None else ""
         if not text and prepared.progress is not None:
             stage, done, total = prepared.progress
             text = self.words(f"review.making_{stage}", done=done, of=total)

@@ -10,7 +10,7 @@ The query parameters of the address contain the state of the page, for links and
     the same, but stored under a key. `plushsense.studio.pages.review.review.Reviews.address` chooses one of these.
 ``person, gesture, state, severity, check, text``
     the filters (`plushsense.studio.pages.review.controller.RecordingFilter`).
-``view=table | one | overlay | stream``, ``recording=ID``, ``stream=ID``
+``view=table | one | overlay | durations | stream``, ``recording=ID``, ``stream=ID``
     the open view; ``recording`` alone opens that recording.
 """
 
@@ -22,8 +22,9 @@ from pathlib import Path
 from nicegui import context, run, ui
 
 from plushsense.studio.app.shell import Page, address, query, tag
-from plushsense.studio.pages.review.controller import ONE, OVERLAY, STREAM, TABLE, ReviewController
-from plushsense.studio.pages.review.recording_view import GestureOverlayView, RecordingView
+from plushsense.studio.pages.review.controller import DURATIONS, ONE, OVERLAY, STREAM, TABLE, ReviewController
+from plushsense.studio.pages.review.gesture_views import DurationsView, GestureOverlayView
+from plushsense.studio.pages.review.recording_view import RecordingView
 from plushsense.studio.pages.review.review import Review, Reviews
 from plushsense.studio.pages.review.stream_view import StreamView
 from plushsense.studio.pages.review.table_view import RecordingTableView
@@ -61,7 +62,13 @@ async def show(page: Page) -> None:
         controller = ReviewController(page, review, values)
         controller.limit(title, recordings)
         controller.build(
-            {TABLE: RecordingTableView, ONE: RecordingView, OVERLAY: GestureOverlayView, STREAM: StreamView}
+            {
+                TABLE: RecordingTableView,
+                ONE: RecordingView,
+                OVERLAY: GestureOverlayView,
+                DURATIONS: DurationsView,
+                STREAM: StreamView,
+            }
         )
         await controller.begin(values.get("recording", ""))
     opening.delete()

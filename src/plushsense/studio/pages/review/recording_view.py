@@ -1,200 +1,24 @@
-"""Define the view of one recording and the view that overlays all recordings of a gesture."""
+"""Define the view of one recording."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 from nicegui import ui
-from nicegui.element import Element
 
-from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, LINES, button, icon_button, named, tag
+from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, button, icon_button, named, tag
 from plushsense.studio.pages.review.controller import ReviewController
-from plushsense.studio.pages.review.signals import ACTIVITY, ALL, GestureOverlay
-from plushsense.studio.pages.review.table_view import SIGNS, ask_reason, finding_button, finding_text
-
-_VENDOR = Path(__file__).parents[2] / "widgets" / "vendor" / "uplot"
-
-
-class ReviewPlot(Element, component="review_plot.js"):
-    """Browser component that plots curves over time (in seconds) with marks, and reports clicks and keys.
-
-    Args:
-        label: text alternative while nothing is plotted.
-        on_pick: called on a click with {x, y, button ("left" or "right"), shift, recording (id of the plotted one)}.
-        on_key: called with {key, shift, recording}, except for keys typed into a field or a dialog.
-        on_zoom: called with {low, high, recording} after zooming into thinned curves.
-        on_select: called with {low, high, recording} after dragging over a range; without it, nothing can be selected.
-    """
-
-    def __init__(
-        self,
-        label: str,
-        *,
-        height: int = 330,
-        legend: bool = True,
-        on_pick: Callable[[dict[str, Any]], Any],
-        on_key: Callable[[dict[str, Any]], Any] | None = None,
-        on_zoom: Callable[[dict[str, Any]], Any] | None = None,
-        on_select: Callable[[dict[str, Any]], Any] | None = None,
-    ) -> None:
-        super().__init__()
-        self.add_resource(_VENDOR)
-        self._props.update({"label": label, "height": height, "legend": legend, "keyed": on_key is not None})
-        self._props["selects"] = on_select is not None
-        self.classes("w-full")
-        for event, handler in (("pick", on_pick), ("key", on_key), ("zoomed", on_zoom), ("selected", on_select)):
-            if handler is not None:
-                self.on(event, lambda e, handler=handler: handler(dict(e.args)))
-
-    def show(
-        self,
-        identity: str,
-        label: str,
-        x: Sequence[float],
-        curves: Sequence[Sequence[float | None]],
-        series: Sequence[dict[str, Any]],
-        *,
-        x_title: str,
-        y_title: str = "",
-        lanes: Sequence[tuple[float, str]] = (),
-        limits: tuple[float, float] | None = None,
-        marks: Sequence[dict[str, Any]] = (),
-        cut: Sequence[tuple[Any, ...]] = (),
-        thinned: bool = False,
-        keep: bool = False,
-    ) -> None:
-        """Replace the plotted curves.
-
-        Args:
-            identity: id that is sent back with every click and key.
-            label: text alternative.
-            lanes: pairs (position, name) that replace the numbers of the y-axis.
-            limits: range of the y-axis.
-            marks: vertical lines with ``x``, ``label``, ``stroke`` and ``dash``.
-            cut: ranges (from, to) to shade because they are trimmed off, or (from, to, CSS colour, name).
-            keep: whether to keep the zoom if the recording is the same.
-        """
-        plot = {"id": identity, "label": label, "data": [x, *curves], "series": series, "from": x[0] if x else 0.0}
-        plot |= {"xTitle": x_title, "y": y_title, "lanes": lanes, "range": limits, "marks": marks, "cut": cut}
-        self.run_method("show", plot | {"thinned": thinned, "keep": keep})
-
-    def remark(
-        self, identity: str, marks: Sequence[dict[str, Any]], cut: Sequence[tuple[Any, ...]], label: str
-    ) -> None:
-        """Replace the marks, shaded ranges and text alternative of the plotted recording."""
-        self.run_method("remark", identity, marks, cut, label)
-
-    def zoom(self, factor: float) -> None:
-        """Scale the visible range by ``factor`` around the first mark; 0 displays the whole recording."""
-        self.run_method("zoom", factor)
-
-    def look(self, low: float, high: float) -> None:
-        """Display the range from ``low`` to ``high`` seconds."""
-        self.run_method("look", low, high)
-
-    def pan(self, share: float) -> None:
-        """Move the visible range by a share of its length."""
-        self.run_method("pan", share)
-
-
-_MAX_OUTLIERS = 30
-_GREY = "#8a9099"
-
-
-class GestureOverlayView:
-    """View that overlays the recordings of one gesture; a click on a curve or a name opens the recording."""
-
-    def __init__(self, desk: ReviewController) -> None:
-        self.desk = desk
-        self._overlay: GestureOverlay | None = None
-        self._drawn: Any = None
-        words, labels = desk.words, desk.review.gestures()
-        self._gesture = desk.filter.gesture or (labels[0] if labels else "")
-        with tag(ui.element("div").classes("ps-two w-full"), "overlay") as self.place:
-            with ui.column().classes("w-full ps-small-gap no-wrap"):
-                self.choice = ui.select(
-                    {g: words.gesture(g) for g in labels},
-                    value=self._gesture if self._gesture in labels else None,
-                    label=words("review.gesture"),
-                    on_change=lambda e: self._choose(str(e.value)),
-                )
-                tag(self.choice.props("options-dense").style("min-width: 260px"), "overlay-gesture")
-                self.summary = tag(ui.label().props("role=status"), "overlay-summary")
-                self.plot = ReviewPlot(words("review.overlay_plot"), height=420, legend=False, on_pick=self.picked)
-                tag(self.plot, "overlay-plot")
-                ui.label(words("review.overlay_help")).classes("ps-dim")
-            with ui.column().classes("w-full ps-small-gap"):
-                ui.label(words("review.outliers")).classes("text-bold")
-                self.names = tag(ui.column().classes("w-full ps-no-gap"), "outliers")
-
-    async def _choose(self, gesture: str) -> None:
-        self._gesture = gesture
-        self.draw()
-
-    def draw(self) -> None:
-        """Plot the gesture; if the filter specifies a gesture, switch to that one."""
-        desk = self.desk
-        if desk.filter.gesture and desk.filter.gesture != self._gesture:
-            self._gesture = desk.filter.gesture
-            self.choice.value = self._gesture
-        self._drawn = None
-        self.refresh()
-
-    def refresh(self) -> None:
-        """Plot the gesture again if its recordings or the filter have changed."""
-        desk, words = self.desk, self.desk.words
-        overlay = desk.review.overlay(self._gesture)
-        fitting = set(desk.order) if desk.filter.query() or desk.only is not None else None
-        now = (self._gesture, [(c.recording, c.seconds, c.why) for c in overlay.drawn], fitting)
-        if now == self._drawn:
-            return
-        self._drawn, self._overlay = now, overlay
-        outliers = [c for c in overlay.drawn if c.why]
-        colours = {c.recording: LINES[i % len(LINES)] for i, c in enumerate(outliers)}
-        series, curves = [], []
-        for c, heights in zip(overlay.drawn, overlay.curves, strict=True):
-            if c.why:
-                look = {"label": c.recording, "stroke": colours[c.recording], "width": 2}
-            else:
-                faint = len(overlay.drawn) > 40 or (fitting is not None and c.recording not in fitting)
-                look = {"label": c.recording, "stroke": f"{_GREY}{'66' if faint else 'cc'}", "width": 1}
-            series.append(look)
-            curves.append([None if np.isnan(v) else round(float(v), 3) for v in heights])
-        gesture = words.gesture(self._gesture)
-        summary = words("review.overlay_summary", n=len(overlay.drawn), odd=len(outliers), gesture=gesture)
-        self.summary.set_text(summary if overlay.drawn else words("review.overlay_empty"))
-        self.plot.show(
-            f"overlay {self._gesture}",
-            summary,
-            np.round(overlay.x, 4).tolist(),
-            curves,
-            series,
-            x_title=words("review.x_axis"),
-            y_title=words("review.activity_axis"),
-            limits=(0.0, overlay.top),
-        )
-        self.names.clear()
-        with self.names:
-            if not outliers:
-                ui.label(words("review.no_outliers")).classes("ps-dim")
-            for c in outliers[:_MAX_OUTLIERS]:
-                with ui.row().classes("items-center no-wrap w-full"):
-                    dash = ui.element("span").style("width: 22px; height: 4px; flex: none")
-                    dash.style(f"background: {colours[c.recording]}")
-                    text = f"{c.recording}: {c.why}"
-                    name = button("", text, lambda c=c: desk.open(c.recording), "flat dense align=left")
-                    name.style("overflow-wrap: anywhere; text-align: left").classes("flex-grow")
-            if len(outliers) > _MAX_OUTLIERS:
-                ui.label(words("review.more_outliers", n=len(outliers) - _MAX_OUTLIERS)).classes("ps-dim")
-
-    async def picked(self, event: dict[str, Any]) -> None:
-        """Open the recording whose curve is nearest to the click."""
-        if self._overlay is not None and (nearest := self._overlay.nearest(float(event["x"]), float(event["y"]))):
-            await self.desk.open(nearest)
-
+from plushsense.studio.pages.review.plot import ReviewPlot, curve_styles
+from plushsense.studio.pages.review.signals import ACTIVITY, ALL
+from plushsense.studio.pages.review.table_view import (
+    SIGNS,
+    advice,
+    ask_gesture,
+    ask_reason,
+    finding_button,
+    finding_text,
+    recorded_as,
+)
 
 START, STOP = "start", "stop"
 KEYS = (
@@ -207,24 +31,18 @@ KEYS = (
     ("Home, End", "edges"),
     ("s, Esc", "drop"),
     ("x", "exclude"),
+    ("g", "relabel"),
     ("u", "undo"),
     ("+ − 0", "zoom"),
 )
 """Keyboard commands: pairs of the keys to press and the key of the text that describes the command."""
 # Commands available for recordings that cannot be trimmed.
-_PLAIN = ("accept", "back", "pass", "exclude", "undo", "zoom")
+_PLAIN = ("accept", "back", "pass", "exclude", "relabel", "undo", "zoom")
 _SET, _DRAFT = "--ps-set", "--ps-draft"
 _STEPS = {"ArrowLeft": -1, "ArrowRight": 1, ",": -10, "<": -10, ";": -10, ".": 10, ">": 10, ":": 10}
 _ZOOMS = {"zoom_in": ("zoom_in", 0.5), "zoom_out": ("zoom_out", 2.0), "zoom_all": ("fit_screen", 0.0)}
-_DASHES: tuple[list[int], ...] = ([], [7, 4], [2, 3])
-
-
-def curve_styles(names: Sequence[str]) -> list[dict[str, Any]]:
-    """Return label, colour and dashes of each curve, as `ReviewPlot.show` takes them."""
-    return [
-        {"label": n, "stroke": LINES[i % len(LINES)], "dash": _DASHES[i // len(LINES) % len(_DASHES)]}
-        for i, n in enumerate(names)
-    ]
+# Of the window's height.
+_PLOT_HEIGHT = 0.52
 
 
 class RecordingView:
@@ -243,10 +61,10 @@ class RecordingView:
                     self.heading.style("overflow-wrap: anywhere")
                     self.affect = ui.label().classes("q-px-sm rounded-borders").style("font-weight: 600; color: #fff")
                     self.state = tag(ui.label().classes("ps-chip").props("role=status"), "state")
-                self.about = tag(ui.label().classes("ps-dim ps-number"), "about")
+                self.about = tag(ui.label().classes("ps-dim"), "about")
                 self._actions(trims)
                 self.plot = ReviewPlot(
-                    words("review.plot"), height=310, on_pick=self.picked, on_key=self.key, on_zoom=self.zoomed
+                    words("review.plot"), height=_PLOT_HEIGHT, on_pick=self.picked, on_key=self.key, on_zoom=self.zoomed
                 )
                 tag(self.plot, "plot")
                 if trims:
@@ -273,6 +91,7 @@ class RecordingView:
             self._button("accept" if trims else "next", lambda: self.accept(), "accept", "unelevated color=primary")
             self._button("back", desk.back, "back")
             self.exclude = self._button("exclude", self._exclude, "exclude")
+            self._button("relabel", self._relabel, "relabel")
             self._button("undo", desk.undo, "undo")
 
     def _marks(self) -> None:
@@ -350,7 +169,9 @@ class RecordingView:
             self.plot.remark(row.id, self._lines(), self._cut(), self._label())
         self._drawn = now
         self.heading.set_text(row.id)
-        self.affect.set_text(f"{AFFECT_SIGNS[row.affect]} {words.gesture(row.info.gesture)}")
+        recorded = recorded_as(words, row)
+        gesture = f"{AFFECT_SIGNS[row.affect]} {words.gesture(row.info.gesture)}"
+        self.affect.set_text(f"{gesture} ({recorded})" if recorded else gesture)
         self.affect.style(f"background: {AFFECT_COLOURS.get(row.affect, '#767676')}")
         self.state.set_text(f"{SIGNS[row.state]} {words(f'review.state_{row.state}')}")
         self.state.props(f'data-state="{row.state}"')
@@ -426,13 +247,13 @@ class RecordingView:
             for f in row.findings:
                 with ui.column().classes("w-full ps-no-gap").props(f'data-check="{f.check}"'):
                     ui.label(finding_text(words, f)).classes("text-bold")
-                    ui.label(f.message)
+                    ui.label(words.sentence(f.message))
                     if f.accepted:
                         with ui.row().classes("items-center"):
                             ui.label(f"✓ {words('review.accepted_finding')}").classes("ps-dim")
                             finding_button(desk, f, row.id).classes("ps-act")
                     else:
-                        ui.label(f"→ {f.action}").classes("ps-dim")
+                        ui.label(f"→ {advice(words, f)}").classes("ps-dim")
                         finding_button(desk, f, row.id).classes("ps-act")
 
     # Commands -----------------------------------------------------------------------------------------------------
@@ -456,6 +277,8 @@ class RecordingView:
             await self.accept(str(event["recording"]))
         elif key == "x":
             await self._exclude()
+        elif key == "g":
+            self._relabel()
         elif trims and key in ("s", "Escape"):
             self._drop()
         elif trims and key == "Home":
@@ -504,9 +327,18 @@ class RecordingView:
         if not identity:
             return
         if desk.review.standing(identity).excluded:
-            await desk.decide(identity, lambda: desk.review.include(desk.visit, identity, desk.name))
+            await desk.decide(identity, lambda: desk.review.include(desk.visit, [identity], desk.name))
         else:
             ask_reason(desk)
+
+    def _relabel(self) -> None:
+        desk, identity = self.desk, self.desk.current
+
+        async def answer(gesture: str, why: str) -> None:
+            await desk.decide(identity, lambda: desk.review.relabel(desk.visit, [identity], gesture, desk.name, why))
+
+        if identity in desk.review.rows:
+            ask_gesture(desk, [identity], answer)
 
     def _drop(self) -> None:
         self.desk.review.drop(self.desk.current)

@@ -27,11 +27,12 @@ from plushsense.dataset import trimming as trim
 from plushsense.dataset.files import current_stamp
 from plushsense.dataset.index import apply_marks, open_dataset
 from plushsense.dataset.marks import SUGGESTED as BY_SUGGESTION
-from plushsense.dataset.marks import LabelledStretch, Mark, MarksFollower, MarkState, append_marks, inverse_marks
+from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, append_marks, apply_mark
 from plushsense.dataset.onset import Suggestion
 from plushsense.dataset.quality.findings import SEVERITIES, Finding
 from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
+from plushsense.studio.pages.review.decisions import Decisions, ReviewDecision
 from plushsense.studio.pages.review.signals import (
     GestureOverlay,
     RecordingSignals,
@@ -80,32 +81,9 @@ class ReviewedRecording:
         return self.state in DECIDED or (self.state == LABELLED and not self.open)
 
 
-@dataclass(frozen=True)
-class ReviewDecision:
-    """A decision made in a browser tab, with the state of the marks before and after it."""
-
-    recording: str
-    action: str
-    before: MarkState
-    after: MarkState
-    check: str = ""
-    rows: tuple[int, int] = (0, -1)
-
-    def changed_part(self, marks: MarkState) -> Any:
-        """Return the part of a mark state that the decision changes."""
-        if self.check:
-            return self.check in marks.accepted
-        if self.action in ("exclude", "include"):
-            return marks.excluded
-        if self.action in ("label", "unlabel"):
-            return marks.stretches
-        return marks.start, marks.stop, marks.how
-
-
 ODD = ("never-stopped", "duration", "no-onset", "several-gestures", "stuck", "flat")
 """Checks whose findings make a recording stand out among the others of its gesture."""
 _MAX_SIGNALS = 48
-_MAX_VISITS = 50
 
 
 class Review:
@@ -121,13 +99,12 @@ class Review:
         self.version = 0
         self._lock = threading.RLock()
         self._reading = threading.Lock()
-        self._histories: OrderedDict[str, list[ReviewDecision]] = OrderedDict()
         self._drafts: dict[str, tuple[int, int]] = {}
         self._read: OrderedDict[str, RecordingSignals] = OrderedDict()
         self._stream: RecordingSignals | None = None
         self._marked_source: Any = None
         self._rows: dict[str, ReviewedRecording] = {}
-        self._marks = MarksFollower(path)
+        self._decisions = Decisions(path)
         self._open()
         self.prepared = ReviewPreparation(self.changed)
         self._rows_source: Any = None
@@ -138,7 +115,6 @@ class Review:
         self.dataset = open_dataset(self.path)
         self.infos = {r.id: r for r in self.dataset.recordings}
         self._affects = {g.label: g.affect for g in self.dataset.gestures.gestures}
-        self._standing = self._marks.states()
 
     def close(self) -> None:
         """Stop the background thread."""
@@ -171,9 +147,7 @@ class Review:
             DatasetError: if the file of marks is invalid.
         """
         with self._lock:
-            before = self._standing
-            self._standing = self._marks.states()
-            if self._standing is before:
+            if not self._decisions.look():
                 return
         self._changed()
 
@@ -183,12 +157,12 @@ class Review:
 
     def standing(self, identity: str) -> MarkState:
         """Return the state of a recording, stream or person according to the marks."""
-        return self._standing.get(identity, MarkState())
+        return self._decisions.state(identity)
 
     def as_marked(self) -> Dataset:
         """Return a copy of the data set with the current marks applied, for use in another thread."""
-        bare = [replace(r, start=0, stop=r.rows, excluded=False) for r in self.dataset.recordings]
-        return Dataset(self.path, self.dataset.head, apply_marks(bare, dict(self._standing)), self.dataset.streams)
+        infos = apply_marks(self.dataset.recordings, dict(self._decisions.states), self.dataset.gestures)
+        return Dataset(self.path, self.dataset.head, infos, self.dataset.streams)
 
     def check(self) -> None:
         """Start to repeat the checks in the background."""
@@ -196,12 +170,12 @@ class Review:
 
     @property
     def unchecked(self) -> int:
-        """Number of recordings whose trim or exclusion has changed since the last check."""
+        """Number of recordings whose trim, exclusion or gesture has changed since the last check."""
         checked = self.prepared.checked
         if checked is None:
             return 0
-        now = {r.id: (r.start, r.stop, r.excluded) for r in self.as_marked().recordings}
-        return sum(now.get(r.id) != (r.start, r.stop, r.excluded) for r in checked.dataset.recordings)
+        now = {r.id: (r.start, r.stop, r.excluded, r.gesture) for r in self._marked().recordings}
+        return sum(now.get(r.id) != (r.start, r.stop, r.excluded, r.gesture) for r in checked.dataset.recordings)
 
     @property
     def rows(self) -> dict[str, ReviewedRecording]:
@@ -212,7 +186,8 @@ class Review:
                 findings: dict[str, list[Finding]] = {}
                 for f in self._findings():
                     findings.setdefault(f.recording, []).append(f)
-                self._rows = {i: self._row(info, tuple(findings.get(i, ()))) for i, info in self.infos.items()}
+                marked = self._marked().recordings
+                self._rows = {info.id: self._row(info, tuple(findings.get(info.id, ()))) for info in marked}
                 self._rows_source = source
             return self._rows
 
@@ -254,7 +229,7 @@ class Review:
 
     def gestures(self) -> list[str]:
         """Return the gestures of the recordings, in the order of the gesture set."""
-        present = {info.gesture for info in self.infos.values()}
+        present = {info.gesture for info in self._marked().recordings}
         known = [g.label for g in self.dataset.gestures.gestures if g.label in present]
         return [*known, *sorted(present - set(known))]
 
@@ -304,7 +279,7 @@ class Review:
     def _marked(self) -> Dataset:
         """Return `as_marked`, computed again only after a change."""
         with self._lock:
-            source = (self.version, id(self._standing), id(self.dataset))
+            source = (self.version, id(self._decisions.states), id(self.dataset))
             if self._marked_source != source:
                 self._marked_source, self._marked_dataset = source, self.as_marked()
             return self._marked_dataset
@@ -365,27 +340,17 @@ class Review:
     def _decide(
         self,
         visit: str,
-        about: str,
+        about: Iterable[str],
         action: str,
         make: Callable[[], object],
         check: str = "",
         rows: tuple[int, int] = (0, -1),
-    ) -> bool:
-        """Call ``make`` to write marks, store how to undo them, and return whether the state changed."""
+    ) -> int:
+        """Decide as in `Decisions.decide`, and notify subscribers."""
         with self._lock:
-            self._standing = self._marks.states()
-            before = self.standing(about)
-            make()
-            self._standing = self._marks.states()
-            now = self.standing(about)
-            if now != before:
-                history = self._histories.setdefault(visit, [])
-                history.append(ReviewDecision(about, action, before, now, check, rows))
-                self._histories.move_to_end(visit)
-                while len(self._histories) > _MAX_VISITS:
-                    self._histories.popitem(last=False)
+            changed = self._decisions.decide(visit, about, action, make, check, rows)
         self._changed()
-        return now != before
+        return changed
 
     def accept(self, visit: str, identity: str, who: str, ends: bool = False) -> bool:
         """Mark the draft or the suggested rows as the rows to keep; return whether the marks changed.
@@ -415,32 +380,57 @@ class Review:
                 else:
                     trim.set_rows(self.dataset, current, *rows, who)
 
-            changed = self._decide(visit, identity, "trim", make)
+            changed = self._decide(visit, [identity], "trim", make)
             self._drafts.pop(identity, None)
         self._changed()
-        return changed
+        return bool(changed)
 
-    def exclude(self, visit: str, identity: str, who: str, why: str) -> bool:
-        """Exclude a recording; raise ConfigError if the reason ``why`` is empty."""
-        return self._mark(visit, Mark(self.info(identity).id, "exclude", who, _check_reason(why)))
+    def surer_than(self, above: float, identities: Iterable[str]) -> list[str]:
+        """Return those of ``identities`` that have a suggestion of at least this confidence and no decision yet."""
+        rows = self.rows
+        return [i for i in identities if i in rows and rows[i].state == SUGGESTED and rows[i].confidence >= above]
 
-    def include(self, visit: str, identity: str, who: str) -> bool:
-        """Take an excluded recording back into use."""
-        return self._mark(visit, Mark(self.info(identity).id, "include", who))
+    def accept_above(
+        self, visit: str, identities: Iterable[str], who: str, above: float = 0.0, ends: bool = False
+    ) -> int:
+        """Accept the suggestions `surer_than` ``above`` as one decision; return how many were accepted."""
+        trims = [
+            trim.Trim(self.info(i), self.prepared.suggestions[i], self.standing(i), np.empty(0))
+            for i in self.surer_than(above, identities)
+        ]
+        make = partial(trim.accept_suggestions, self.dataset, trims, who, above=above, offset=ends)
+        return self._decide(visit, [t.recording.id for t in trims], "trim", make)
 
-    def untrim(self, visit: str, identity: str, who: str) -> bool:
+    def exclude(self, visit: str, identities: Iterable[str], who: str, why: str) -> int:
+        """Exclude recordings as one decision; raise ConfigError if the reason ``why`` is empty."""
+        return self._mark(visit, [Mark(self.info(i).id, "exclude", who, _check_reason(why)) for i in identities])
+
+    def include(self, visit: str, identities: Iterable[str], who: str) -> int:
+        """Take excluded recordings back into use, as one decision."""
+        return self._mark(visit, [Mark(self.info(i).id, "include", who) for i in identities])
+
+    def untrim(self, visit: str, identity: str, who: str) -> int:
         """Remove the trim marks of a recording, so that the suggestion applies again."""
-        return self._mark(visit, Mark(self.info(identity).id, "untrim", who))
+        return self._mark(visit, [Mark(self.info(identity).id, "untrim", who)])
 
-    def accept_finding(self, visit: str, finding: Finding, who: str, why: str) -> bool:
+    def relabel(self, visit: str, identities: Sequence[str], gesture: str, who: str, why: str = "") -> int:
+        """State as one decision that ``gesture`` was made in recordings; "" restores the recorded one.
+
+        Raises:
+            DatasetError: for a gesture that is not in the gesture set.
+        """
+        make = partial(labelling.relabel, self.dataset, identities, gesture, who, why)
+        return self._decide(visit, identities, "relabel", make)
+
+    def accept_finding(self, visit: str, finding: Finding, who: str, why: str) -> int:
         """Mark a finding as known and harmless; raise ConfigError if the reason ``why`` is empty."""
-        return self._mark(visit, Mark(finding.about, "accept", who, _check_reason(why), check=finding.check))
+        return self._mark(visit, [Mark(finding.about, "accept", who, _check_reason(why), check=finding.check)])
 
-    def reopen_finding(self, visit: str, finding: Finding, who: str) -> bool:
+    def reopen_finding(self, visit: str, finding: Finding, who: str) -> int:
         """Reopen an accepted finding."""
-        return self._mark(visit, Mark(finding.about, "unaccept", who, check=finding.check))
+        return self._mark(visit, [Mark(finding.about, "unaccept", who, check=finding.check)])
 
-    def label(self, visit: str, stream: str, rows: tuple[int, int], label: str, who: str) -> bool:
+    def label(self, visit: str, stream: str, rows: tuple[int, int], label: str, who: str) -> int:
         """Label rows of a stream, or with the label "" remove their labels; return whether the marks changed.
 
         Raises:
@@ -449,53 +439,30 @@ class Review:
         (found,) = labelling.find_streams(self.dataset, stream)
         if label:
             new = [LabelledStretch(stream, *rows, label)]
-            return self._decide(
-                visit, stream, "label", partial(labelling.label_stretches, self.dataset, new, who), rows=rows
-            )
-        return self._decide(
-            visit, stream, "unlabel", partial(labelling.unlabel, self.dataset, found, *rows, who), rows=rows
-        )
+            make: Callable[[], object] = partial(labelling.label_stretches, self.dataset, new, who)
+        else:
+            make = partial(labelling.unlabel, self.dataset, found, *rows, who)
+        return self._decide(visit, [stream], "label" if label else "unlabel", make, rows=rows)
 
-    def _mark(self, visit: str, mark: Mark) -> bool:
-        before = self.standing(mark.recording)
-        if {
-            "exclude": before.excluded,
-            "include": not before.excluded,
-            "untrim": not before.trimmed,
-            "accept": mark.check in before.accepted,
-            "unaccept": mark.check not in before.accepted,
-        }[mark.action]:
-            return False
-        return self._decide(visit, mark.recording, mark.action, partial(append_marks, self.path, [mark]), mark.check)
+    def _mark(self, visit: str, marks: Iterable[Mark]) -> int:
+        """Write the marks that change something as one decision, and return how many that are."""
+        new = [m for m in marks if apply_mark(self.standing(m.recording), m) != self.standing(m.recording)]
+        if not new:
+            return 0
+        make = partial(append_marks, self.path, new)
+        return self._decide(visit, [m.recording for m in new], new[0].action, make, new[0].check)
 
     def history(self, visit: str) -> Sequence[ReviewDecision]:
         """Return the decisions of a browser tab that can be undone, oldest first."""
-        return tuple(self._histories.get(visit, ()))
+        return self._decisions.history(visit)
 
     def undo(self, visit: str, who: str, why: str = "") -> ReviewDecision | None:
-        """Undo the last decision of a browser tab by writing the inverse mark; return None if there is none.
-
-        Raises:
-            DatasetError: if the mark was changed elsewhere since. It stays, and the next call undoes an older decision.
-        """
+        """Undo the last decision of a browser tab, see `Decisions.undo`."""
         with self._lock:
-            history = self._histories.get(visit)
-            if not history:
-                return None
-            self._standing = self._marks.states()
-            last, now = history[-1], self.standing(history[-1].recording)
-            if last.changed_part(now) != last.changed_part(last.after):
-                history.pop()
-                raise DatasetError(
-                    f"'{last.recording}' has been changed in another window or program since then: nothing is undone."
-                )
-            start, stop = last.rows
-            mark = Mark(last.recording, last.action, who, start=start, stop=stop, check=last.check)
-            append_marks(self.path, inverse_marks(mark, last.before, who, why))
-            history.pop()
-            self._standing = self._marks.states()
-        self._changed()
-        return last
+            undone = self._decisions.undo(visit, who, why)
+        if undone is not None:
+            self._changed()
+        return undone
 
     # Overlay ------------------------------------------------------------------------------------------------------
 
@@ -517,7 +484,7 @@ class Review:
 
 def _check_reason(why: str) -> str:
     if not why.strip():
-        raise ConfigError("A reason is missing: give it in a few words.")
+        raise ConfigError("A reason is missing: give it in a few words.", reason="reason_missing")
     return why.strip()
 
 

@@ -3,8 +3,18 @@
 import { loadResource } from "../../static/utils/resources.js";
 
 const colour = (name) => getComputedStyle(document.body).getPropertyValue(name).trim() || "#555";
+// Dark colours of curves are hard to see on a dark page: raise the lightness of "#rrggbb" or "#rrggbbaa".
+function lighten(stroke) {
+  const match = /^#([0-9a-f]{2})([0-9a-f]{2})([0-9a-f]{2})([0-9a-f]{2})?$/i.exec(stroke || "");
+  if (!match) return stroke;
+  const rgb = match.slice(1, 4).map((part) => parseInt(part, 16));
+  const light = (0.2126 * rgb[0] + 0.7152 * rgb[1] + 0.0722 * rgb[2]) / 255, least = 0.62;
+  const mix = light < least ? (least - light) / (1 - light) : 0;
+  const hex = rgb.map((v) => Math.round(v + (255 - v) * mix).toString(16).padStart(2, "0")).join("");
+  return `#${hex}${match[4] || ""}`;
+}
 const OURS = ["Enter", "Backspace", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End", "Escape"];
-const LETTERS = ["x", "u", "s", "i", "p", "h", "r", "d", "+", "-", "0", ",", ".", ";", ":", "<", ">"];
+const LETTERS = ["x", "g", "u", "s", "i", "p", "h", "r", "d", "+", "-", "0", ",", ".", ";", ":", "<", ">"];
 const REPEATED = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", ",", ".", "<", ">", ";", ":"];
 
 export default {
@@ -22,7 +32,7 @@ export default {
     this.times = [];
     this.resizer = new ResizeObserver(() => {
       const width = this.$el.clientWidth;
-      if (this.u && width && width !== this.u.width) this.u.setSize({ width, height: this.height });
+      if (this.u && width && width !== this.u.width) this.u.setSize({ width, height: this.pixels() });
     });
     this.resizer.observe(this.$el);
     // Other classes of the body change with every key.
@@ -68,11 +78,16 @@ export default {
       this.pressed = performance.now();
       this.$emit("key", { key, shift: event.shiftKey, recording: this.recording });
     },
+    pixels() {
+      return this.height > 1 ? this.height : Math.max(240, Math.round(window.innerHeight * this.height));
+    },
     build() {
       this.u?.destroy();
       this.dark = document.body.classList.contains("body--dark");
       const p = this.p, ink = colour("--ps-ink"), grid = { stroke: colour("--ps-line"), width: 1 };
-      const y = { stroke: ink, grid, ticks: grid, label: p.y || undefined, labelSize: 22, size: 64 };
+      const number = new Intl.NumberFormat(document.documentElement.lang || "en", { maximumFractionDigits: 4 });
+      const values = (u, splits) => splits.map((v) => (v == null ? "" : number.format(v)));
+      const y = { values, stroke: ink, grid, ticks: grid, label: p.y || undefined, labelSize: 22, size: 64 };
       if (p.lanes.length > 1) {
         y.splits = () => p.lanes.map((lane) => lane[0]);
         y.values = () => p.lanes.map((lane) => lane[1]);
@@ -82,12 +97,13 @@ export default {
       }
       const options = {
         width: this.$el.clientWidth || 600,
-        height: this.height,
+        height: this.pixels(),
+        bands: p.bands || [],
         legend: { show: this.legend, live: false },
         cursor: { drag: { x: this.selects, y: false, setScale: false, dist: 4 }, points: { show: false } },
         scales: { x: { time: false }, y: p.range ? { range: p.range } : {} },
-        axes: [{ stroke: ink, grid, ticks: grid, label: p.xTitle, labelSize: 22, size: 44 }, y],
-        series: [{ label: p.xTitle }, ...p.series.map((s) => ({ width: 1.4, points: { show: false }, ...s }))],
+        axes: [{ values, stroke: ink, grid, ticks: grid, label: p.xTitle, labelSize: 22, size: 44 }, y],
+        series: [{ label: p.xTitle }, ...p.series.map((s) => this.style(s))],
         hooks: { drawClear: [(u) => this.drawBehind(u)], draw: [(u) => this.drawMarks(u)], setSelect: [(u) => this.select(u)] },
       };
       this.u = new uPlot(options, p.data, this.$refs.place);
@@ -108,6 +124,11 @@ export default {
         const x = this.u.posToVal(event.clientX - over.getBoundingClientRect().left, "x");
         this.zoom(event.deltaY < 0 ? 0.7 : 1.4, x);
       }, { passive: false });
+    },
+    style(s) {
+      const stroke = this.dark ? lighten(s.stroke) : s.stroke;
+      if (!s.dots) return { width: 1.4, points: { show: false }, ...s, stroke };
+      return { ...s, stroke, paths: () => null, points: { show: true, size: 8, fill: stroke, stroke } };
     },
     select(u) {
       const { left, width } = u.select;

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ForgottenError, PlushSenseError
+from plushsense.core.errors import DatasetError, ForgottenError, PlushSenseError
 from plushsense.core.files import write_file
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
@@ -267,7 +267,7 @@ class ReviewPreparation:
     Attributes:
         scale: (C,) typical deviation of each channel; empty until it has been computed.
         progress: (step, done, total), or None if the thread is idle; ``step`` is "suggestions" or "checks".
-        message: error message of the last run, or "".
+        error: why the last run failed, or None.
     """
 
     changed: ChangeSignal
@@ -276,7 +276,7 @@ class ReviewPreparation:
     scale: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     checked: CheckReport | None = None
     progress: tuple[str, int, int] | None = None
-    message: str = ""
+    error: PlushSenseError | None = None
     _thread: threading.Thread | None = field(default=None, repr=False)
     _next: Dataset | None = field(default=None, repr=False)
     _lock: Any = field(default_factory=threading.Lock, repr=False)
@@ -313,16 +313,18 @@ class ReviewPreparation:
     def _run(self, dataset: Dataset | None) -> None:
         while dataset is not None:
             try:
-                self.message = ""
+                self.error = None
                 self._make(dataset)
                 self.progress = ("checks", 0, len(dataset.recordings))
                 self.checked = check(dataset, progress=self._steps("checks"))
             except _Closed:
                 return
             except PlushSenseError as refusal:
-                self.message = str(refusal)
+                self.error = refusal
             except OSError as cause:
-                self.message = f"'{dataset.path}' cannot be read: {cause.strerror or cause}."
+                why = cause.strerror or str(cause)
+                message = f"'{dataset.path}' cannot be read: {why}."
+                self.error = DatasetError(message, reason="not_readable", name=dataset.path.name, why=why)
             with self._lock:
                 dataset, self._next = self._next, None
                 if dataset is None:

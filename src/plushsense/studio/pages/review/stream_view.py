@@ -9,7 +9,7 @@ from nicegui import background_tasks, run, ui
 from plushsense.dataset.marks import HANDLING, PRACTICE, REST
 from plushsense.studio.app.shell import button, icon_button, tag
 from plushsense.studio.pages.review.controller import ReviewController
-from plushsense.studio.pages.review.recording_view import ReviewPlot, curve_styles
+from plushsense.studio.pages.review.plot import ReviewPlot, curve_styles
 from plushsense.studio.pages.review.signals import ALL, RecordingSignals
 
 REMOVE = "remove"

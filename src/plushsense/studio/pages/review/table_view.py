@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
 from nicegui import ui
 from nicegui.element import Element
 
 from plushsense.dataset.quality.findings import Finding
-from plushsense.studio.app.shell import AFFECT_SIGNS, button, icon_button, tag
+from plushsense.studio.app.shell import AFFECT_SIGNS, button, icon_button, scroll_region, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.review.controller import SORTS, ReviewController
 from plushsense.studio.pages.review.review import ReviewedRecording
@@ -22,15 +22,27 @@ class ReviewTable(Element, component="review_table.js"):
         words: the texts of the page.
         on_sort: called with the key of a column to sort by.
         on_open: called with the id of a recording to open.
+        on_pick: called with the id of a recording whose check box was clicked, and whether Shift was held.
+        on_page: called when the check box of all displayed rows was clicked.
     """
 
-    def __init__(self, words: Words, on_sort: Callable[[str], Any], on_open: Callable[[str], Any]) -> None:
+    def __init__(
+        self,
+        words: Words,
+        on_sort: Callable[[str], Any],
+        on_open: Callable[[str], Any],
+        on_pick: Callable[[str, bool], Any],
+        on_page: Callable[[], Any],
+    ) -> None:
         super().__init__()
         columns = [{"key": k, "label": words(f"review.{k}"), "sorts": k in SORTS} for k in (*SORTS, "path")]
         self._props.update(caption=words("review.table"), columns=columns, rows=[], spark=words("review.spark"))
+        self._props["pick"] = words("review.select")
         self.classes("w-full")
         self.on("sort", lambda event: on_sort(str(event.args)))
         self.on("open", lambda event: on_open(str(event.args)))
+        self.on("pick", lambda event: on_pick(str(event.args["id"]), bool(event.args["shift"])))
+        self.on("page", lambda _: on_page())
 
     def show(self, rows: list[dict[str, Any]], sort: str, down: bool, current: str) -> None:
         """Display rows, each made by `RecordingTableView._cells`."""
@@ -45,7 +57,19 @@ _ACCEPTING = ("looked", "person", "known")
 
 def finding_text(words: Words, finding: Finding) -> str:
     """Return a short text for a finding: its sign, severity and check."""
-    return f"{SEVERITY_SIGNS[finding.severity]} {words(f'review.severity_{finding.severity}')}: {finding.check}"
+    severity = words(f"review.severity_{finding.severity}")
+    return f"{SEVERITY_SIGNS[finding.severity]} {severity}: {check_name(words, finding.check)}"
+
+
+def check_name(words: Words, check: str) -> str:
+    """Return the name of a check in this language."""
+    return words.get(f"checks.{check}", check)
+
+
+def advice(words: Words, finding: Finding) -> str:
+    """Return what a check advises to do about a finding, in this language."""
+    of_stream = words.get(f"advice.{finding.check}-stream") if finding.stream else ""
+    return of_stream or words.get(f"advice.{finding.check}", finding.action)
 
 
 def finding_button(desk: ReviewController, finding: Finding, recording: str = "") -> ui.button:
@@ -58,24 +82,34 @@ def finding_button(desk: ReviewController, finding: Finding, recording: str = ""
     return button("", desk.words(f"review.{key}"), action, "flat dense")
 
 
-def ask_reason(desk: ReviewController, finding: Finding | None = None) -> None:
-    """Ask for a reason in a dialog; then accept ``finding``, or exclude the displayed recording if it is None."""
+def ask_reason(
+    desk: ReviewController, finding: Finding | None = None, excluded: Callable[[str], Awaitable[None]] | None = None
+) -> None:
+    """Ask for a reason in a dialog; then accept ``finding``, or exclude the displayed recording if it is None.
+
+    Args:
+        excluded: called with the reason instead, to exclude the selected recordings.
+    """
     words, recording = desk.words, desk.current
-    if finding is None:
+    if excluded is not None:
+        title = words("review.why_exclude_all", n=len(desk.selected))
+    elif finding is None:
         title = words("review.why_exclude", id=recording)
     else:
         about = finding.about or desk.review.dataset.head.name
-        title = words("review.why_accept", check=finding.check, about=about)
+        title = words("review.why_accept", check=check_name(words, finding.check), about=about)
 
     async def answer(why: str) -> None:
         if not why.strip():
-            error.set_text(words("review.reason_needed"))
+            field.error = words("review.reason_needed")
             field.run_method("focus")
             return
         dialog.close()
         review, visit = desk.review, desk.visit
-        if finding is None:
-            await desk.decide(recording, lambda: review.exclude(visit, recording, desk.name, why), move=True)
+        if excluded is not None:
+            await excluded(why)
+        elif finding is None:
+            await desk.decide(recording, lambda: review.exclude(visit, [recording], desk.name, why), move=True)
         else:
             await desk.decide(recording, lambda: review.accept_finding(visit, finding, desk.name, why))
 
@@ -91,7 +125,6 @@ def ask_reason(desk: ReviewController, finding: Finding | None = None) -> None:
                     button("", reason, lambda reason=reason: answer(reason), look)
             field = ui.input(words("review.own_reason")).classes("w-full")
             tag(field, "own-reason").on("keydown.enter", lambda: answer(field.value or ""))
-            error = tag(ui.label().props("role=alert").classes("ps-message-error"), "reason-error")
             with ui.row().classes("w-full justify-end"):
                 button("", words("review.cancel"), dialog.close, "flat")
                 go = words("review.exclude_go") if finding is None else words("review.accept_finding")
@@ -100,7 +133,53 @@ def ask_reason(desk: ReviewController, finding: Finding | None = None) -> None:
     dialog.open()
 
 
+def recorded_as(words: Words, row: ReviewedRecording) -> str:
+    """Return a text that names the recorded gesture if marks state another one, else ""."""
+    if row.info.gesture == row.info.recorded:
+        return ""
+    return words("review.recorded_as", gesture=words.gesture(row.info.recorded))
+
+
+def ask_gesture(
+    desk: ReviewController, identities: Sequence[str], answer: Callable[[str, str], Awaitable[None]]
+) -> None:
+    """Ask in a dialog which gesture was made; call ``answer`` with it ("" for the recorded one) and the reason."""
+    words = desk.words
+    rows = [desk.review.rows[i] for i in identities]
+    now = rows[0].info.gesture if len({r.info.gesture for r in rows}) == 1 else None
+    title = (
+        words("review.which_gesture_all", n=len(rows))
+        if len(rows) > 1
+        else words("review.which_gesture", id=rows[0].id)
+    )
+    options = {g: words.gesture(g) for g in desk.review.dataset.gestures.labels}
+
+    async def done(gesture: str | None) -> None:
+        if gesture is None:
+            choice.error = words("review.gesture_needed")
+            return
+        dialog.close()
+        await answer(gesture, (why.value or "").strip())
+
+    with desk.page_slot, ui.dialog() as dialog:
+        dialog.props(f'aria-label="{words("review.relabel_title")}" transition-duration=0')
+        with tag(ui.card().classes("w-full"), "relabelling"):
+            ui.label(title).classes("text-lg text-bold").style("overflow-wrap: anywhere")
+            choice = ui.select(options, value=now if now in options else None, label=words("review.gesture"))
+            tag(choice.props("options-dense").classes("w-full"), "new-gesture")
+            why = tag(ui.input(words("review.why_optional")).classes("w-full"), "relabel-why")
+            ui.label(words("review.relabel_about")).classes("ps-dim")
+            with ui.row().classes("w-full justify-end"):
+                button("", words("review.cancel"), dialog.close, "flat")
+                if any(r.info.gesture != r.info.recorded for r in rows):
+                    button("relabel-restore", words("review.relabel_restore"), lambda: done(""), "flat")
+                button("relabel-go", words("review.relabel_go"), lambda: done(choice.value), "unelevated")
+    dialog.on("hide", dialog.delete)
+    dialog.open()
+
+
 PER_PAGE = 50
+_SURE_PERCENT = 90
 _SPARK = 40
 SIGNS = {
     "looking": "…",
@@ -123,15 +202,28 @@ class RecordingTableView:
         words = desk.words
         with tag(ui.column().classes("w-full"), "list") as self.place:
             with ui.row().classes("w-full items-center ps-small-gap"):
+                button("start", words("review.start"), self._start, "unelevated color=primary")
                 self.range = tag(ui.label().classes("ps-number").props("role=status"), "range")
                 before, after = words("review.page_before"), words("review.page_after")
                 self.before = icon_button("chevron_left", before, lambda: self.turn(-1), "flat round")
                 self.after = icon_button("chevron_right", after, lambda: self.turn(1), "flat round")
                 ui.space()
-                button("start", words("review.start"), self._start, "unelevated color=primary")
+                if not desk.review.is_labelled:
+                    self._sure()
                 button("undo-list", words("review.undo"), desk.undo)
                 self.again = button("check-again", "", self._check)
-            self.table = tag(ReviewTable(words, self._sort, desk.open), "table")
+            with ui.row().classes("w-full items-center ps-small-gap"):
+                self.chosen = tag(ui.label().props("role=status"), "chosen")
+                self.all = button("select-all", "", self._select_all, "flat dense")
+                with ui.row().classes("items-center ps-small-gap") as self.acts:
+                    if not desk.review.is_labelled:
+                        button("accept-selected", words("review.accept_selected"), self._accept)
+                    button("exclude-selected", words("review.exclude"), lambda: ask_reason(desk, None, self._exclude))
+                    button("include-selected", words("review.include"), self._include)
+                    button("relabel-selected", words("review.relabel"), self._relabel)
+                    button("select-none", words("review.select_none"), self._select_none, "flat")
+            with scroll_region(words("review.table")):
+                self.table = tag(ReviewTable(words, self._sort, desk.open, self._pick, self._pick_page), "table")
             with tag(ui.expansion().classes("w-full"), "elsewhere") as self.elsewhere:
                 self.others = ui.column().classes("w-full")
         self._others_content: object = None
@@ -147,6 +239,7 @@ class RecordingTableView:
         self.range.set_text(text)
         self.before.set_enabled(first > 0)
         self.after.set_enabled(first + PER_PAGE < n)
+        self._show_selection()
         self.table.show([self._cells(rows[i]) for i in ids if i in rows], desk.by, desk.down, desk.current)
         unchecked = desk.review.unchecked
         self.again.set_visibility(unchecked > 0)
@@ -177,6 +270,8 @@ class RecordingTableView:
         return {
             "id": row.id,
             "person": desk.person(row.info.subject),
+            "selected": row.id in desk.selected,
+            "recorded": recorded_as(words, row),
             "gesture": f"{AFFECT_SIGNS[row.affect]}\u00a0{words.gesture(row.info.gesture)}",
             "seconds": f"{desk.words.number(row.seconds, 2)} s",
             "findings": findings,
@@ -200,8 +295,88 @@ class RecordingTableView:
             for f in findings:
                 with ui.row().classes("w-full items-center no-wrap"):
                     ui.label(finding_text(words, f)).style("min-width: 140px")
-                    ui.label(f"{f.about or words('review.dataset')}: {f.message}").classes("flex-grow")
+                    ui.label(f"{f.about or words('review.dataset')}: {words.sentence(f.message)}").classes(
+                        "flex-grow ps-break"
+                    )
                     finding_button(desk, f)
+
+    # Selection ----------------------------------------------------------------------------------------------------
+
+    def _sure(self) -> None:
+        """Add the field for a confidence, and the button that accepts all suggestions that are surer."""
+        words = self.desk.words
+        self.percent = ui.number(words("review.sure"), value=_SURE_PERCENT, min=0, max=100, step=5, format="%.0f")
+        self.percent.props('suffix="%"').style("width: 130px").on_value_change(self._show_selection)
+        tag(self.percent, "sure")
+        self.accept_sure = button("accept-sure", "", self._accept_sure)
+
+    def _surer(self) -> list[str]:
+        """Return the recordings of the list whose suggestion is surer than the field says."""
+        return self.desk.review.surer_than((self.percent.value or 0) / 100, self.desk.order)
+
+    async def _accept_sure(self) -> None:
+        desk, surer, above = self.desk, self._surer(), (self.percent.value or 0) / 100
+        review, ends = desk.review, desk.ends
+        await desk.decide_all(lambda: review.accept_above(desk.visit, surer, desk.name, above, ends), "trim")
+
+    def _show_selection(self) -> None:
+        desk, words = self.desk, self.desk.words
+        for gone in [i for i in desk.selected if i not in desk.review.infos]:
+            del desk.selected[gone]
+        n, fitting = len(desk.selected), len(desk.order)
+        self.chosen.set_text(words("review.selected", n=n) if n else words("review.none_selected"))
+        self.all.set_text(words("review.select_all", n=fitting))
+        self.all.set_visibility(fitting > 0 and any(i not in desk.selected for i in desk.order))
+        self.acts.set_visibility(n > 0)
+        if not desk.review.is_labelled:
+            surer = len(self._surer())
+            self.accept_sure.set_text(words("review.accept_sure", n=surer))
+            self.accept_sure.set_enabled(surer > 0)
+
+    def _pick(self, identity: str, through: bool) -> None:
+        self.desk.toggle_selected(identity, through)
+        self.draw()
+
+    def _pick_page(self) -> None:
+        desk = self.desk
+        shown = desk.order[desk.first_row : desk.first_row + PER_PAGE]
+        if all(i in desk.selected for i in shown):
+            for i in shown:
+                del desk.selected[i]
+        else:
+            desk.selected |= dict.fromkeys(shown)
+        self.draw()
+
+    def _select_all(self) -> None:
+        self.desk.selected |= dict.fromkeys(self.desk.order)
+        self.draw()
+
+    def _select_none(self) -> None:
+        self.desk.selected.clear()
+        self.draw()
+
+    async def _accept(self) -> None:
+        desk, chosen = self.desk, list(self.desk.selected)
+        review, ends = desk.review, desk.ends
+        await desk.decide_all(lambda: review.accept_above(desk.visit, chosen, desk.name, 0.0, ends), "trim")
+
+    async def _exclude(self, why: str) -> None:
+        desk, chosen = self.desk, list(self.desk.selected)
+        await desk.decide_all(lambda: desk.review.exclude(desk.visit, chosen, desk.name, why), "exclude")
+
+    async def _include(self) -> None:
+        desk, chosen = self.desk, list(self.desk.selected)
+        await desk.decide_all(lambda: desk.review.include(desk.visit, chosen, desk.name), "include")
+
+    def _relabel(self) -> None:
+        desk, chosen = self.desk, list(self.desk.selected)
+
+        async def answer(gesture: str, why: str) -> None:
+            await desk.decide_all(lambda: desk.review.relabel(desk.visit, chosen, gesture, desk.name, why), "relabel")
+
+        ask_gesture(desk, chosen, answer)
+
+    # Paging and sorting -------------------------------------------------------------------------------------------
 
     def turn(self, by: int) -> None:
         """Move by ``by`` pages of the table."""
