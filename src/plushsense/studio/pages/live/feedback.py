@@ -22,7 +22,8 @@ from plushsense.live.feedback import (
 from plushsense.models.bundle import Bundle
 from plushsense.recording.session import check_subject
 from plushsense.studio.app.workspace import BUNDLES, ChangeSignal, Workspace, plain_name
-from plushsense.studio.pages.live.reader import EventSpan, LiveReader
+from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.state import EventSpan
 
 EVENT_S = 22.0
 """Longest part of an event that is kept, its last seconds; a correction has at most 30 s of rows."""

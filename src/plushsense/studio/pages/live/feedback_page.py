@@ -11,7 +11,8 @@ from nicegui import ui
 from plushsense.core.errors import BadInput
 from plushsense.studio.app.shell import Page, button, named, on_change, tag
 from plushsense.studio.pages.live.feedback import Feedback
-from plushsense.studio.pages.live.reader import EventSpan, LiveReader
+from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.state import EventSpan
 
 
 def show(page: Page, reader: LiveReader) -> None:
