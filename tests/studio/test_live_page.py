@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import socket
 import subprocess
@@ -98,6 +99,31 @@ def test_what_the_toy_feels_is_seen(studio: Fixture, look: Fixture, shots: Fixtu
     row = marked(page, "events").locator("li[data-id]").last
     assert row.locator(".lv-badge").inner_text().split()[1] == row.get_attribute("data-affect")
     marked(page, "latency").get_by_text("to this page").wait_for()
+    # What the virtual person really does, by itself and when asked; the newest event of the log says so, too.
+    marked(page, "person").fill("S09")
+    settings(page)
+    choose(page, "Draw the signals", "2 times a second")
+    page.get_by_role("button", name="Tail pull", exact=True).click()
+    page.wait_for_function("() => document.querySelector('[data-test=really]').dataset.label === 'Tail pull'")
+    assert marked(page, "really").inner_text() == "Really: Tail pull"
+    marked(page, "do-nothing").click()
+    marked(page, "really").get_by_text("the virtual person does nothing").wait_for()
+    with page.expect_download() as saved:
+        marked(page, "log-save").click()
+    assert saved.value.suggested_filename.startswith("live-20")
+    rows = list(csv.DictReader(Path(saved.value.path()).read_text(encoding="utf-8").splitlines()))
+    assert f"{len(rows)} event" in marked(page, "log-count").inner_text()
+    assert {row["simulated"] for row in rows} == {"yes"} and {row["network"] for row in rows} == {"little"}
+    assert {row["person"] for row in rows} <= {"", "S09"} and any(row["really"] for row in rows)
+    page.evaluate(
+        "() => { window.print = () => { window.printed = document.querySelectorAll('.lv-print tr').length; }; }"
+    )
+    marked(page, "log-print").click()
+    page.wait_for_function("(n) => window.printed > n", arg=len(rows))
+    page.emulate_media(media="print")
+    assert page.locator(".lv-print table").is_visible() and not marked(page, "state").is_visible()
+    shots(page, "live-print")
+    page.emulate_media(media="screen")
     label = page.locator('[data-test="signals"] canvas').get_attribute("aria-label")
     assert label.startswith("The 13 signals of the toy")
     assert page.locator('[data-test="now"] [aria-live="polite"]').count() == 1
@@ -287,12 +313,12 @@ def test_a_hard_case_is_kept_labelled_and_in_the_data_set(
     page = started(browser, url)
     page.wait_for_function("() => window.plushsenseLive.samples > 1000")
     marked(page, "keep").click()
-    marked(page, "message").get_by_text("First enter the code of the person").wait_for()
-    page.wait_for_function("document.activeElement.getAttribute('aria-label') === \"Code of the person\"")
+    page.get_by_role("alert").get_by_text("First enter the code of the person").wait_for()
+    page.wait_for_function("document.activeElement.dataset.test === 'person'")
     page.keyboard.type("Anna")
     marked(page, "keep").click()
-    marked(page, "message").get_by_text("no code for a person").wait_for()
-    page.get_by_label("Code of the person").fill("S77")
+    page.get_by_role("alert").get_by_text("Anna").wait_for()
+    marked(page, "person").fill("S77")
     marked(page, "keep").click()
     page.get_by_role("button", name="Open S77/live-1").click()
     over = marked(page, "clip-plot").locator(".u-over")
@@ -342,7 +368,7 @@ def test_a_hard_case_is_kept_labelled_and_in_the_data_set(
 def test_the_server_is_killed_while_a_clip_is_recorded(studio: Fixture, look: Fixture, home: Path) -> None:
     server: Studio = studio(*VIRTUAL, home=home)
     page = started(look(), server.url)
-    page.get_by_label("Code of the person").fill("S05")
+    marked(page, "person").fill("S05")
     marked(page, "record").click()
     marked(page, "record-end").wait_for()
     stream = home / "recordings" / "S05" / "live-1" / "fulldatastream.csv"
@@ -386,8 +412,8 @@ def test_an_event_is_marked_as_wrong_and_the_network_improved(
     marked(page, "wrong-event").get_by_text(f"Last event: {gesture} at {begin}").wait_for()
     wrong = page.get_by_role("button", name="That was wrong")
     wrong.click()
-    marked(page, "message").get_by_text("First enter the code of the person").wait_for()
-    page.wait_for_function("document.activeElement.getAttribute('aria-label') === 'Person'")
+    page.get_by_role("alert").get_by_text("First enter the code of the person").wait_for()
+    page.wait_for_function("document.activeElement.dataset.test === 'wrong-person'")
     page.keyboard.type("S07")
     right = next(g for g in ("Tail pull", "Ear scratch 1") if g != gesture)
     choose(page, "It really was", right)

@@ -19,6 +19,7 @@ from plushsense.studio.app.workspace import VIRTUAL, Workspace
 from plushsense.studio.pages.live import clips_page, feedback_page
 from plushsense.studio.pages.live.clips import Clips
 from plushsense.studio.pages.live.feed import PACE_S, RATES_HZ, Feed, LiveView, follow
+from plushsense.studio.pages.live.log import LogButtons
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.state import LiveChoice
 from plushsense.studio.widgets.elements import summary
@@ -42,12 +43,15 @@ def show(page: Page) -> None:
 
     on_change(reader.changed, update_mark)
     update_mark()
-    view = LiveView(words, feed)
+    view, people = LiveView(words, feed), feedback_page.PersonFields(page, reader)
     with view:
         _person_panel(page, reader)
-        feedback_page.show(page, reader)
+        feedback_page.show(page, reader, people)
+    with view.add_slot("log"):
+        log = LogButtons(page, reader)
     follow(view, feed, reader)
-    clips_page.show(page, reader)
+    clips_page.show(page, reader, people)
+    log.add_sheet()
     clips = page.workspace.part(Clips)
     context.client.on_delete(reader.add_viewer(lambda: bool(clips.recording)))
 

@@ -35,6 +35,8 @@ KEPT_EVENTS = 20_000
 _BETWEEN_S = 0.06
 """Time in seconds after which new samples cause a notification even without a decision."""
 _JOIN_S = 10.0
+_EARLY_S, _LATE_S = 0.3, 2.0
+"""How long before the hand touches, and after it has left, an event belongs to a gesture, as in the protocol."""
 ALONE_S = 60.0
 """Time without an open page, in seconds, after which the toy is closed so that other programs can use it."""
 _UNREADABLE = 30
@@ -54,7 +56,8 @@ class _BundleRun:
 class LiveReader:
     """Service, shared by all live pages, that reads and classifies the signals of one toy.
 
-    It notifies `changed` after every decision and every other change of its state.
+    It notifies `changed` after every decision and every other change of its state. ``subject`` is the code of the
+    person who touches the toy, "" if it is not known.
     """
 
     def __init__(self, workspace: Workspace) -> None:
@@ -71,6 +74,8 @@ class LiveReader:
         self._begun = self._changes = 0
         self._first = 1
         self._performed: list[Performed] = []
+        self._started = 0.0
+        self.subject = ""
         self._next: _BundleRun | None = None
         self._thread: threading.Thread | None = None
         self._ends = threading.Event()
@@ -107,6 +112,7 @@ class LiveReader:
                 virtual.on_performed = partial(self._add_performed, virtual)
             with self._lock:
                 self._first, self._performed, self._malformed = self._begun + 1, [], 0
+                self._started = time.time()
                 self.device, self.bundle, self._next = device, bundle, bundle_run
                 self.now = LiveState(
                     self.now.generation + 1,
@@ -365,6 +371,8 @@ class LiveReader:
                 at=time.time(),
                 network=self.choice.bundle.stem if self.choice.bundle is not None else "",
                 simulated=self.choice.simulated,
+                session=self._started,
+                subject=self.subject,
             )
             self._events.pop(self._begun - KEPT_EVENTS, None)
             self._events[span.number] = span
@@ -373,6 +381,7 @@ class LiveReader:
             changed: dict[str, Any] = {"named_s": zero + event.t_s}
             if event.kind == "ended":
                 changed = {"end_s": zero + event.since_s, "closed_s": zero + event.t_s}
+                changed["really"] = self._performed_in(self.now.event.begin_s, zero + event.t_s)
             elif event.gesture != self.now.event.gesture:
                 # From now on it is the probability of the gesture, not of the affect.
                 changed["confidence"] = None
@@ -411,6 +420,17 @@ class LiveReader:
             begin_s, end_s = ((ms - first_ms) / 1000.0 for ms in (made.start_ms, made.end_ms))
             self._performed.append(Performed(number, made.label, begin_s, end_s))
             self.now = replace(self.now, performed=number, next_gesture=device.prompted)
+
+    def _performed_in(self, begin_s: float, end_s: float) -> str | None:
+        """Return the gesture of the virtual person that an event reports, "" for none, None for any other toy."""
+        if self.device is None or _virtual(self.device) is None:
+            return None
+        overlaps = {
+            min(end_s, made.end_s + _LATE_S) - max(begin_s, made.begin_s - _EARLY_S): made.label
+            for made in self._performed[-20:]
+        }
+        longest = max(overlaps, default=0.0)
+        return overlaps[longest] if longest > 0.0 else ""
 
     def _set(self, **changed: Any) -> None:
         with self._lock:

@@ -62,6 +62,9 @@ class EventSpan:
         at: time of its first report, in seconds since 1970.
         network: name of the bundle that reported it.
         simulated: whether the toy is virtual.
+        session: time of the start of the toy, in seconds since 1970.
+        subject: code of the person, "" if none was given.
+        really: the gesture that the virtual person made, "" for none; None for any other toy, and before the end.
     """
 
     number: int
@@ -80,6 +83,9 @@ class EventSpan:
     at: float = 0.0
     network: str = ""
     simulated: bool = False
+    session: float = 0.0
+    subject: str = ""
+    really: str | None = None
 
 
 @dataclass(frozen=True)
