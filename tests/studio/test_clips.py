@@ -18,7 +18,8 @@ from plushsense.recording.session import next_session
 from plushsense.recording.session_files import SESSION_LOG, read_events
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.live.clips import LONGEST_S, PROTOCOL, Clips
-from plushsense.studio.pages.live.reader import LiveChoice, LiveReader
+from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.state import LiveChoice
 from support.bundles import odd_bundle
 from support.waiting import until
 

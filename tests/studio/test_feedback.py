@@ -17,7 +17,8 @@ from plushsense.models.bundle import Bundle
 from plushsense.runtime.classifier import GestureEvent
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.live.feedback import EVENT_S, WAIT_S, Feedback
-from plushsense.studio.pages.live.reader import LiveChoice, LiveReader
+from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.state import LiveChoice
 from support.bundles import OTHER, odd_bundle
 from support.waiting import until
 
@@ -32,7 +33,7 @@ def workspace(tmp_path: Path) -> Iterator[Workspace]:
     reader = made.part(LiveReader)
     reader.start(LiveChoice("virtual://?person=31&seconds=45", bundle))
     until(lambda: not reader.now.running)
-    reader._spans.clear()
+    reader._events.clear()
     reader.now = replace(reader.now, event=None)
     yield made
     made.close()

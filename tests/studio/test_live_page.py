@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -21,6 +23,7 @@ from support.browsing import DESK, TABLET, Look, Studio, axe, connected, marked
 from support.bundles import OTHER, odd_bundle
 
 Fixture = Callable[..., Any]
+PHONE = (390, 844)
 VIRTUAL = ("--device", "virtual://?person=31", "--speed", "2")
 
 
@@ -35,9 +38,24 @@ def started(browser: Look, url: str) -> Any:
     """The same, and a toy that is being read."""
     page = live(browser, url)
     marked(page, "start").click()
-    # Exact, because "Not reading" is no other text to a search.
-    marked(page, "state").get_by_text("Reading", exact=True).wait_for()
+    situation(page, *READING)
     return page
+
+
+READING = ("nothing", "unsure", "unknown", "event")
+
+
+def situation(page: Any, *kinds: str) -> None:
+    """Wait for one of the situations."""
+    page.wait_for_function(
+        "(kinds) => kinds.includes(document.querySelector('[data-test=state]').dataset.kind)", arg=list(kinds)
+    )
+
+
+def settings(page: Any) -> None:
+    """Unfold the fields, which are folded while a toy is read."""
+    page.wait_for_function("() => !document.querySelector('[data-test=settings]').open")
+    marked(page, "settings").locator("summary").click()
 
 
 def choose(page: Any, label: str, option: str) -> None:
@@ -60,7 +78,7 @@ def test_what_the_toy_feels_is_seen(studio: Fixture, look: Fixture, shots: Fixtu
     url = studio(*VIRTUAL, home=home).url
     browser = look()
     page = live(browser, url)
-    assert marked(page, "state").inner_text() == "Not reading"
+    assert marked(page, "state").inner_text() == "Not started"
     assert axe(page) == []
     assert not marked(page, "simulation").is_visible()
     marked(page, "start").click()
@@ -70,7 +88,7 @@ def test_what_the_toy_feels_is_seen(studio: Fixture, look: Fixture, shots: Fixtu
     # samples come, and a message holds those that came since the one before.
     assert seen["samples"] / seen["updates"] < 2 * 100 / 15
     assert seen["drawn"] > 0
-    assert marked(page, "state").inner_text() == "Reading"
+    situation(page, *READING)
     assert marked(page, "simulation").is_visible()
     shares = marked(page, "bars").locator("li > span:last-child").all_inner_texts()
     assert len(shares) == 18
@@ -80,9 +98,32 @@ def test_what_the_toy_feels_is_seen(studio: Fixture, look: Fixture, shots: Fixtu
     marked(page, "events").locator("li[data-id]").first.wait_for()
     row = marked(page, "events").locator("li[data-id]").last
     assert row.locator(".lv-badge").inner_text().split()[1] == row.get_attribute("data-affect")
-    assert "%" in marked(page, "network").inner_text()
-    assert "Answer of the gate" in marked(page, "gate").inner_text()
     marked(page, "latency").get_by_text("to this page").wait_for()
+    # What the virtual person really does, by itself and when asked; the newest event of the log says so, too.
+    marked(page, "person").fill("S09")
+    settings(page)
+    choose(page, "Draw the signals", "2 times a second")
+    page.get_by_role("button", name="Tail pull", exact=True).click()
+    page.wait_for_function("() => document.querySelector('[data-test=really]').dataset.label === 'Tail pull'")
+    assert marked(page, "really").inner_text() == "Really: Tail pull"
+    marked(page, "do-nothing").click()
+    marked(page, "really").get_by_text("the virtual person does nothing").wait_for()
+    with page.expect_download() as saved:
+        marked(page, "log-save").click()
+    assert saved.value.suggested_filename.startswith("live-20")
+    rows = list(csv.DictReader(Path(saved.value.path()).read_text(encoding="utf-8").splitlines()))
+    assert f"{len(rows)} event" in marked(page, "log-count").inner_text()
+    assert {row["simulated"] for row in rows} == {"yes"} and {row["network"] for row in rows} == {"little"}
+    assert {row["person"] for row in rows} <= {"", "S09"} and any(row["really"] for row in rows)
+    page.evaluate(
+        "() => { window.print = () => { window.printed = document.querySelectorAll('.lv-print tr').length; }; }"
+    )
+    marked(page, "log-print").click()
+    page.wait_for_function("(n) => window.printed > n", arg=len(rows))
+    page.emulate_media(media="print")
+    assert page.locator(".lv-print table").is_visible() and not marked(page, "state").is_visible()
+    shots(page, "live-print")
+    page.emulate_media(media="screen")
     label = page.locator('[data-test="signals"] canvas').get_attribute("aria-label")
     assert label.startswith("The 13 signals of the toy")
     assert page.locator('[data-test="now"] [aria-live="polite"]').count() == 1
@@ -112,13 +153,15 @@ def test_another_bundle_while_it_runs_and_one_that_does_not_fit(studio: Fixture,
     page = live(browser, url)
     choose(page, "Network", "little")
     marked(page, "start").click()
-    marked(page, "state").get_by_text("Reading", exact=True).wait_for()
+    situation(page, *READING)
+    settings(page)
     for name, told in (("circus", "no gesture in common"), ("accel", "accel-3")):
         choose(page, "Network", name)
-        marked(page, "message").get_by_text(told).wait_for()
+        # Beside the field.
+        page.get_by_role("alert").get_by_text(told).wait_for()
         assert axe(page) == []
         page.wait_for_function("(n) => window.plushsenseLive.updates > n + 20", arg=look_at(page)["updates"])
-        assert marked(page, "state").inner_text() == "Reading"
+        situation(page, *READING)
         assert (
             marked(page, "bundle").locator("span", has_text="little").count()
             or page.get_by_label("Network", exact=True).input_value() == "little"
@@ -131,15 +174,15 @@ def test_another_bundle_while_it_runs_and_one_that_does_not_fit(studio: Fixture,
         "Back stroke 1",
         "Tail pull",
     ]
-    marked(page, "state").get_by_text("Reading", exact=True).wait_for()
+    situation(page, *READING)
     choose(page, "Arithmetic", "as on the chip (int8)")
-    marked(page, "message").get_by_text("calibration").wait_for()
+    page.get_by_role("alert").get_by_text("calibration").wait_for()
     choose(page, "Network", "little")
     marked(page, "bars").locator("li").nth(17).wait_for()
     choose(page, "Arithmetic", "as on the chip (int8)")
     page.wait_for_function("(n) => window.plushsenseLive.scenes > n + 2", arg=scenes)
     choose(page, "Reactions of the toy", "none")
-    marked(page, "state").get_by_text("Reading", exact=True).wait_for()
+    situation(page, *READING)
     assert browser.complaints == []
 
 
@@ -168,13 +211,12 @@ def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, hom
     assert not marked(page, "simulation").is_visible(), "nobody said that this port is a virtual toy"
     process.kill()
     process.wait(20.0)
-    marked(page, "state").get_by_text("No signal from the toy").wait_for()
-    marked(page, "message").wait_for()
-    assert "away" in marked(page, "message").inner_text() or "closed" in marked(page, "message").inner_text()
+    situation(page, "gone")
+    assert marked(page, "state").inner_text() == "The toy is gone"
+    assert "connects again by itself" in marked(page, "about").inner_text()
     assert axe(page) == []
     toy(int(address.rsplit(":", 1)[1]))
-    marked(page, "state").get_by_text("Reading", exact=True).wait_for()
-    marked(page, "message").wait_for(state="detached")
+    situation(page, *READING)
     assert browser.complaints == []
 
 
@@ -193,24 +235,41 @@ def test_a_toy_that_goes_away_while_the_page_is_behind(
     )
     process.kill()
     process.wait(20.0)
-    marked(page, "message").wait_for()
     page.wait_for_timeout(1500)
     page.evaluate(hide, False)
-    marked(page, "state").get_by_text("No signal from the toy").wait_for()
+    situation(page, "gone")
     assert browser.complaints == []
 
 
 def test_a_toy_that_is_not_there_is_a_sentence(studio: Fixture, look: Fixture, home: Path) -> None:
-    page = live(look(), studio("--device", "tcp://127.0.0.1:9", home=home).url)
-    marked(page, "start").click()
-    marked(page, "message").get_by_text("nobody listens on port 9").wait_for()
-    box = page.get_by_role("combobox", name="Toy", exact=True)
-    for typed, told in (("replay:///etc/passwd", "outside"), ("serial:///dev/nothing-here", "nothing-here")):
-        box.fill(typed)
+    with socket.create_server(("127.0.0.1", 0)) as dead:
+        port = dead.getsockname()[1]
+        browser = look(PHONE, True, "lv", touch=True)
+        page = live(browser, studio("--device", "tcp://127.0.0.1:9", home=home).url)
+        box = page.get_by_role("combobox", name="Rotaļlieta", exact=True)
+        field = page.locator(".q-field", has=box)
+        marked(page, "start").click()
+        field.get_by_role("alert").get_by_text("9").wait_for()
+        for typed, why in (("replay:///etc/passwd", "nav studijas mapē"), ("nonsense://x", "nonsense")):
+            box.fill(typed)
+            box.press("Enter")
+            marked(page, "start").click()
+            field.get_by_role("alert").get_by_text(why).wait_for()
+        assert axe(page) == []
+        assert marked(page, "state").inner_text() == "Nav sākts"
+        # A port that is open but sends nothing is not a calm toy.
+        box.fill(f"tcp://127.0.0.1:{port}")
         box.press("Enter")
         marked(page, "start").click()
-        marked(page, "message").get_by_text(told).wait_for()
-    assert marked(page, "state").inner_text() == "Not reading"
+        situation(page, "silent")
+        assert marked(page, "state").inner_text() == "No rotaļlietas nav signāla"
+        assert "neko nesūta" in marked(page, "about").inner_text()
+        assert axe(page) == []
+        assert no_sideways(page)
+        for name in ("stop", "eyes", "state"):
+            box_of = marked(page, name).bounding_box()
+            assert box_of["y"] + box_of["height"] <= PHONE[1], f"{name} is visible without scrolling"
+        assert browser.complaints == []
 
 
 def test_two_tabs_and_a_reload_show_the_present(studio: Fixture, look: Fixture, home: Path) -> None:
@@ -221,7 +280,7 @@ def test_two_tabs_and_a_reload_show_the_present(studio: Fixture, look: Fixture, 
     events.first.wait_for()
     first = events.last.get_attribute("data-from")
     second = live(browser, url)
-    assert marked(second, "state").inner_text() == "Reading"
+    situation(second, *READING)
     assert look_at(second)["samples"] > 100, "the last seconds are there at once"
     assert marked(second, "events").locator(f'li[data-from="{first}"]').count() == 1
     page.reload()
@@ -241,7 +300,7 @@ def test_two_tabs_and_a_reload_show_the_present(studio: Fixture, look: Fixture, 
     second.wait_for_function("(n) => window.plushsenseLive.updates > n + 5", arg=before["updates"])
     marked(second, "stop").click()
     for tab in (page, second):
-        marked(tab, "state").get_by_text("Not reading").wait_for()
+        situation(tab, "stopped")
         marked(tab, "start").wait_for()
     assert browser.complaints == []
 
@@ -254,12 +313,12 @@ def test_a_hard_case_is_kept_labelled_and_in_the_data_set(
     page = started(browser, url)
     page.wait_for_function("() => window.plushsenseLive.samples > 1000")
     marked(page, "keep").click()
-    marked(page, "message").get_by_text("First enter the code of the person").wait_for()
-    page.wait_for_function("document.activeElement.getAttribute('aria-label') === \"Code of the person\"")
+    page.get_by_role("alert").get_by_text("First enter the code of the person").wait_for()
+    page.wait_for_function("document.activeElement.dataset.test === 'person'")
     page.keyboard.type("Anna")
     marked(page, "keep").click()
-    marked(page, "message").get_by_text("no code for a person").wait_for()
-    page.get_by_label("Code of the person").fill("S77")
+    page.get_by_role("alert").get_by_text("Anna").wait_for()
+    marked(page, "person").fill("S77")
     marked(page, "keep").click()
     page.get_by_role("button", name="Open S77/live-1").click()
     over = marked(page, "clip-plot").locator(".u-over")
@@ -309,7 +368,7 @@ def test_a_hard_case_is_kept_labelled_and_in_the_data_set(
 def test_the_server_is_killed_while_a_clip_is_recorded(studio: Fixture, look: Fixture, home: Path) -> None:
     server: Studio = studio(*VIRTUAL, home=home)
     page = started(look(), server.url)
-    page.get_by_label("Code of the person").fill("S05")
+    marked(page, "person").fill("S05")
     marked(page, "record").click()
     marked(page, "record-end").wait_for()
     stream = home / "recordings" / "S05" / "live-1" / "fulldatastream.csv"
@@ -346,15 +405,15 @@ def test_an_event_is_marked_as_wrong_and_the_network_improved(
     page.wait_for_function("!document.querySelector('[data-test=wrong]').disabled")
     # The last event can be marked after the toy was stopped, too.
     marked(page, "stop").click()
-    marked(page, "state").get_by_text("Not reading").wait_for()
+    situation(page, "stopped")
     assert axe(page) == []
     listed = marked(page, "events").locator("li[data-gesture]:not([data-gesture=''])").first
     gesture, begin = listed.locator("b").inner_text(), listed.locator("span").first.inner_text()
     marked(page, "wrong-event").get_by_text(f"Last event: {gesture} at {begin}").wait_for()
     wrong = page.get_by_role("button", name="That was wrong")
     wrong.click()
-    marked(page, "message").get_by_text("First enter the code of the person").wait_for()
-    page.wait_for_function("document.activeElement.getAttribute('aria-label') === 'Person'")
+    page.get_by_role("alert").get_by_text("First enter the code of the person").wait_for()
+    page.wait_for_function("document.activeElement.dataset.test === 'wrong-person'")
     page.keyboard.type("S07")
     right = next(g for g in ("Tail pull", "Ear scratch 1") if g != gesture)
     choose(page, "It really was", right)
@@ -398,5 +457,5 @@ def test_an_event_is_marked_as_wrong_and_the_network_improved(
     # The former network again, by its name.
     choose(page, "Network", "little")
     marked(page, "start").click()
-    marked(page, "state").get_by_text("Reading", exact=True).wait_for()
+    situation(page, *READING)
     assert browser.complaints == []

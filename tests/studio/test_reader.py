@@ -9,18 +9,22 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from plushsense.core.errors import BundleError, ConfigError, DeviceError, PlushSenseError
+from plushsense.core.gestures import load_gestures
 from plushsense.devices.virtual.server import ToyServer
 from plushsense.devices.virtual.stream import ToySpec
-from plushsense.live.reactions import Reactor, load_reactions
+from plushsense.live.reactions import ReactionRule, Reactions, Reactor, load_reactions
 from plushsense.runtime.classifier import Decision, GestureEvent
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.live import reader as live
-from plushsense.studio.pages.live.page import STRIP_S, WINDOW_S, Feed
-from plushsense.studio.pages.live.reader import LiveChoice, LiveReader
+from plushsense.studio.pages.live.feed import STRIP_S, WINDOW_S, Feed
+from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.state import EventSpan, LiveChoice, LiveState, Situation, quiet_reason
 from support.bundles import OTHER, odd_bundle
 from support.waiting import until
 
@@ -57,11 +61,7 @@ def test_a_bundle_is_swapped_without_opening_the_toy_again(workspace: Workspace)
     assert not device.closed
     assert reader.choice == LiveChoice(VIRTUAL, bundle(workspace, "two"), "float", "gentle", True)
     # Time goes on: the second bundle's own clock began with its first frame.
-    # An answer is set just before the time of the newest frame.
-    until(lambda: (now := reader.now).network is not None and now.t_s >= now.network.t_s > before)
-    now = reader.now
-    assert now.network is not None
-    assert now.t_s - now.network.t_s < 3.0
+    until(lambda: reader.now.probabilities is not None and reader.now.t_s > before + 1.0)
 
 
 @pytest.mark.parametrize(
@@ -118,13 +118,14 @@ def test_it_ends_with_the_toy_and_by_command(workspace: Workspace) -> None:
     reader = workspace.part(LiveReader)
     reader.start(LiveChoice(f"{VIRTUAL}&seconds=5", bundle(workspace)))
     until(lambda: not reader.now.running)
-    assert reader.now.message == "The toy's data have ended."
+    assert reader.now.ended is not None and reader.now.ended.reason == "toy_data_ended"
     assert reader.now.event is None
     reader.start(LiveChoice(VIRTUAL, bundle(workspace)))
     until(lambda: reader.now.t_s > 1.0)
     reader.stop()
     assert not reader.now.running
-    assert reader.now.message == ""
+    assert reader.now.ended is None
+    assert reader.now.situation.kind == "stopped"
     assert not [t for t in threading.enumerate() if t.name == "plushsense-live"]
 
 
@@ -165,13 +166,13 @@ def test_a_toy_that_goes_away_comes_back(workspace: Workspace) -> None:
     until(lambda: reader.now.state == "tracking")
     first.set()
     thread.join()
-    until(lambda: reader.now.state == "no signal")
-    until(lambda: "closed the connection" in reader.now.problem or "went away" in reader.now.problem)
+    until(lambda: reader.now.state == "no signal" and reader.now.situation.kind == "gone")
     assert reader.now.running
+    assert reader.now.event is None
     heard = reader.now.t_s
     serve(int(urls[0].rsplit(":", 1)[1]), second, urls.append)
     until(lambda: reader.now.state == "tracking")
-    assert reader.now.problem == ""
+    assert reader.now.connection == ""
     # A toy that was switched on again counts from 0; the page's time goes on.
     assert reader.now.t_s >= heard
     second.set()
@@ -187,8 +188,19 @@ def test_lines_that_are_no_frames_are_told(workspace: Workspace) -> None:
     until(lambda: urls)
     reader = workspace.part(LiveReader)
     reader.start(LiveChoice(urls[0], bundle(workspace, "accel")))
-    until(lambda: "none is a frame of the layout 'accel-3'" in reader.now.problem)
+    until(lambda: reader.now.situation.kind == "unreadable")
+    scene = Feed(reader).scene()
+    assert (scene["layout"], scene["numbers"]) == ("accel-3", 4)
     stop.set()
+
+
+def test_a_port_that_sends_nothing_is_no_calm_toy(workspace: Workspace) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as dead:
+        reader = workspace.part(LiveReader)
+        reader.start(LiveChoice(f"tcp://127.0.0.1:{dead.getsockname()[1]}", bundle(workspace)))
+        assert reader.now.situation.kind == "connecting"
+        until(lambda: reader.now.situation.kind == "silent")
+        reader.stop()
 
 
 def test_what_is_kept_is_bounded_and_every_event_ends(workspace: Workspace) -> None:
@@ -204,6 +216,7 @@ def test_what_is_kept_is_bounded_and_every_event_ends(workspace: Workspace) -> N
     assert all(s.end_s is not None and s.gesture == "Tail pull" for s in spans)
     assert [s.number for s in spans] == list(range(live.KEPT_SPANS, 2 * live.KEPT_SPANS))
     assert reader.spans(spans[-2].change) == [spans[-1]]
+    assert len(reader.events()) == 2 * live.KEPT_SPANS - 1, "the log has them all"
     late = GestureEvent("begun", 9999, "negative", None, "gate", live.KEPT_SPAN_S + 2 * live.KEPT_SPANS - 1.5, 0.0)
     with reader._lock:
         reader._take_event(late, 100.0)
@@ -250,23 +263,127 @@ def test_a_feed_sends_everything_once_and_anew_when_it_missed_some(workspace: Wo
     assert (feed.message() or ("",))[0] == "scene"
 
 
+def decided(reader: LiveReader, profile: str = "standard") -> Callable[..., None]:
+    """Return a function that gives the reader a decision, of a toy whose first frame came at 10 s."""
+    reader.now = replace(reader.now, running=True, state="tracking")
+    gestures = load_gestures("plush-18")
+    reactor = Reactor(load_reactions(profile)) if profile else None
+    bundle_run = live._BundleRun(SimpleNamespace(gestures=gestures), None, reactor, 10.0)  # type: ignore[arg-type]
+
+    def decide(
+        t_s: float, *events: GestureEvent, answer: str = "idle", state: Any = "tracking", **likely: float
+    ) -> None:
+        shares = tuple(likely.get(g.label.replace(" ", "_"), 0.0) for g in gestures.gestures)
+        decision = Decision(t_s, None, None, None, "cnn", state, shares if likely else None, answer, events)
+        reader._take_in(decision, bundle_run)
+
+    return decide
+
+
 def test_the_reaction_ends_in_its_time(workspace: Workspace) -> None:
     reader = LiveReader(workspace)
-    reader.now = replace(reader.now, state="tracking")
-    bundle_run = live._BundleRun(None, None, Reactor(load_reactions("standard")), 10.0)  # type: ignore[arg-type]
-
-    def decide(t_s: float, *events: GestureEvent) -> None:
-        reader._take_in(
-            Decision(t_s, "Tail pull", "negative", 0.9, "cnn", "tracking", None, "sure", events), bundle_run
-        )
-
+    decide = decided(reader)
     decide(1.0, GestureEvent("begun", 1, "negative", None, "gate", 0.9, 1.0))
-    assert reader.now.reaction is not None
-    assert (reader.now.reaction.eyes, reader.now.reaction.sound) == ("red", "shriek")
+    now = reader.now.situation
+    assert (now.kind, now.affect, now.gesture, now.eyes, now.sound) == ("event", "negative", None, "red", "shriek")
     assert reader.now.reaction_ends_s == 12.0
     decide(1.95)
-    assert reader.now.reaction is not None
+    assert reader.now.situation.eyes == "red"
     decide(2.0)
-    assert reader.now.reaction is None
+    now = reader.now.situation
+    assert (now.kind, now.eyes, now.quiet) == ("event", "off", "over")
     assert reader.now.event is not None
     assert reader.now.event.begin_s == 10.9
+    decide(2.1, GestureEvent("ended", 1, "negative", None, "gate", 2.0, 2.1))
+    decide(2.2, GestureEvent("begun", 2, "negative", None, "gate", 2.2, 2.2))
+    assert reader.now.situation.quiet == "pause"
+    decide(2.3, state="no signal")
+    assert reader.now.situation == Situation("silent")
+
+
+def test_there_is_one_situation_whatever_the_network_computes(workspace: Workspace) -> None:
+    reader = LiveReader(workspace)
+    decide = decided(reader, "gentle")
+    # The network is as sure as can be, and yet there is no event.
+    decide(1.0, answer="unknown", Back_stroke_1=0.93)
+    assert reader.now.situation == Situation("unknown")
+    for answer, kind in (("idle", "nothing"), ("unsure", "unsure"), ("sure", "unsure")):
+        decide(1.1, answer=answer, Back_stroke_1=0.93)
+        assert reader.now.situation == Situation(kind)  # type: ignore[arg-type]
+    begun = GestureEvent("begun", 1, "positive", None, "cnn", 1.0, 1.2)
+    decide(1.2, begun, answer="affect", Back_stroke_1=0.5, Ear_scratch_1=0.3)
+    assert (now := reader.now.situation).kind == "event"
+    assert now.confidence == pytest.approx(0.8)
+    decide(
+        1.3, GestureEvent("named", 1, "positive", "Back stroke 1", "cnn", 1.0, 1.3), answer="sure", Back_stroke_1=0.6
+    )
+    decide(1.4, answer="unknown", Back_stroke_1=0.7)
+    decide(1.5, answer="unknown", Back_stroke_1=0.2)
+    now = reader.now.situation
+    assert (now.kind, now.gesture, now.eyes, now.sound) == ("event", "Back stroke 1", "green", "purr")
+    assert now.confidence == pytest.approx(0.7)
+    decide(1.6, GestureEvent("ended", 1, "positive", "Back stroke 1", "cnn", 1.5, 1.6))
+    now = reader.now.situation
+    assert (now.kind, now.eyes, now.reacts_to) == ("nothing", "green", "positive")
+    (event,) = reader.events()
+    assert (event.eyes, event.sound, event.gesture, event.end_s) == ("green", "purr", "Back stroke 1", 11.5)
+    assert event.confidence == pytest.approx(0.7)
+    decide(5.0, GestureEvent("begun", 2, "negative", None, "gate", 5.0, 5.0), Back_stroke_1=0.9)
+    now = reader.now.situation
+    assert (now.quiet, now.confidence, now.eyes) == ("dark", None, "off"), "the gate decided, not the network"
+
+
+def test_why_the_toy_does_not_react() -> None:
+    standard, event = load_reactions("standard"), EventSpan(1, 1, 1, 0.0, "positive", None, "cnn")
+    assert quiet_reason(None, event) == "off"
+    assert quiet_reason(standard, replace(event, affect="neutral")) == "none"
+    own = Reactions("own", (ReactionRule("positive", eyes="green", seconds=1.0, when="named"),))
+    assert quiet_reason(own, event) == "named"
+    assert quiet_reason(own, replace(event, gesture="Back stroke 1")) == "pause"
+    for state, kind in (
+        (LiveState(), "stopped"),
+        (LiveState(running=True, connection="connecting", state="warming"), "connecting"),
+        (LiveState(running=True, connection="gone", state="tracking", event=event), "gone"),
+        (LiveState(running=True, state="sensor fault"), "sensor_fault"),
+        (LiveState(running=True, state="warming"), "warming"),
+        (LiveState(running=True, state="warming", event=event), "event"),
+    ):
+        assert state.situation.kind == kind
+
+
+def test_the_virtual_person_does_what_is_asked(workspace: Workspace) -> None:
+    reader = workspace.part(LiveReader)
+    with pytest.raises(ConfigError, match="No virtual toy"):
+        reader.direct("Tail pull")
+    reader.start(LiveChoice(VIRTUAL, bundle(workspace)))
+    until(lambda: reader.performed())
+    reader.direct("Tail pull")
+    assert reader.now.next_gesture == "Tail pull"
+    until(lambda: reader.performed()[-1].label == "Tail pull" and reader.now.next_gesture == "")
+    made = reader.performed()
+    assert [p.number for p in made] == list(range(1, len(made) + 1))
+    until(lambda: reader.now.t_s > made[-1].end_s + 10.0)
+    assert reader.performed() == made, "and then nothing more"
+    reader.direct(None)
+    until(lambda: len(reader.performed()) > len(made) + 1)
+    reader.direct("")
+    until(lambda: reader.now.t_s > reader.performed()[-1].end_s + 10.0)
+    reader.stop()
+    assert reader.person is None
+
+
+def test_a_feed_keeps_the_rates_that_were_chosen(workspace: Workspace) -> None:
+    reader = workspace.part(LiveReader)
+    feed = Feed(reader)
+    reader.start(LiveChoice(VIRTUAL, bundle(workspace)))
+    until(lambda: reader.now.state == "tracking")
+    assert (feed.message() or ("",))[0] == "scene"
+    feed.plot_s, feed.decision_s = 3600.0, 0.0
+    _, message = feed.message() or ("", {})
+    assert "p" in message and "x" not in message
+    feed.plot_s, feed.decision_s = 0.0, 3600.0
+    _, message = feed.message() or ("", {})
+    assert "x" in message and "p" not in message
+    reader.stop()
+    _, message = feed.message() or ("", {})
+    assert message["now"]["kind"] == "stopped", "that no toy is read is displayed at once"

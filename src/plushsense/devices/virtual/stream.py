@@ -166,7 +166,8 @@ def _garble(line: bytes, rng: np.random.Generator) -> bytes:
 class ToyStream:
     """The endless lines of a virtual toy.
 
-    With ``prompts`` (set before the first line), its person performs the prompted gestures; else those of ``spec``.
+    With ``prompts``, its person performs the prompted gestures; else those of ``spec``. They may be set or removed at
+    any time; the person first ends what was begun.
     """
 
     def __init__(self, spec: ToySpec, layout: Layout, prompts: Prompts | None = None) -> None:
@@ -180,25 +181,25 @@ class ToyStream:
         self._rng = np.random.default_rng([spec.seed, spec.person, spec.session, 0x10])
 
     def __iter__(self) -> Iterator[ToyLine]:
-        # Checked only here, since a recorder may set the prompts after it has opened the toy.
-        episodes = self._session.play(self.spec.gestures) if self.prompts is None else self._prompted(self.prompts)
-        for episode in episodes:
-            yield from self._lines(episode)
-
-    def _prompted(self, prompts: Prompts) -> Iterator[Episode]:
-        """Yield idle episodes until there is a prompt, then its gesture, timed to the start of the recording."""
-        session = self._session
+        alone = self._session.play(self.spec.gestures)
         while True:
-            prompt = prompts()
-            if prompt is None or prompt.label not in GESTURES:  # nobody touches a toy at rest
-                yield session.idle(_LISTEN_S)
-                continue
-            family, in_hands = split_label(prompt.label)
-            lead = _LEAD_S + (PICK_S if in_hands and family != "Hold in hands" else 0.0)
-            wait = 0.0 if prompt.begin_ms is None else (prompt.begin_ms - session.clock_ms) / 1000.0 - lead
-            wait = min(max(0.0, wait), _LONGEST_WAIT_S)
-            session.wait_s = (wait, wait)
-            yield session.perform(prompt.label)
+            yield from self._lines(next(alone) if self.prompts is None else self._prompted(self.prompts))
+
+    def _prompted(self, prompts: Prompts) -> Episode:
+        """Return the gesture of a new prompt, timed to the start of the recording, or a short idle episode."""
+        session = self._session
+        prompt = prompts()
+        if prompt is None or prompt.label not in GESTURES:  # nobody touches a toy at rest
+            return session.idle(_LISTEN_S)
+        family, in_hands = split_label(prompt.label)
+        lead = _LEAD_S + (PICK_S if in_hands and family != "Hold in hands" else 0.0)
+        wait = 0.0 if prompt.begin_ms is None else (prompt.begin_ms - session.clock_ms) / 1000.0 - lead
+        wait = min(max(0.0, wait), _LONGEST_WAIT_S)
+        usual, session.wait_s = session.wait_s, (wait, wait)
+        try:
+            return session.perform(prompt.label)
+        finally:
+            session.wait_s = usual
 
     def _lines(self, episode: Episode) -> Iterator[ToyLine]:
         world, n = self.spec.world, len(episode)
@@ -267,8 +268,23 @@ class VirtualDevice(PacedDevice):
         self._lines = iter(lines)
 
     def follow(self, prompts: Prompts | None = None) -> None:
-        """Let the person make only gestures of ``prompts``, by default of `perform`; call it before any `read`."""
+        """Let the person make only gestures of ``prompts``, by default of `perform`, after ending what was begun."""
+        self._prompt = None
         self._stream.prompts = prompts or self._next_prompt
+
+    def release(self) -> None:
+        """Undo `follow`: let the person make gestures of their own again."""
+        self._stream.prompts = None
+
+    @property
+    def prompted(self) -> str:
+        """The gesture that was prompted with `perform` and has not been taken up yet, or ""."""
+        return self._prompt.label if self._prompt is not None else ""
+
+    @property
+    def following(self) -> bool:
+        """Whether the person makes only prompted gestures."""
+        return self._stream.prompts is not None
 
     def perform(self, label: str, begin_ms: int | None = None) -> None:
         """Prompt a gesture whose recording begins when the toy's clock is ``begin_ms``; call `follow` first."""

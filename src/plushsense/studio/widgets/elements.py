@@ -131,10 +131,10 @@ async def change_files(
         page.say(message, "good", None if undo is None else take_back)
 
 
-def summary(text: str) -> None:
+def summary(text: str) -> ui.html:
     """Add the heading of a collapsible part of the page, which stays visible when the part is folded."""
     style = "display: list-item; list-style-position: inside; cursor: pointer; font-weight: 600"
-    html(text, "summary").style(style)
+    return html(text, "summary").style(style)
 
 
 def verdict(good: bool | None, word: str) -> Markup:

@@ -18,6 +18,7 @@ from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.store import DatasetHead
 from plushsense.studio.app.shell import LINES, Page, button, html, moment, named, on_change, section, tag
 from plushsense.studio.pages.live.clips import Clip, Clips
+from plushsense.studio.pages.live.feedback_page import PersonFields
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.widgets.elements import Plot
 
@@ -26,7 +27,7 @@ _MAX_POINTS = 3000
 _START, _END = "#009E73", "#D55E00"
 
 
-def show(page: Page, reader: LiveReader) -> None:
+def show(page: Page, reader: LiveReader, people: PersonFields) -> None:
     """Build the section for clips, which is below the live view."""
     clips = page.workspace.part(Clips)
     words = page.words
@@ -34,7 +35,7 @@ def show(page: Page, reader: LiveReader) -> None:
         ui.label(words("live.hard_about")).classes("ps-dim")
         # Display messages about clips here instead of at the top of the page, which may be out of view.
         near = replace(page, _messages=ui.column().classes("w-full ps-messages"))
-        _recording_controls(near, reader, clips)
+        _recording_controls(near, reader, clips, people)
         listing = tag(ui.column().classes("w-full ps-no-gap"), "clips")
         editor = tag(ui.column().classes("w-full"), "clip")
 
@@ -60,11 +61,11 @@ def show(page: Page, reader: LiveReader) -> None:
     on_change(clips.changed, refresh)
 
 
-def _recording_controls(page: Page, reader: LiveReader, clips: Clips) -> None:
+def _recording_controls(page: Page, reader: LiveReader, clips: Clips, people: PersonFields) -> None:
     """Build the field for the person and the buttons that record a clip."""
     words = page.words
     with ui.row().classes("w-full items-end ps-small-gap"):
-        person = tag(ui.input(words("live.person"), placeholder="S01").props("maxlength=40"), "person")
+        person = people.add("person").classes("w-64")
         seconds = ui.select({s: words("live.seconds", s=s) for s in _KEEP_S}, value=10, label=words("live.keep_last"))
         tag(seconds, "keep-seconds").classes("w-32")
         keep = button("keep", words("live.keep"), None, "unelevated", icon="bookmark_add")
@@ -73,23 +74,15 @@ def _recording_controls(page: Page, reader: LiveReader, clips: Clips) -> None:
         end.style("background: #a3310a !important; color: #fff !important")
         length = tag(ui.label("").props('role="timer"').classes("ps-dim"), "record-length")
 
-    def code() -> str:
-        """Return the code of the person; if it is missing, show a message and return ""."""
-        text = str(person.value or "").strip()
-        if not text:
-            page.say(words("live.person_first"), "warning")
-            person.run_method("focus")
-        return text
-
     async def keep_last() -> None:
-        if not (subject := code()):
+        if not (subject := people.checked(person)):
             return
         with page.show_errors():
             key = await asyncio.to_thread(clips.keep, reader, float(seconds.value), subject)
             page.say(words("live.kept", clip=key), "good")
 
     async def start() -> None:
-        if not (subject := code()):
+        if not (subject := people.checked(person)):
             return
         with page.show_errors():
             await asyncio.to_thread(clips.begin, reader, subject)

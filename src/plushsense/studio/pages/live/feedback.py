@@ -22,7 +22,8 @@ from plushsense.live.feedback import (
 from plushsense.models.bundle import Bundle
 from plushsense.recording.session import check_subject
 from plushsense.studio.app.workspace import BUNDLES, ChangeSignal, Workspace, plain_name
-from plushsense.studio.pages.live.reader import EventSpan, LiveReader
+from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.state import EventSpan
 
 EVENT_S = 22.0
 """Longest part of an event that is kept, its last seconds; a correction has at most 30 s of rows."""
@@ -48,8 +49,8 @@ class Feedback:
         self._workspace = workspace
         self._reader = workspace.part(LiveReader)
         self._lock = threading.Lock()
-        # Events that were marked, by number, and the person whose file has the mark.
-        self._marked: dict[int, str] = {}
+        # Events that were marked, by number: the person whose file has the mark, and the right gesture, if known.
+        self._marked: dict[int, tuple[str, str]] = {}
 
     def last_event(self) -> EventSpan | None:
         """Return the last event that names a gesture of the bundle in use, unless it is marked or long ago."""
@@ -61,6 +62,11 @@ class Feedback:
                 late = span.end_s is not None and now_s - span.end_s > WAIT_S
                 return None if late or span.number in self._marked else span
         return None
+
+    def marks(self) -> dict[int, tuple[str, str]]:
+        """Return the events that were marked since the studio was started: number to person and right gesture."""
+        with self._lock:
+            return dict(self._marked)
 
     def count(self, subject: str) -> int:
         """Return the number of marks of a person; raise DatasetError for an invalid code."""
@@ -93,7 +99,7 @@ class Feedback:
             correction = cut_correction(bundle, frames, event.gesture, *times_s, subject=path.stem, right=right)
             path.parent.mkdir(parents=True, exist_ok=True)
             append_corrections(path, [correction])
-            self._marked[number] = path.stem
+            self._marked[number] = (path.stem, right)
             count = self.count(subject)
         self.changed.notify()
         return count
@@ -108,7 +114,7 @@ class Feedback:
             path = self._path(subject)
             if remove_last_correction(path):
                 # The event can be marked again if it was marked since the studio was started.
-                self._marked.pop(next((n for n in reversed(self._marked) if self._marked[n] == path.stem), 0), None)
+                self._marked.pop(next((n for n in reversed(self._marked) if self._marked[n][0] == path.stem), 0), None)
             count = self.count(subject)
         self.changed.notify()
         return count

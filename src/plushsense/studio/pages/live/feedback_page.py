@@ -4,28 +4,70 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Callable
 from dataclasses import replace
 
 from nicegui import ui
 
 from plushsense.core.errors import BadInput
+from plushsense.recording.session import check_subject
 from plushsense.studio.app.shell import Page, button, named, on_change, tag
 from plushsense.studio.pages.live.feedback import Feedback
-from plushsense.studio.pages.live.reader import EventSpan, LiveReader
+from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.state import EventSpan
 
 
-def show(page: Page, reader: LiveReader) -> None:
-    """Build the part, which is below the current event."""
+def show(page: Page, reader: LiveReader, people: PersonFields) -> None:
+    """Build the part, which is beside the current event."""
     box = ui.element("div").props("role=group").classes("w-full column no-wrap ps-small-gap q-mt-sm")
     with named(box, page.words("live.wrong_about")):
-        _FeedbackPanel(page, reader)
+        _FeedbackPanel(page, reader, people)
+
+
+class PersonFields:
+    """The fields of a page for the code of the person who touches the toy; all of them hold the same text."""
+
+    def __init__(self, page: Page, reader: LiveReader) -> None:
+        self._page, self._reader = page, reader
+        self._fields: list[ui.input] = []
+        self.code = reader.subject
+
+    def add(self, name: str, on_change: Callable[[], None] = lambda: None) -> ui.input:
+        """Add a field; ``on_change`` is called when the text of any field has changed."""
+        words = self._page.words
+        field = tag(ui.input(words("live.person"), value=self.code, placeholder="S01").props("maxlength=16"), name)
+        self._fields.append(field)
+
+        def changed() -> None:
+            self.code = str(field.value or "").strip()
+            field.error = None
+            for other in self._fields:
+                other.set_value(field.value)
+            self._reader.subject = ""
+            # A code that is still being typed may be invalid.
+            with contextlib.suppress(BadInput):
+                self._reader.subject = check_subject(self.code)
+            on_change()
+
+        field.on_value_change(changed)
+        return field
+
+    def checked(self, field: ui.input) -> str:
+        """Return the code; if it is missing or invalid, say so beside ``field`` and return ""."""
+        text = ""
+        try:
+            text = check_subject(self.code)
+        except BadInput as refusal:
+            field.error = self._page.words.error(refusal) if self.code else self._page.words("live.person_first")
+            field.run_method("focus")
+        return text
 
 
 class _FeedbackPanel:
     """Fields and buttons that mark the last event, remove the last mark, and improve the network."""
 
-    def __init__(self, page: Page, reader: LiveReader) -> None:
-        self._reader, self._words = reader, page.words
+    def __init__(self, page: Page, reader: LiveReader, people: PersonFields) -> None:
+        self._reader, self._words, self._people = reader, page.words, people
         self._feedback = page.workspace.part(Feedback)
         self._event: EventSpan | None = None
         self._labels: tuple[str, ...] = ()
@@ -39,8 +81,7 @@ class _FeedbackPanel:
             nothing = {"": words("live.wrong_nothing")}
             self._right = ui.select(nothing, value="", label=words("live.wrong_really"))
             tag(self._right, "wrong-really").style("flex: 1 1 10rem; min-width: 0")
-            self._person = ui.input(words("live.wrong_person"), placeholder="S01").props("maxlength=16")
-            tag(self._person.style("width: 7rem"), "wrong-person").on_value_change(self._update_marks)
+            self._person = people.add("wrong-person", self._update_marks).style("flex: 1 1 9rem")
         with ui.row().classes("w-full items-center ps-small-gap"):
             self._improve = button("improve", words("live.improve"), self._fit, icon="auto_fix_high")
             self._undo = button("marks-undo", words("live.marks_undo"), self._remove, "flat", icon="undo")
@@ -51,12 +92,7 @@ class _FeedbackPanel:
         self._update()
 
     def _code(self) -> str:
-        """Return the code of the person; if it is missing, show a message and return ""."""
-        text = str(self._person.value or "").strip()
-        if not text:
-            self._page.say(self._words("live.person_first"), "warning")
-            self._person.run_method("focus")
-        return text
+        return self._people.checked(self._person)
 
     async def _mark(self) -> None:
         # The event that the page shows: another one may begin while the button is pressed.
@@ -120,7 +156,7 @@ class _FeedbackPanel:
             self._right.set_options(options, value=self._right.value if self._right.value in options else "")
 
     def _update_marks(self) -> None:
-        subject, n = str(self._person.value or "").strip(), 0
+        subject, n = self._people.code, 0
         if subject:
             # A code that is still being typed may be invalid.
             with contextlib.suppress(BadInput, OSError):

@@ -1,4 +1,4 @@
-// Signals, probabilities, answers, eyes and time line of a live toy. `scene` sets the whole state, `update` adds changes.
+// Situation, eyes, time line, probabilities and signals of a live toy. `scene` sets the whole state, `update` adds changes.
 // Drawing waits for the next frame of the screen, so that it never falls behind.
 
 const el = (tag, cls, text) => {
@@ -10,6 +10,8 @@ const el = (tag, cls, text) => {
 const say = (node, text) => { if (node.textContent !== text) node.textContent = text; };
 const fill = (text, values) => text.replace(/\{(\w+)\}/g, (_, key) => values[key]);
 const SPOKEN_MS = 2500, KEPT_DELAYS = 600;
+const STRIP = 96, DID = 40; // height of the time line in pixels, and of the row of what the virtual person did
+const NARROW = 700;
 
 const EYES = {
   // Round; narrowed under slanted brows; closed: they differ in shape as well as in colour.
@@ -25,46 +27,47 @@ const EYES = {
   off: `<path d="M34 60 Q60 72 86 60 M114 60 Q140 72 166 60" fill="none" stroke="#3a2413" stroke-width="6" stroke-linecap="round"/>
     <path d="M86 108 L114 108" fill="none" stroke="#3a2413" stroke-width="5" stroke-linecap="round"/>`,
 };
+const QUIET = ["event", "nothing", "unsure", "unknown"]; // not announced: events have their own sentence
 const face = (eyes) => `<svg viewBox="0 0 200 132" aria-hidden="true" focusable="false">
   <ellipse cx="26" cy="16" rx="22" ry="16" fill="#9c6a3d"/><ellipse cx="174" cy="16" rx="22" ry="16" fill="#9c6a3d"/>
   <rect x="10" y="6" width="180" height="122" rx="58" fill="#c08a55"/>${EYES[eyes] || EYES.off}
   <ellipse cx="100" cy="88" rx="10" ry="7" fill="#3a2413"/></svg>`;
 
 const CSS = `
-.lv { display: grid; gap: 16px; grid-template-columns: minmax(0, 1.25fr) minmax(0, 1fr); width: 100%; }
+.lv { display: grid; gap: 16px; grid-template-columns: minmax(0, 1fr) minmax(0, 1.25fr); width: 100%; }
 .lv > section { border: 1px solid var(--ps-line); border-radius: 10px; padding: 12px 14px; min-width: 0; }
-.lv h2 { margin-bottom: 8px; } .lv .lv-wide { grid-column: 1 / -1; }
-.lv canvas { display: block; width: 100%; }
-.lv-top { display: flex; gap: 16px; align-items: center; flex-wrap: wrap; }
-.lv-face { width: 170px; flex: none; } .lv-face svg { display: block; width: 100%; }
-.lv-event { font-size: 1.5rem; line-height: 2rem; font-weight: 600; overflow-wrap: anywhere; min-height: 2rem; }
+.lv [hidden] { display: none; } .lv h2 { margin-bottom: 8px; } .lv .lv-wide { grid-column: 1 / -1; }
+.lv summary { cursor: pointer; } .lv summary h2 { display: inline; margin: 0; }
+.lv canvas { display: block; width: 100%; margin-top: 8px; }
+.lv-now { display: grid; gap: 16px 24px; grid-template-columns: minmax(0, 1.25fr) minmax(0, 1fr); align-items: start; }
+.lv-top { display: flex; gap: 20px; align-items: center; min-width: 0; } .lv-top > :last-child { min-width: 0; }
+.lv-face { width: clamp(120px, 17vw, 230px); flex: none; } .lv-face svg { display: block; width: 100%; }
+.lv-line { font-size: clamp(1.45rem, 2.6vw, 2.1rem); line-height: 1.25; font-weight: 600; overflow-wrap: anywhere; }
 .lv-badge { display: inline-block; color: #fff; font-weight: 600; border-radius: 6px; padding: 1px 9px; }
-.lv-state { font-weight: 600; } .lv-state::before { content: ""; display: inline-block; width: .7em; height: .7em; margin-right: .5em;
-  border: 2px solid var(--ps-ink); border-radius: 50%; }
-.lv-state[data-state=tracking]::before { background: var(--ps-ink); }
-.lv-state[data-state="no signal"]::before, .lv-state[data-state="sensor fault"]::before { border-radius: 0; transform: rotate(45deg); }
-.lv-voices { display: grid; grid-template-columns: 1fr 1fr; gap: 10px; margin-top: 10px; }
-.lv-voices > div { border-top: 3px solid var(--ps-line); padding-top: 6px; min-width: 0; overflow-wrap: anywhere; }
-.lv-voices h3, .lv-group h3 { font-size: 1rem; line-height: 1.4rem; font-weight: 600; margin: 0; }
+.lv-sure { font-weight: 600; font-size: 1.15rem; margin-left: .5em; font-variant-numeric: tabular-nums; }
+.lv-more { min-height: 1.5em; } .lv-did { border-left: 4px solid var(--ps-line); padding-left: 10px; margin-top: 8px; }
+.lv-group h3 { font-size: 1rem; line-height: 1.4rem; font-weight: 600; margin: 0; }
 .lv-group { margin-bottom: 8px; } .lv ul, .lv ol { list-style: none; margin: 0; padding: 0; }
 .lv-bar { display: grid; grid-template-columns: minmax(7em, 11em) 1fr 3.2em; gap: 8px; align-items: center; line-height: 1.35rem; }
 .lv-bar > i { display: block; height: 12px; background: var(--ps-soft); border-radius: 4px; overflow: hidden; border: 1px solid var(--ps-line); }
 .lv-bar > i > b { display: block; height: 100%; width: 100%; transform: scaleX(0); transform-origin: left; }
 .lv-bar > span:last-child { text-align: right; font-variant-numeric: tabular-nums; }
 .lv-bar.lv-best > span { font-weight: 700; }
-.lv-list { max-height: 236px; overflow-y: auto; } .lv-list li { display: flex; gap: 10px; flex-wrap: wrap; padding: 3px 0; border-bottom: 1px solid var(--ps-line); }
+.lv-list { max-height: 168px; overflow-y: auto; } .lv-list li { display: flex; gap: 2px 10px; flex-wrap: wrap; padding: 3px 0; border-bottom: 1px solid var(--ps-line); }
 .lv-list li > :nth-child(1) { min-width: 5.2em; font-variant-numeric: tabular-nums; color: var(--ps-dim); }
 .lv-dim { color: var(--ps-dim); } .lv-hidden { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); white-space: nowrap; }
-@media (max-width: 900px) { .lv { grid-template-columns: minmax(0, 1fr); } }
+body.body--dark .q-field { --q-negative: #ffa08c !important; }
+@media (max-width: 900px) { .lv, .lv-now { grid-template-columns: minmax(0, 1fr); } .lv { gap: 12px; } }
+@media (max-width: 500px) { .lv > section { padding: 10px; } .lv-top { gap: 12px; } .lv-face { width: 116px; } }
 @media (prefers-reduced-motion: no-preference) {
   .lv-face[data-eyes=green] .lv-eye-light { animation: lv-glow 1.1s ease-in-out infinite alternate; }
   .lv-face[data-eyes=red] .lv-eye-light { animation: lv-glow .5s ease-in-out infinite alternate; } }
 @keyframes lv-glow { from { opacity: .75 } to { opacity: 1 } }`;
 
 export default {
-  // The slot is moved below the current event.
-  template: '<div><div ref="below"><slot></slot></div></div>',
-  props: { words: Object, affects: Object, signs: Object, colours: Object, lines: Array, locale: String, sameClock: Boolean, start: Object },
+  // The slots are moved beside the current event, and below the time line.
+  template: '<div><div ref="beside"><slot></slot></div><div ref="log"><slot name="log"></slot></div></div>',
+  props: { words: Object, gestures: Object, affects: Object, signs: Object, colours: Object, lines: Array, locale: String, sameClock: Boolean, start: Object },
   mounted() {
     if (!document.getElementById("lv-css")) {
       const css = el("style", "", CSS);
@@ -78,7 +81,7 @@ export default {
     this.scene(this.start);
     this.resizer = new ResizeObserver(() => {
       // A canvas is cleared when its size changes: draw it in the same frame.
-      if (this.n.signals.parentElement.clientWidth !== this.wide) { this.size(); this.paint(); }
+      if (this.$el.clientWidth !== this.wide) { this.size(); this.paint(); }
     });
     this.resizer.observe(this.$el);
     this.lights = new MutationObserver(() => { this.inks(); this.draw(); });
@@ -109,42 +112,40 @@ export default {
         root.append(s);
         return s;
       };
-      const signals = section(w.signals, "", "signals");
-      n.signals = el("canvas");
-      n.signals.setAttribute("role", "img");
-      n.latency = el("p", "lv-dim");
-      n.latency.dataset.test = "latency";
-      signals.append(n.signals, n.latency);
-
-      const now = section(w.now, "", "now"), top = el("div", "lv-top"), texts = el("div");
+      const folding = (parent, open) => {
+        const box = el("details"), head = el("summary");
+        box.open = open;
+        head.append(parent.querySelector("h2"));
+        box.append(head);
+        parent.append(box);
+        box.addEventListener("toggle", () => { this.listed = false; this.size(); this.paint(); });
+        return box;
+      };
+      const now = section(w.now, "lv-wide", "now"), grid = el("div", "lv-now"), top = el("div", "lv-top"), texts = el("div");
+      now.querySelector("h2").className = "lv-hidden";
       n.face = el("div", "lv-face");
       n.face.dataset.test = "eyes";
       n.face.setAttribute("role", "img");
-      n.state = el("div", "lv-state");
+      n.state = el("div", "lv-line");
       n.state.dataset.test = "state";
-      n.event = el("div", "lv-event");
-      n.event.dataset.test = "event";
       n.badge = el("span", "lv-badge");
       n.badge.dataset.test = "affect";
-      n.eyes = el("div", "lv-dim");
-      texts.append(n.state, n.event, n.badge, n.eyes);
+      n.sure = el("span", "lv-sure");
+      n.sure.dataset.test = "sure";
+      n.about = el("div", "lv-dim lv-more");
+      n.about.dataset.test = "about";
+      n.eyes = el("div", "lv-more");
+      n.eyes.dataset.test = "reaction";
+      n.did = el("div", "lv-did");
+      n.did.dataset.test = "really";
+      const affect = el("div");
+      affect.append(n.badge, n.sure);
+      texts.append(n.state, affect, n.about, n.eyes, n.did);
       top.append(n.face, texts);
-      const voices = el("div", "lv-voices");
-      for (const [key, title] of [["network", w.network], ["gate", w.gate]]) {
-        const box = el("div");
-        box.dataset.test = key;
-        n[key] = el("p", "");
-        box.append(el("h3", "", title), n[key]);
-        voices.append(box);
-      }
       n.spoken = el("p", "lv-hidden");
       n.spoken.setAttribute("aria-live", "polite");
-      now.append(top, this.$refs.below, voices, n.spoken);
-      const chances = el("h2", "", w.chances);
-      chances.style.marginTop = "14px";
-      n.bars = el("div");
-      n.bars.dataset.test = "bars";
-      now.append(chances, n.bars);
+      grid.append(top, this.$refs.beside);
+      now.append(grid, n.spoken);
 
       const line = section(w.timeline, "lv-wide", "timeline");
       n.strip = el("canvas");
@@ -154,18 +155,32 @@ export default {
       n.list.dataset.test = "events";
       n.list.setAttribute("tabindex", "0");
       n.list.setAttribute("aria-label", w.events);
-      n.mark = el("p", "lv-dim", w.gate_mark);
-      line.append(n.strip, n.mark, n.list);
+      n.mark = el("p", "lv-dim");
+      line.append(n.strip, n.mark, n.list, this.$refs.log);
+
+      const chances = folding(section(w.chances, "", "chances"), true);
+      n.bars = el("div");
+      n.bars.dataset.test = "bars";
+      chances.append(el("p", "lv-dim", w.chances_about), n.bars);
+
+      n.fold = folding(section(w.signals, "", "signals"), innerWidth > NARROW);
+      n.signals = el("canvas");
+      n.signals.setAttribute("role", "img");
+      n.latency = el("p", "lv-dim");
+      n.latency.dataset.test = "latency";
+      n.fold.append(n.signals, n.latency);
       this.$el.append(root);
     },
     inks() {
+      this.fresh = true;
       const css = getComputedStyle(document.body), get = (name) => css.getPropertyValue(name).trim();
       this.ink = { ink: get("--ps-ink"), dim: get("--ps-dim"), line: get("--ps-line"), soft: get("--ps-soft"), dark: document.body.classList.contains("body--dark") };
     },
     size() {
-      this.wide = this.n.signals.parentElement.clientWidth;
+      this.wide = this.$el.clientWidth;
+      this.fresh = true;
       const fit = (canvas, height) => {
-        const ratio = window.devicePixelRatio || 1, width = canvas.parentElement.clientWidth - 28;
+        const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth;
         canvas.width = Math.max(1, Math.round(width * ratio));
         canvas.height = Math.round(height * ratio);
         canvas.style.height = `${height}px`;
@@ -173,24 +188,25 @@ export default {
         return { width, height };
       };
       this.signalsAt = fit(this.n.signals, Math.max(2, this.channels.length) * this.lane + 24);
-      this.stripAt = fit(this.n.strip, 96);
+      this.stripAt = fit(this.n.strip, STRIP + (this.person ? DID : 0));
     },
     scene(s) {
       if (this.gone) return;
       this.stats.scenes++;
-      Object.assign(this, { channels: s.channels, classes: s.classes, windowS: s.window, stripS: s.strip, gateRules: s.gate_rules });
+      Object.assign(this, { channels: s.channels, classes: s.classes, windowS: s.window, stripS: s.strip, gateRules: s.gate_rules, layout: s.layout, numbers: s.numbers, person: s.person });
       this.lane = Math.min(140, Math.max(50, Math.round(600 / Math.max(4, s.channels.length))));
       this.xs = [];
       this.ys = this.channels.map(() => []);
       this.range = this.channels.map(() => null);
       this.spans = new Map();
+      this.did = [];
       this.t = 0;
       this.chances = null;
-      this.now = { running: false, message: "", state: "", gate: null, event: null, eyes: "off", sound: "" };
-      this.net = null;
-      this.names = Object.fromEntries(this.classes.map((c) => [c.label, c.name]));
+      this.now = { kind: "stopped", why: "", eyes: "off", sound: "", next: "" };
+      this.nowDrawn = this.listed = false;
       this.n.signals.setAttribute("aria-label", fill(this.words.signals_label, { n: this.channels.length, s: s.window }));
-      this.n.mark.hidden = !this.gateRules;
+      say(this.n.mark, [this.person ? this.words.did_row : "", this.gateRules ? this.words.gate_mark : this.words.gate_none].filter(Boolean).join(" "));
+      this.n.mark.hidden = !this.channels.length;
       this.buildBars();
       this.inks();
       this.size();
@@ -211,7 +227,7 @@ export default {
           track.setAttribute("aria-hidden", "true");
           bar.style.background = this.colours[affect];
           track.append(bar);
-          row.append(el("span", "", c.name), track, share);
+          row.append(el("span", "", this.name(c.label)), track, share);
           list.append(row);
           this.bars[i] = { row, bar, share, at: -1 };
         }
@@ -246,6 +262,7 @@ export default {
       if (m.lat !== undefined) this.decided = m.lat;
       if (m.x && m.x.length) {
         this.stats.samples += m.x.length;
+        this.fresh = true;
         this.xs.push(...m.x);
         m.y.forEach((column, i) => this.ys[i].push(...column));
         const from = this.xs[this.xs.length - 1] - this.windowS;
@@ -254,8 +271,8 @@ export default {
         // Cut rarely and many samples at once: it costs as much for one as for fifty.
         if (cut > 50 || this.xs.length > 5000) for (const column of [this.xs, ...this.ys]) column.splice(0, cut);
       }
-      this.chances = m.p || null;
-      if (m.net) this.net = m.net;
+      if (m.p !== undefined) this.chances = m.p;
+      if (m.did) this.did = [...this.did, ...m.did].slice(-100);
       if (m.spans) {
         for (const s of m.spans) {
           this.speakEvent(s, this.spans.get(s.id), first);
@@ -265,7 +282,7 @@ export default {
         this.listed = false;
       }
       if (m.now) {
-        if (!first && (m.now.state !== this.now.state || m.now.running !== this.now.running)) this.speak(this.stateWords(m.now));
+        if (!first && m.now.kind !== this.now.kind && !QUIET.includes(m.now.kind)) this.speak(this.lineOf(m.now));
         this.now = m.now;
         this.nowDrawn = false;
       }
@@ -288,7 +305,7 @@ export default {
       });
     },
     paint() {
-      this.drawSignals();
+      if (this.n.fold.open && this.fresh) this.drawSignals();
       this.drawStrip();
       this.showNow();
       this.showBars();
@@ -299,7 +316,7 @@ export default {
       const sorted = [...this.stats.delays].slice(-200).sort((a, b) => a - b);
       const p95 = sorted.length ? sorted[Math.min(sorted.length - 1, Math.floor(0.95 * sorted.length))] : null;
       const w = this.words, parts = [];
-      if (this.now.running) {
+      if (this.now.kind !== "stopped") {
         if (this.decided !== undefined) parts.push(fill(w.latency_decision, { ms: this.number(this.decided) }));
         if (p95 !== null && p95 >= 0) parts.push(fill(this.sameClock ? w.latency_page : w.latency_page_most, { ms: this.number(p95) }));
       }
@@ -312,6 +329,7 @@ export default {
 
     // Drawing ----------------------------------------------------------------------------------------------------
     drawSignals() {
+      this.fresh = false;
       const { width, height } = this.signalsAt, c = this.n.signals.getContext("2d"), k = this.ink;
       c.clearRect(0, 0, width, height);
       const left = Math.min(150, width * 0.3), right = width - 4, lane = this.lane, bottom = this.channels.length * lane;
@@ -368,8 +386,8 @@ export default {
       });
     },
     drawStrip() {
-      const { width } = this.stripAt, c = this.n.strip.getContext("2d"), k = this.ink;
-      c.clearRect(0, 0, width, 96);
+      const { width, height } = this.stripAt, c = this.n.strip.getContext("2d"), k = this.ink, shift = height - STRIP;
+      c.clearRect(0, 0, width, height);
       const begin = this.t - this.stripS, x = (s) => ((s - begin) / this.stripS) * width;
       c.font = "12px sans-serif";
       c.textAlign = "center";
@@ -377,17 +395,29 @@ export default {
         c.strokeStyle = k.line;
         c.beginPath();
         c.moveTo(x(s), 0);
-        c.lineTo(x(s), 74);
+        c.lineTo(x(s), height - 22);
         c.stroke();
         c.fillStyle = k.dim;
-        if (x(s) > 14 && x(s) < width - 14) c.fillText(`${s} s`, x(s), 90);
+        if (x(s) > 14 && x(s) < width - 14) c.fillText(`${s} s`, x(s), height - 6);
       }
       c.textAlign = "left";
       const ends = [-1, -1];
+      let last = -1;
+      for (const d of this.did) {
+        if (d.to < begin) continue;
+        const a = Math.max(x(d.from), 0), b = Math.max(x(Math.min(d.to, this.t)), a + 3), label = this.name(d.label);
+        c.fillStyle = k.dim;
+        c.fillRect(a, 4, b - a, 5);
+        const wide = c.measureText(label).width, at = Math.min(a, width - wide);
+        if (at > last) {
+          c.fillText(label, at, 22);
+          last = at + wide + 6;
+        }
+      }
       for (const s of this.spans.values()) {
         const to = s.to === null ? this.t : s.to;
         if (to < begin) continue;
-        const row = s.id % 2, top = 4 + row * 36, a = Math.max(x(s.from), 0), b = Math.max(x(to), a + 3);
+        const row = s.id % 2, top = shift + 4 + row * 36, a = Math.max(x(s.from), 0), b = Math.max(x(to), a + 3);
         c.fillStyle = this.colours[s.affect || "none"];
         c.fillRect(a, top, b - a, 12);
         if (s.source === "gate") {
@@ -409,26 +439,30 @@ export default {
       }
     },
     showNow() {
-      if (!this.net && !this.now) return;
-      const w = this.words, now = this.now, net = this.net, e = now.event;
-      // The answer of the network changes at every step; the rest is drawn only after a change.
-      if (net && now.running && (now.state === "tracking" || now.state === "warming")) {
-        const answer = w[`answer_${net.answer || "none"}`];
-        say(this.n.network, net.answer === null ? w.answer_none : fill(answer, { gesture: this.names[net.gesture] || net.gesture || "", sure: net.sure, affect: this.affectText(net.affect) }));
-      } else say(this.n.network, now.running ? w.answer_none : "–");
-      const g = now.gate;
-      if (!this.gateRules) say(this.n.gate, w.gate_none);
-      else if (!g) say(this.n.gate, w.gate_quiet);
-      else say(this.n.gate, fill(w.gate_ago, { what: [this.affectText(g.affect), this.names[g.gesture] || g.gesture].filter(Boolean).join(", "), s: Math.max(0, Math.round(this.t - g.t)) }));
+      const w = this.words, now = this.now;
+      if (this.person) {
+        // A gesture begins and ends by the clock of the toy, without a message.
+        const made = this.did.findLast((d) => d.from <= this.t && this.t <= d.to);
+        const doing = made ? this.name(made.label) : now.next ? fill(w.really_next, { gesture: this.name(now.next) }) : w.really_nothing;
+        say(this.n.did, `${w.really} ${now.kind === "stopped" ? "–" : doing}`);
+        this.n.did.dataset.label = made ? made.label : "";
+      }
       if (this.nowDrawn) return;
       this.nowDrawn = true;
-      say(this.n.state, this.stateWords(now));
-      this.n.state.dataset.state = now.running ? now.state : "stopped";
-      say(this.n.event, e ? this.nameOf(e) : w.nothing);
-      this.n.event.dataset.label = e && e.gesture ? e.gesture : "";
-      this.n.badge.style.visibility = e ? "visible" : "hidden";
-      if (e) this.badge(this.n.badge, e.affect);
-      const eyes = EYES[now.eyes] ? now.eyes : "off", text = w[`eyes_${eyes}`] + (now.sound ? ` · ♪ ${now.sound}` : "");
+      this.n.did.hidden = !this.person;
+      const event = now.kind === "event";
+      say(this.n.state, this.lineOf(now));
+      Object.assign(this.n.state.dataset, { kind: now.kind, label: (event && now.gesture) || "" });
+      this.n.badge.hidden = this.n.sure.hidden = !event;
+      if (event) this.badge(this.n.badge, now.affect);
+      say(this.n.sure, event && now.confidence !== null ? `${now.confidence} %` : "");
+      const about = event ? w[now.source === "gate" ? "by_gate" : "by_network"] : fill(w[`about_${now.kind}`] || "", { layout: this.layout, n: this.numbers });
+      say(this.n.about, now.why || about);
+      const eyes = EYES[now.eyes] ? now.eyes : "off", parts = [w[`eyes_${eyes}`]];
+      if (now.sound) parts.push(`♪ ${w[`sound_${now.sound}`] || now.sound}`);
+      if (now.quiet) parts.push(w[`quiet_${now.quiet}`]);
+      else if (!event && now.reacts_to) parts.push(fill(w.reacts_to, { what: this.affects[now.reacts_to] || this.name(now.reacts_to) }));
+      const text = parts.join(" · ");
       if (this.n.face.dataset.eyes !== eyes) {
         this.n.face.dataset.eyes = eyes;
         this.n.face.innerHTML = face(eyes);
@@ -461,16 +495,19 @@ export default {
         Object.assign(row.dataset, { id: s.id, affect: s.affect, gesture: s.gesture || "", from: s.from, to: s.to === null ? "" : s.to, source: s.source });
         const seconds = (v) => v.toLocaleString(this.locale, { minimumFractionDigits: 1, maximumFractionDigits: 1 });
         row.append(el("span", "", `${seconds(s.from)} s`), this.badge(el("span", "lv-badge"), s.affect), el("b", "", this.nameOf(s)),
-          el("span", "", s.to === null ? w.lasting : `${seconds(s.to - s.from)} s`), el("span", "lv-dim", s.source === "gate" ? w.by_gate : w.by_network));
+          el("span", "", s.sure === null ? "" : `${s.sure} %`), el("span", "", s.to === null ? w.lasting : `${seconds(s.to - s.from)} s`),
+          el("span", "lv-dim", [s.source === "gate" ? w.by_gate : w.by_network, this.reactionOf(s)].filter(Boolean).join(" · ")));
         return row;
       }));
     },
 
     // Texts -----------------------------------------------------------------------------------------------
-    nameOf(s) { return s.gesture ? this.names[s.gesture] || s.gesture : this.words.some_gesture; },
-    affectText(affect) { const key = affect || "none"; return `${this.signs[key]} ${this.affects[key]}`; },
-    stateWords(now) {
-      return now.running ? this.words[`state_${now.state.replace(" ", "_")}`] || "" : this.words.state_stopped;
+    name(label) { return this.gestures[label] || label; },
+    nameOf(s) { return s.gesture ? this.name(s.gesture) : this.words.some_gesture; },
+    lineOf(now) { return now.kind === "event" ? this.nameOf(now) : this.words[`state_${now.kind}`]; },
+    reactionOf(s) {
+      if (!s.eyes) return "";
+      return [this.words[`eyes_${s.eyes}`], s.sound && (this.words[`sound_${s.sound}`] || s.sound)].filter(Boolean).join(", ");
     },
     speakEvent(s, before, first) {
       if (first || s.to !== null || (before && before.gesture === s.gesture)) return;

@@ -4,249 +4,38 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from nicegui import context, ui
-from nicegui.element import Element
-from nicegui.events import GenericEventArguments
 
-from plushsense.core.errors import PlushSenseError
+from plushsense.core.errors import BundleError, ConfigError, PlushSenseError
 from plushsense.live.reactions import reaction_names
 from plushsense.recording.recorder import is_virtual
-from plushsense.runtime.decisions import DecideSpec
-from plushsense.studio.app.guard import is_loopback
-from plushsense.studio.app.shell import (
-    AFFECT_COLOURS,
-    AFFECT_SIGNS,
-    LINES,
-    Page,
-    button,
-    on_change,
-    query,
-    query_path,
-    tag,
-)
+from plushsense.studio.app.shell import Page, button, named, on_change, query, query_path, tag
 from plushsense.studio.app.toys import Toys
-from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import VIRTUAL, Workspace
 from plushsense.studio.pages.live import clips_page, feedback_page
 from plushsense.studio.pages.live.clips import Clips
-from plushsense.studio.pages.live.reader import EventSpan, LatestAnswer, LiveChoice, LiveReader, LiveState
+from plushsense.studio.pages.live.feed import PACE_S, RATES_HZ, Feed, LiveView, follow
+from plushsense.studio.pages.live.log import LogButtons
+from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.state import LiveChoice
+from plushsense.studio.widgets.elements import summary
 
-WINDOW_S = 8.0
-"""Length of the displayed signals, in seconds."""
-STRIP_S = 60.0
-"""Length of the time line of events, in seconds."""
-PACE_S = 0.04
-"""Minimum time between two messages to a page; less than the 50 ms between two decisions in real time."""
-_MAX_BEHIND = 60
-"""Number of unconfirmed messages after which sending pauses; a page confirms messages about once a second."""
-
-Message = dict[str, Any]
-
-
-class Feed:
-    """Source of the messages for one page; it tracks what was sent and whether the page keeps up. Not thread-safe.
-
-    Attributes:
-        hidden: whether the page is in the background. It is then sent nothing, and afterwards the whole state.
-        away: whether the connection is lost, which has the same effect.
-    """
-
-    def __init__(self, reader: LiveReader) -> None:
-        self._reader = reader
-        self.hidden = self.away = False
-        self._generation = -1
-        self._place = 0
-        self._change = 0
-        self._sent = self._seen = 0
-        self._last = 0.0
-        self._rare: tuple[Any, ...] = ()
-        self._round_ms: float | None = None
-        self._watched: tuple[int, float] | None = None
-
-    def wait_s(self) -> float:
-        """Return the number of seconds until the next message may be sent."""
-        return max(0.0, self._last + PACE_S - time.perf_counter())
-
-    @property
-    def holds(self) -> bool:
-        """True if no message should be sent now, because the page is hidden, disconnected or too far behind."""
-        return self.hidden or self.away or self._sent - self._seen > _MAX_BEHIND
-
-    def seen(self, number: int) -> None:
-        """Record that the page has drawn message ``number``."""
-        if self._watched is not None and number >= self._watched[0]:
-            self._round_ms = 1000.0 * (time.perf_counter() - self._watched[1])
-            self._watched = None
-        self._seen = max(self._seen, number)
-
-    def again(self) -> None:
-        """Make the next message contain the whole state, after the page was hidden or disconnected."""
-        self._generation = -1
-        self._seen = self._sent
-
-    def scene(self) -> Message:
-        """Return the whole state, for a page that opens or becomes visible, or after a change of toy or bundle."""
-        reader = self._reader
-        now, device, bundle = reader.now, reader.device, reader.bundle
-        self._generation = now.generation
-        self._change = 0
-        scene: Message = {"window": WINDOW_S, "strip": STRIP_S, "simulated": reader.choice.simulated}
-        scene |= {"channels": [], "classes": [], "gate_rules": 0}
-        self._place = 0
-        if device is not None and bundle is not None:
-            channels = device.layout.channels
-            scene["channels"] = [
-                {"name": c.name, "unit": c.unit, "step": c.step, "offset": c.offset, "scale": c.scale} for c in channels
-            ]
-            scene["classes"] = [{"label": g.label, "affect": g.affect} for g in bundle.gestures.gestures]
-            scene["gate_rules"] = len(DecideSpec.from_dict(bundle.decision).gate.rules)
-            self._place = max(0, device.buffer.count - int(WINDOW_S * device.layout.rate_hz))
-        self._rare = ()
-        return scene | {"first": self._message(now)}
-
-    def message(self) -> tuple[str, Message] | None:
-        """Return the method to call in the browser and its argument, or None if nothing should be sent."""
-        if self.holds:
-            return None
-        now = self._reader.now
-        self._last = time.perf_counter()
-        if now.generation != self._generation:
-            return "scene", self.scene()
-        return "update", self._message(now)
-
-    def _message(self, now: LiveState) -> Message:
-        device = self._reader.device
-        self._sent += 1
-        if self._watched is None:
-            self._watched = (self._sent, time.perf_counter())
-        message: Message = {
-            "n": self._sent,
-            "t": round(now.t_s, 3),
-            "at": round(1000.0 * now.arrived, 2),
-            "out": round(1000.0 * time.time(), 2),
-        }
-        if device is not None:
-            piece = device.buffer.since(self._place, int(WINDOW_S * device.layout.rate_hz))
-            self._place = piece.end
-            message["x"] = [round(s, 3) for s in piece.seconds.tolist()]
-            message["y"] = piece.values.astype(int).T.tolist()
-        if now.probabilities is not None:
-            # Integer thousandths are precise enough for the length of a bar.
-            message["p"] = [round(1000.0 * p) for p in now.probabilities]
-        if now.network is not None:
-            message["net"] = _answer(now.network)
-        if now.latency_s is not None:
-            message["lat"] = round(1000.0 * now.latency_s, 2)
-        if self._round_ms is not None:
-            message["round"] = round(self._round_ms, 1)
-        if now.changes > self._change:
-            message["spans"] = [_span(s) for s in self._reader.spans(self._change)]
-            self._change = now.changes
-        # These values change rarely, so they are sent only after a change.
-        rare = (now.running, now.message, now.state, now.gate, now.event, now.reaction)
-        if rare != self._rare:
-            self._rare = rare
-            message["now"] = {
-                "running": now.running,
-                "message": now.message,
-                "state": now.state,
-                "gate": _answer(now.gate),
-                "event": None if now.event is None else _span(now.event),
-                "eyes": now.reaction.eyes if now.reaction else "off",
-                "sound": now.reaction.sound if now.reaction else "",
-            }
-        return message
-
-
-def _answer(answer: LatestAnswer | None) -> Message | None:
-    if answer is None:
-        return None
-    return {
-        "t": round(answer.t_s, 2),
-        "affect": answer.affect,
-        "gesture": answer.gesture,
-        "sure": None if answer.confidence is None else round(100.0 * answer.confidence),
-        "answer": answer.answer,
-    }
-
-
-def _span(span: EventSpan) -> Message:
-    return {
-        "id": span.number,
-        "from": round(span.begin_s, 2),
-        "to": None if span.end_s is None else round(span.end_s, 2),
-        "affect": span.affect,
-        "gesture": span.gesture,
-        "source": span.source,
-    }
-
-
-class LiveView(Element, component="live_view.js"):
-    """Browser component that displays the messages of ``feed``, with texts from ``words``.
-
-    Elements that are added to it are displayed below the current event.
-    """
-
-    def __init__(self, words: Words, feed: Feed) -> None:
-        super().__init__()
-        self._feed, self._words = feed, words
-        self._props.update(
-            words=words.table("live"),
-            affects={key: words.affect(key) for key in AFFECT_COLOURS},
-            signs=dict(AFFECT_SIGNS),
-            colours=dict(AFFECT_COLOURS),
-            lines=list(LINES),
-            locale=words.language,
-            # Latency can be measured only if browser and studio use the same clock.
-            sameClock=is_loopback(context.client.ip),
-            start=self._named(feed.scene()),
-        )
-        self.classes("w-full")
-        self.on("seen", self._seen)
-        self.on("visible", self._visible)
-
-    def push(self) -> None:
-        """Send the next message to the browser, if there is one."""
-        if (due := self._feed.message()) is not None:
-            method, message = due
-            self.run_method(method, self._named(message) if method == "scene" else message)
-
-    def _named(self, scene: Message) -> Message:
-        """Add to ``scene`` the names of the gestures in the language of the page."""
-        for gesture in scene["classes"]:
-            gesture["name"] = self._words.gesture(gesture["label"])
-        return scene
-
-    def _seen(self, event: GenericEventArguments) -> None:
-        held_back = self._feed.holds
-        self._feed.seen(int(event.args["n"]))
-        if held_back:
-            # If the toy has stopped sending, no change would trigger the withheld message, so send it now.
-            self.push()
-
-    def _visible(self, event: GenericEventArguments) -> None:
-        visible = bool(event.args["on"])
-        if visible and self._feed.hidden:
-            self._feed.hidden = False
-            self._feed.again()
-            self.push()
-        self._feed.hidden = not visible
-
-
-_GRID = "display: grid; grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); gap: 12px"
+_GRID = "display: grid; grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); gap: 12px; margin-top: 8px"
+_OF_NETWORK = ("no_network", "no_common_gesture", "layouts_differ")
+"""Reasons of errors that belong to the field of the network."""
 
 
 def show(page: Page) -> None:
     """Build the page."""
     reader = page.workspace.part(LiveReader)
     words = page.words
+    feed = Feed(reader, words.error)
     with ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap"):
-        _controls(page, reader)
+        _Controls(page, reader, feed)
     simulated = tag(ui.label(words("shell.simulation")).classes("ps-message ps-message-warning w-full"), "simulation")
 
     def update_mark() -> None:
@@ -254,161 +43,202 @@ def show(page: Page) -> None:
 
     on_change(reader.changed, update_mark)
     update_mark()
-    feed = Feed(reader)
-    view = LiveView(words, feed)
+    view, people = LiveView(words, feed), feedback_page.PersonFields(page, reader)
     with view:
-        feedback_page.show(page, reader)
-    _follow(view, feed, reader)
-    clips_page.show(page, reader)
+        _person_panel(page, reader)
+        feedback_page.show(page, reader, people)
+    with view.add_slot("log"):
+        log = LogButtons(page, reader)
+    follow(view, feed, reader)
+    clips_page.show(page, reader, people)
+    log.add_sheet()
     clips = page.workspace.part(Clips)
     context.client.on_delete(reader.add_viewer(lambda: bool(clips.recording)))
 
 
-def _follow(view: LiveView, feed: Feed, reader: LiveReader) -> None:
-    """Push a message to the view after each change, at most every `PACE_S`, and not while it is disconnected."""
-    client = context.client
-    loop = asyncio.get_running_loop()
-    timer: asyncio.TimerHandle | None = None
+def _person_panel(page: Page, reader: LiveReader) -> None:
+    """Add the buttons that direct the person of a virtual toy; they are hidden for any other toy."""
+    words = page.words
+    box = named(ui.element("div").props("role=group").classes("w-full"), words("live.person_title"))
+    with tag(box, "virtual-person"):
+        ui.label(words("live.person_title")).classes("text-bold")
+        buttons = ui.row().classes("w-full ps-small-gap q-mt-xs")
 
-    def push() -> None:
-        nonlocal timer
-        timer = None
-        if not client.has_socket_connection:
-            feed.away = True
-            return
-        with client:
-            view.push()
-
-    def update() -> None:
-        nonlocal timer
-        if timer is not None:
-            return
-        if (wait_s := feed.wait_s()) > 0.0:
-            timer = loop.call_later(wait_s, push)
-        else:
-            push()
-
-    def connected() -> None:
-        if feed.away:
-            feed.away = False
-            feed.again()
-        push()
-
-    def deleted() -> None:
-        if timer is not None:
-            timer.cancel()
-
-    on_change(reader.changed, update)
-    client.on_connect(connected)
-    client.on_delete(deleted)
-
-
-def _controls(page: Page, reader: LiveReader) -> None:  # noqa: C901
-    words, workspace = page.words, page.workspace
-    toys = workspace.part(Toys)
-    choice = reader.choice
-    bundles = {str(path): path.stem for path in workspace.bundles()}
-    chosen = str(choice.bundle) if choice.bundle else None
-    if chosen is None or (query().get("model") and not reader.now.running):
-        chosen = query_path(workspace, "model", bundles) or None
-    first = choice.toy if reader.now.running else workspace.toy or VIRTUAL
-    with ui.element("div").classes("w-full").style(_GRID):
-        toy = ui.select(
-            _toy_options(toys, workspace, first),
-            value=first,
-            label=words("live.toy"),
-            with_input=True,
-            new_value_mode="add-unique",
-        )
-        tag(toy.props(f'hint="{words("live.toy_hint")}"'), "toy")
-        bundle = tag(ui.select(bundles, value=chosen, label=words("live.bundle")), "bundle")
-        engines = {"float": words("live.engine_float"), "int8": words("live.engine_int8")}
-        engine = tag(ui.select(engines, value=choice.engine, label=words("live.engine")), "engine")
-        names = {"": words("live.reactions_none")}
-        names |= {name: words.get(f"live.reactions_{name}", name) for name in reaction_names()}
-        reactions = tag(ui.select(names, value=choice.reactions, label=words("live.reactions")), "reactions")
-    with ui.row().classes("w-full items-center ps-small-gap"):
-        start = button("start", words("live.start"), None, "unelevated", icon="play_arrow")
-        stop = button("stop", words("live.stop"), icon="stop")
-        look = button("look", words("live.look"), toys.search, "flat", icon="search")
-        virtual = tag(ui.checkbox(words("live.simulated"), value=choice.simulated), "simulated")
-        busy = tag(ui.spinner(size="1.6em").props("aria-hidden=true"), "busy")
-    busy.set_visibility(False)
-
-    async def run(command: Callable[..., None], *args: Any) -> bool:
-        """Run ``command`` in a thread, show its errors on the page, and return whether it succeeded."""
-        busy.set_visibility(True)
-        page.say("")
-        done = False
+    def direct(label: str | None) -> None:
         with page.show_errors():
-            await asyncio.to_thread(command, *args)
-            done = True
-        busy.set_visibility(False)
-        return done
+            reader.direct(label)
 
-    async def begin() -> None:
-        with page.show_errors():
-            url = toys.choose(str(toy.value or ""))
-            path = Path(bundle.value) if bundle.value else None
-            await run(reader.start, LiveChoice(url, path, engine.value, reactions.value, bool(virtual.value)))
-
-    async def change() -> None:
-        # Also called when this page displays the choice made in another tab; then there is nothing to do.
-        now = reader.choice
-        selection = (Path(bundle.value) if bundle.value else None, engine.value, reactions.value)
-        if selection != (now.bundle, now.engine, now.reactions) and not await run(reader.choose, *selection):
-            follow()
-
-    def follow() -> None:
-        """Display the current choice, which may have been made in another tab."""
-        now = reader.choice
-        if now.bundle is not None:
-            if str(now.bundle) not in bundles:
-                bundles[str(now.bundle)] = now.bundle.stem
-                bundle.set_options(bundles)
-            bundle.set_value(str(now.bundle))
-        engine.set_value(now.engine)
-        reactions.set_value(now.reactions)
-        if reader.now.running:
-            toy.set_options(_toy_options(toys, workspace, now.toy), value=now.toy)
-            virtual.set_value(now.simulated)
-
-    state: tuple[Any, ...] = ("",)
+    labels: tuple[str, ...] | None = None
 
     def update() -> None:
         # Called after every decision, mostly without a change.
-        nonlocal state
-        message, running = reader.now.problem or reader.now.message, reader.now.running
-        if (message, running, reader.choice) == state:
+        nonlocal labels
+        bundle = reader.bundle if reader.person is not None else None
+        now = () if bundle is None else tuple(g.label for g in bundle.gestures.gestures if not g.idle)
+        if now == labels:
             return
-        start.set_visibility(not running)
-        stop.set_visibility(running)
-        for control in (toy, look, virtual):
-            control.set_enabled(not running)
-        if message or state[0]:
-            page.say(message, "warning")
-        state = (message, running, reader.choice)
-        follow()
+        labels = now
+        box.set_visibility(bool(now))
+        buttons.clear()
+        with buttons:
+            for label in now:
+                button(f"do-{label}", words.gesture(label), lambda label=label: direct(label), "outline dense").classes(
+                    "ps-note"
+                )
+            button(
+                "do-nothing", words("live.person_stop"), lambda: direct(""), "outline dense", icon="front_hand"
+            ).classes("ps-note")
+            button("do-own", words("live.person_own"), lambda: direct(None), "flat dense", icon="shuffle").classes(
+                "ps-note"
+            )
 
-    def update_toys() -> None:
-        busy.set_visibility(toys.searching)
-        if not reader.now.running:
-            toy.set_options(_toy_options(toys, workspace, str(toy.value or "")), value=toy.value)
-
-    def update_simulated() -> None:
-        if not reader.now.running:
-            with contextlib.suppress(PlushSenseError):
-                virtual.set_value(is_virtual(str(toy.value or "")))
-
-    start.on_click(begin)
-    stop.on_click(lambda: run(reader.stop))
-    toy.on_value_change(update_simulated)
-    for control in (bundle, engine, reactions):
-        control.on_value_change(change)
     on_change(reader.changed, update)
-    on_change(toys.changed, update_toys)
-    update_simulated()
     update()
+
+
+class _Controls:
+    """Fields for toy, network and settings, which are folded while a toy is read, and the buttons above them."""
+
+    def __init__(self, page: Page, reader: LiveReader, feed: Feed) -> None:
+        self._page, self._reader, self._feed = page, reader, feed
+        self._workspace, self._toys = page.workspace, page.workspace.part(Toys)
+        words, choice = page.words, reader.choice
+        self._state: tuple[Any, ...] = ()
+        with ui.row().classes("w-full items-center ps-small-gap"):
+            self._start = button("start", words("live.start"), self._begin, "unelevated", icon="play_arrow")
+            self._stop = button("stop", words("live.stop"), lambda: self._run(reader.stop), "unelevated", icon="stop")
+            self._fields = tag(ui.element("details").style("flex: 1 1 17rem; min-width: 0"), "settings")
+            self._busy = tag(ui.spinner(size="1.6em").props("aria-hidden=true"), "busy")
+        self._busy.set_visibility(False)
+        with self._fields:
+            self._title = summary("").classes("ps-break")
+            with ui.element("div").classes("w-full").style(_GRID):
+                self._add_toy(words("live.toy"))
+                self._bundles = {str(path): path.stem for path in self._workspace.bundles()}
+                chosen = str(choice.bundle) if choice.bundle else None
+                if chosen is None or (query().get("model") and not reader.now.running):
+                    chosen = query_path(self._workspace, "model", self._bundles) or None
+                self._bundle = tag(ui.select(self._bundles, value=chosen, label=words("live.bundle")), "bundle")
+                names = {"": words("live.reactions_none")}
+                names |= {name: words.get(f"live.reactions_{name}", name) for name in reaction_names()}
+                self._reactions = ui.select(names, value=choice.reactions, label=words("live.reactions"))
+                tag(self._reactions, "reactions")
+                engines = {"float": words("live.engine_float"), "int8": words("live.engine_int8")}
+                self._engine = tag(ui.select(engines, value=choice.engine, label=words("live.engine")), "engine")
+                self._add_rate("decision", lambda pace_s: setattr(feed, "decision_s", pace_s))
+                self._add_rate("plot", lambda pace_s: setattr(feed, "plot_s", pace_s))
+            self._rates = ui.label("").classes("ps-dim ps-note")
+            with ui.row().classes("w-full items-center ps-small-gap"):
+                self._look = button("look", words("live.look"), self._toys.search, "flat", icon="search")
+                virtual = ui.checkbox(words("live.simulated"), value=choice.simulated)
+                self._simulated = tag(virtual, "simulated")
+        self._toy.on_value_change(self._update_simulated)
+        for control in (self._bundle, self._engine, self._reactions):
+            control.on_value_change(self._change)
+        on_change(reader.changed, self._update)
+        on_change(self._toys.changed, self._update_toys)
+        self._update_simulated()
+        self._update()
+
+    def _add_toy(self, label: str) -> None:
+        reader, workspace = self._reader, self._workspace
+        first = reader.choice.toy if reader.now.running else workspace.toy or VIRTUAL
+        options = _toy_options(self._toys, workspace, first)
+        self._toy = ui.select(options, value=first, label=label, with_input=True, new_value_mode="add-unique")
+        tag(self._toy.props(f'hint="{self._page.words("live.toy_hint")}"'), "toy")
+
+    def _add_rate(self, name: str, choose: Callable[[float], None]) -> None:
+        """Add the choice of a rate at which this page displays something."""
+        words = self._page.words
+        most = RATES_HZ[-1]
+        rates = {n: words("live.rate", n=n) if n > 1 else words("live.rate_one") for n in RATES_HZ[::-1]}
+        field = ui.select(rates, value=most, label=words(f"live.rate_{name}"))
+        tag(field, f"rate-{name}").on_value_change(lambda e: choose(PACE_S if e.value == most else 1.0 / e.value))
+
+    async def _run(self, command: Callable[..., None], *args: Any) -> bool:
+        """Run ``command`` in a thread, show its errors beside the field, and return whether it succeeded."""
+        self._busy.set_visibility(True)
+        self._page.say("")
+        self._bundle.error = self._toy.error = None
+        done = False
+        with self._page.show_errors():
+            try:
+                await asyncio.to_thread(command, *args)
+                done = True
+            except PlushSenseError as refusal:
+                of_network = isinstance(refusal, BundleError) or refusal.reason in _OF_NETWORK
+                field = self._bundle if of_network else self._toy
+                field.error = self._page.words.error(refusal)
+                self._fields.props("open")
+                field.run_method("focus")
+        self._busy.set_visibility(False)
+        return done
+
+    async def _begin(self) -> None:
+        url, simulated = str(self._toy.value or ""), bool(self._simulated.value)
+        path = Path(self._bundle.value) if self._bundle.value else None
+
+        def start() -> None:
+            if not url.strip():
+                raise ConfigError("No toy is chosen: choose one first.", reason="no_toy")
+            chosen = LiveChoice(self._toys.choose(url), path, self._engine.value, self._reactions.value, simulated)
+            self._reader.start(chosen)
+
+        await self._run(start)
+
+    async def _change(self) -> None:
+        # Also called when this page displays the choice made in another tab; then there is nothing to do.
+        now = self._reader.choice
+        path = Path(self._bundle.value) if self._bundle.value else None
+        chosen = (path, self._engine.value, self._reactions.value)
+        if chosen != (now.bundle, now.engine, now.reactions) and not await self._run(self._reader.choose, *chosen):
+            self._follow()
+
+    def _follow(self) -> None:
+        """Display the current choice, which may have been made in another tab."""
+        now = self._reader.choice
+        if now.bundle is not None:
+            if str(now.bundle) not in self._bundles:
+                self._bundles[str(now.bundle)] = now.bundle.stem
+                self._bundle.set_options(self._bundles)
+            self._bundle.set_value(str(now.bundle))
+        self._engine.set_value(now.engine)
+        self._reactions.set_value(now.reactions)
+        if self._reader.now.running:
+            self._toy.set_options(_toy_options(self._toys, self._workspace, now.toy), value=now.toy)
+            self._simulated.set_value(now.simulated)
+
+    def _update(self) -> None:
+        # Called after every decision, mostly without a change.
+        reader, words = self._reader, self._page.words
+        running = reader.now.running
+        if (state := (running, reader.choice, reader.bundle)) == self._state:
+            return
+        if not self._state or self._state[0] != running:
+            self._fields.props(remove="open") if running else self._fields.props("open")
+        self._state = state
+        self._start.set_visibility(not running)
+        self._stop.set_visibility(running)
+        for control in (self._toy, self._look, self._simulated):
+            control.set_enabled(not running)
+        choice = reader.choice
+        now = f": {choice.toy} · {choice.bundle.stem}" if running and choice.bundle is not None else ""
+        self._title.set_content(words("live.settings") + now)
+        step_s = reader.bundle.arch.step * reader.bundle.layout.period_us / 1e6 if reader.bundle is not None else 0.05
+        self._rates.set_text(words("live.rate_about", n=words.number(1.0 / step_s)))
+        self._follow()
+
+    def _update_toys(self) -> None:
+        self._busy.set_visibility(self._toys.searching)
+        if not self._reader.now.running:
+            value = self._toy.value
+            self._toy.set_options(_toy_options(self._toys, self._workspace, str(value or "")), value=value)
+
+    def _update_simulated(self) -> None:
+        self._toy.error = None
+        if not self._reader.now.running:
+            with contextlib.suppress(PlushSenseError):
+                self._simulated.set_value(is_virtual(str(self._toy.value or "")))
 
 
 def _toy_options(toys: Toys, workspace: Workspace, url: str) -> dict[str, str]:

@@ -5,19 +5,20 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import ConfigError, DatasetError, PlushSenseError
+from plushsense.core.errors import ConfigError, DatasetError, DeviceError, PlushSenseError
 from plushsense.dataset.importing.sources import is_simulation
 from plushsense.deploy.quantize import classifier_of
 from plushsense.devices.opening import open_device, parse_url
+from plushsense.devices.virtual.stream import PerformedGesture, VirtualDevice
 from plushsense.live.loop import LiveRun
 from plushsense.live.loop import run_live as run_on
-from plushsense.live.reactions import Reaction, Reactor, load_reactions
+from plushsense.live.reactions import Reactor, load_reactions
 from plushsense.models.bundle import Bundle
 from plushsense.recording.recorder import is_virtual, with_speed
 from plushsense.recording.session_files import SessionHead
@@ -25,103 +26,21 @@ from plushsense.runtime.classifier import Decision, GestureEvent
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
-
-
-@dataclass(frozen=True)
-class LiveChoice:
-    """The toy, bundle, engine and reactions in use.
-
-    Attributes:
-        toy: URL of the toy.
-        engine: arithmetic of the network, "float" or "int8".
-        reactions: name of a set of reactions, or "" for none.
-        simulated: whether the toy is virtual, even if it is connected through a port.
-    """
-
-    toy: str = ""
-    bundle: Path | None = None
-    engine: str = "float"
-    reactions: str = "standard"
-    simulated: bool = False
-
-
-@dataclass(frozen=True)
-class LatestAnswer:
-    """Latest result of the network (at every step) or of the gate's rules (whenever a rule matches)."""
-
-    t_s: float
-    affect: str | None
-    gesture: str | None
-    confidence: float | None = None
-    answer: str | None = None
-
-
-@dataclass(frozen=True)
-class EventSpan:
-    """An event on the time line.
-
-    Attributes:
-        number: consecutive number from 1, continued when the bundle changes.
-        change: number of the latest change of this event; all changes of all events are numbered consecutively.
-        end_s: time of its end, None while it lasts.
-        named_s, closed_s: times at which its gesture and its end were reported, None before that.
-    """
-
-    number: int
-    change: int
-    begin_s: float
-    affect: str
-    gesture: str | None
-    source: str
-    end_s: float | None = None
-    named_s: float | None = None
-    closed_s: float | None = None
-
-
-@dataclass(frozen=True)
-class LiveState:
-    """State that pages display next to the signals. Times ``t_s`` are seconds by the toy's clock since it was opened.
-
-    Attributes:
-        generation: increases with every new toy or bundle; pages then redraw everything.
-        running: whether a toy is being read.
-        message: the reason why reading ended, or "".
-        problem: the reason why no data arrive at present, or "".
-        state: state in the last decision; "" if no toy is being read.
-        probabilities: class probabilities in the order of the bundle; None while there is no prediction.
-        event: the current event, if any.
-        reaction: the current reaction of the toy, if any; it ends at ``reaction_ends_s``.
-        latency_s: time from the arrival of the bytes to the newest decision.
-        arrived: time of arrival of those bytes, in seconds since 1970.
-        changes: number of the newest change of any event, see `EventSpan`.
-    """
-
-    generation: int = 0
-    running: bool = False
-    message: str = ""
-    problem: str = ""
-    state: str = ""
-    t_s: float = 0.0
-    probabilities: tuple[float, ...] | None = None
-    network: LatestAnswer | None = None
-    gate: LatestAnswer | None = None
-    event: EventSpan | None = None
-    reaction: Reaction | None = None
-    reaction_ends_s: float = 0.0
-    latency_s: float | None = None
-    arrived: float = 0.0
-    changes: int = 0
-
+from plushsense.studio.pages.live.state import Connection, EventSpan, LiveChoice, LiveState, Performed, quiet_reason
 
 KEPT_SPANS = 200
 KEPT_SPAN_S = 600.0
+KEPT_EVENTS = 20_000
+"""Number of events in the log; with a touch every three seconds, those of 16 hours."""
 _BETWEEN_S = 0.06
 """Time in seconds after which new samples cause a notification even without a decision."""
 _JOIN_S = 10.0
+_EARLY_S, _LATE_S = 0.3, 2.0
+"""How long before the hand touches, and after it has left, an event belongs to a gesture, as in the protocol."""
 ALONE_S = 60.0
 """Time without an open page, in seconds, after which the toy is closed so that other programs can use it."""
 _UNREADABLE = 30
-"""Number of malformed lines, before any frame has arrived, that indicates a wrong layout."""
+"""Number of malformed lines without a frame between them that indicates a wrong layout."""
 
 
 @dataclass
@@ -137,7 +56,8 @@ class _BundleRun:
 class LiveReader:
     """Service, shared by all live pages, that reads and classifies the signals of one toy.
 
-    It notifies `changed` after every decision and every other change of its state.
+    It notifies `changed` after every decision and every other change of its state. ``subject`` is the code of the
+    person who touches the toy, "" if it is not known.
     """
 
     def __init__(self, workspace: Workspace) -> None:
@@ -149,11 +69,17 @@ class LiveReader:
         self._workspace = workspace
         self._changing = threading.RLock()
         self._lock = threading.Lock()
-        self._spans: deque[EventSpan] = deque(maxlen=KEPT_SPANS)
-        self._spans_begun = self._changes = 0
+        # All events by number, those of earlier toys too; the time line begins with `_first`.
+        self._events: dict[int, EventSpan] = {}
+        self._begun = self._changes = 0
+        self._first = 1
+        self._performed: list[Performed] = []
+        self._started = 0.0
+        self.subject = ""
         self._next: _BundleRun | None = None
         self._thread: threading.Thread | None = None
         self._ends = threading.Event()
+        self._malformed = 0
         self._notified_s = 0.0
         self._pages = 0
         self._alone: threading.Timer | None = None
@@ -168,7 +94,7 @@ class LiveReader:
         """
         with self._changing:
             if choice.bundle is None:
-                raise ConfigError("No bundle is chosen: choose one, or train one first.")
+                raise _no_bundle()
             bundle = Bundle.load(self._workspace.inside(choice.bundle))
             classifier = _classifier(bundle, choice.engine)
             reactor = _reactor(choice.reactions, bundle)
@@ -181,10 +107,20 @@ class LiveReader:
                 device.close()
                 raise
             self.choice = replace(choice, simulated=choice.simulated or _simulated(url))
+            virtual = _virtual(device)
+            if virtual is not None:
+                virtual.on_performed = partial(self._add_performed, virtual)
             with self._lock:
-                self._spans.clear()
+                self._first, self._performed, self._malformed = self._begun + 1, [], 0
+                self._started = time.time()
                 self.device, self.bundle, self._next = device, bundle, bundle_run
-                self.now = LiveState(self.now.generation + 1, running=True, state="warming", changes=self._changes)
+                self.now = LiveState(
+                    self.now.generation + 1,
+                    running=True,
+                    connection="connecting",
+                    state="warming",
+                    changes=self._changes,
+                )
             self._ends = threading.Event()
             self._thread = threading.Thread(
                 target=self._read, args=(device, self._ends), name="plushsense-live", daemon=True
@@ -207,7 +143,7 @@ class LiveReader:
                 self.changed.notify()
                 return
             if bundle is None:
-                raise ConfigError("No bundle is chosen: choose one, or train one first.")
+                raise _no_bundle()
             fresh = before
             if bundle != self.choice.bundle:
                 fresh = Bundle.load(self._workspace.inside(bundle))
@@ -229,6 +165,29 @@ class LiveReader:
             if thread is not None and thread is not threading.current_thread():
                 thread.join(_JOIN_S)
             self._thread = None
+
+    @property
+    def person(self) -> VirtualDevice | None:
+        """The toy that is being read, if it is a virtual one of this process, whose person can be directed."""
+        return _virtual(self.device) if self.device is not None and self.now.running else None
+
+    def direct(self, label: str | None = "") -> None:
+        """Let the virtual person make the gesture ``label``, or nothing if it is ""; None lets the person choose again.
+
+        Raises:
+            ConfigError: if no virtual toy is being read.
+        """
+        person = self.person
+        if person is None:
+            raise ConfigError("No virtual toy is being read: start one first.", reason="no_virtual_toy")
+        if label is None:
+            person.release()
+        else:
+            person.follow()
+            if label:
+                person.perform(label)
+        self._set(next_gesture=label or "")
+        self.changed.notify()
 
     def close(self) -> None:
         """Close the toy because the studio ends."""
@@ -271,13 +230,32 @@ class LiveReader:
 
     def spans(self, since: int = 0) -> list[EventSpan]:
         """Return the events of recent minutes with a change number greater than ``since``, oldest first."""
+        found: list[EventSpan] = []
+        newest_s: float | None = None
         with self._lock:
-            return [span for span in self._spans if span.change > since]
+            for span in reversed(self._events.values()):
+                newest_s = newest_s if newest_s is not None else span.begin_s
+                old = span.begin_s < newest_s - KEPT_SPAN_S or self._begun - span.number >= KEPT_SPANS
+                if old or span.number < self._first:
+                    break
+                if span.change > since:
+                    found.append(span)
+        return found[::-1]
+
+    def events(self) -> list[EventSpan]:
+        """Return all events since the studio was started, those of earlier toys too, oldest first."""
+        with self._lock:
+            return list(self._events.values())
+
+    def performed(self, since: int = 0) -> list[Performed]:
+        """Return the gestures that the virtual person has made since the toy was opened, those after ``since``."""
+        with self._lock:
+            return self._performed[since:]
 
     # The reader thread ------------------------------------------------------------------------------------
 
     def _read(self, device: TappedDevice, ends: threading.Event) -> None:
-        message = ""
+        ended: PlushSenseError | None = None
         bundle_run: _BundleRun | None = None
         try:
             while not ends.is_set():
@@ -290,19 +268,27 @@ class LiveReader:
                 assert bundle_run is not None
                 self._poll(device, bundle_run)
                 if bundle_run.run.over:
-                    message = "" if ends.is_set() else "The toy's data have ended."
+                    ended = DeviceError("The toy's data have ended.", reason="toy_data_ended")
                     break
         except PlushSenseError as cause:
-            message = "" if ends.is_set() else str(cause)
+            ended = cause
         except Exception as cause:  # noqa: BLE001, RUF100
-            message = f"Reading the toy failed ({type(cause).__name__}: {cause}): start it again."
+            what = f"{type(cause).__name__}: {cause}"
+            ended = DeviceError(f"Reading the toy failed ({what}): start it again.", reason="reading_failed", what=what)
         with contextlib.suppress(Exception):
             device.close()
         with self._lock:
             if self.device is device:
                 self._end_event(self.now.t_s)
                 self.now = replace(
-                    self.now, running=False, message=message, problem="", state="", probabilities=None, reaction=None
+                    self.now,
+                    running=False,
+                    ended=None if ends.is_set() else ended,
+                    connection="",
+                    state="",
+                    probabilities=None,
+                    reaction=None,
+                    next_gesture="",
                 )
         self.changed.notify()
 
@@ -314,9 +300,9 @@ class LiveReader:
             bundle_run.offset_s = float(device.buffer.since(before).seconds[0])
         for decision in decisions:
             self._take_in(decision, bundle_run)
-        problem = "" if came else _problem(device, self.now.problem)
+        connection = self._connection(device, came)
         host = time.perf_counter()
-        if not decisions and problem == self.now.problem and not (came and host - self._notified_s >= _BETWEEN_S):
+        if not decisions and connection == self.now.connection and not (came and host - self._notified_s >= _BETWEEN_S):
             return
         self._notified_s = host
         newest = device.buffer.since(device.buffer.count - 1).seconds
@@ -325,7 +311,7 @@ class LiveReader:
         with self._lock:
             self.now = replace(
                 self.now,
-                problem=problem,
+                connection=connection,
                 t_s=float(newest[0]) if len(newest) else 0.0,
                 latency_s=bundle_run.run.latency_s,
                 arrived=time.time() - age_s,
@@ -333,60 +319,122 @@ class LiveReader:
             )
         self.changed.notify()
 
+    def _connection(self, device: TappedDevice, came: bool) -> Connection:
+        """Return what keeps frames from arriving; ``came`` is whether some arrived now."""
+        if came:
+            self._malformed = device.counters.malformed
+            return ""
+        if device.state == "waiting":
+            return "gone"
+        if device.counters.malformed - self._malformed >= _UNREADABLE:
+            return "unreadable"
+        return self.now.connection if device.buffer.count else "connecting"
+
     def _take_in(self, decision: Decision, bundle_run: _BundleRun) -> None:
         zero = bundle_run.offset_s if bundle_run.offset_s is not None else self.now.t_s
-        answer = LatestAnswer(
-            zero + decision.t_s, decision.affect, decision.gesture, decision.confidence, decision.answer
-        )
+        reactor = bundle_run.reactor
         with self._lock:
             for event in decision.events:
                 self._take_event(event, zero)
-            now = self.now
-            if decision.source == "gate":
-                # The network's answer stays displayed until its next step.
-                now = replace(now, gate=answer, state=decision.state)
-            else:
-                now = replace(now, network=answer, state=decision.state, probabilities=decision.probabilities)
-            for reaction in bundle_run.reactor.push(decision) if bundle_run.reactor else []:
-                reaction_now = reaction if reaction.eyes != "off" or reaction.sound else None
-                now = replace(now, reaction=reaction_now, reaction_ends_s=zero + reaction.t_s + reaction.seconds)
-            if now.reaction is not None and zero + decision.t_s >= now.reaction_ends_s:
-                now = replace(now, reaction=None)
-            self.now = now
+            self.now = replace(self.now, state=decision.state)
+            if decision.source == "cnn":
+                # At a decision of the gate, the network's answer stays until its next step.
+                self.now = replace(self.now, answer=decision.answer, probabilities=decision.probabilities)
+                self._measure_confidence(bundle_run.bundle, decision)
+            for reaction in reactor.push(decision) if reactor is not None else []:
+                shows = bool(reaction.eyes != "off" or reaction.sound)
+                ends_s = zero + reaction.t_s + reaction.seconds
+                self.now = replace(self.now, reaction=reaction if shows else None, reaction_ends_s=ends_s)
+                span = next((s for s in reversed(self._events.values()) if s.in_stream == reaction.number), None)
+                if span is not None:
+                    self._change_event(span, eyes=reaction.eyes, sound=reaction.sound)
+            over = self.now.reaction is not None and zero + decision.t_s >= self.now.reaction_ends_s
+            if over or decision.state in ("no signal", "sensor fault"):
+                self.now = replace(self.now, reaction=None)
+            if (current := self.now.event) is not None:
+                quiet = quiet_reason(reactor.profile if reactor is not None else None, current)
+                self.now = replace(self.now, quiet=quiet)
 
     def _take_event(self, event: GestureEvent, zero: float) -> None:
         if event.kind == "begun":
-            self._spans_begun += 1
+            self._begun += 1
             self._changes += 1
             span = EventSpan(
-                self._spans_begun,
+                self._begun,
                 self._changes,
+                event.number,
                 zero + event.since_s,
                 event.affect,
                 event.gesture,
                 event.source,
                 named_s=None if event.gesture is None else zero + event.t_s,
+                at=time.time(),
+                network=self.choice.bundle.stem if self.choice.bundle is not None else "",
+                simulated=self.choice.simulated,
+                session=self._started,
+                subject=self.subject,
             )
-            while self._spans and self._spans[0].begin_s < span.begin_s - KEPT_SPAN_S:
-                self._spans.popleft()
-            self._spans.append(span)
+            self._events.pop(self._begun - KEPT_EVENTS, None)
+            self._events[span.number] = span
             self.now = replace(self.now, event=span)
         elif self.now.event is not None:
-            changed = {"named_s": zero + event.t_s}
+            changed: dict[str, Any] = {"named_s": zero + event.t_s}
             if event.kind == "ended":
                 changed = {"end_s": zero + event.since_s, "closed_s": zero + event.t_s}
-            self._change_event(affect=event.affect, gesture=event.gesture, **changed)
+                changed["really"] = self._performed_in(self.now.event.begin_s, zero + event.t_s)
+            elif event.gesture != self.now.event.gesture:
+                # From now on it is the probability of the gesture, not of the affect.
+                changed["confidence"] = None
+            self._change_event(self.now.event, affect=event.affect, gesture=event.gesture, **changed)
 
-    def _change_event(self, **changed: Any) -> None:
-        """Change or end the current event; the caller must hold the lock."""
-        span = self.now.event
-        assert span is not None
+    def _change_event(self, span: EventSpan, **changed: Any) -> None:
+        """Change or end an event; the caller must hold the lock."""
         self._changes += 1
         fresh = replace(span, change=self._changes, **changed)
-        at = next((i for i, s in enumerate(self._spans) if s.number == span.number), None)
-        if at is not None:
-            self._spans[at] = fresh
-        self.now = replace(self.now, event=None if fresh.end_s is not None else fresh)
+        self._events[span.number] = fresh
+        if self.now.event is not None and self.now.event.number == span.number:
+            self.now = replace(self.now, event=None if fresh.end_s is not None else fresh)
+
+    def _measure_confidence(self, bundle: Bundle, decision: Decision) -> None:
+        """Raise the confidence of the current event to that of this step; the caller must hold the lock."""
+        event, shares = self.now.event, decision.probabilities
+        # Before it is named, an event of the gate is not the network's.
+        if event is None or shares is None or (event.source == "gate" and event.gesture is None):
+            return
+        likely = sum(
+            share
+            for gesture, share in zip(bundle.gestures.gestures, shares, strict=True)
+            if (gesture.affect == event.affect if event.gesture is None else gesture.label == event.gesture)
+        )
+        if event.confidence is None or likely > event.confidence:
+            # Not a change for the pages, which get the confidence with the situation and at the next change.
+            fresh = replace(event, confidence=min(1.0, likely))
+            self._events[event.number] = fresh
+            self.now = replace(self.now, event=fresh)
+
+    def _add_performed(self, device: VirtualDevice, made: PerformedGesture) -> None:
+        """Note a gesture that the virtual person begins; called in the reader thread."""
+        first_ms = device.first_ms or 0
+        with self._lock:
+            number = len(self._performed) + 1
+            begin_s, end_s = ((ms - first_ms) / 1000.0 for ms in (made.start_ms, made.end_ms))
+            self._performed.append(Performed(number, made.label, begin_s, end_s))
+            self.now = replace(self.now, performed=number, next_gesture=device.prompted)
+
+    def _performed_in(self, begin_s: float, end_s: float) -> str | None:
+        """Return the gesture of the virtual person that an event reports, "" for none, None for any other toy."""
+        if self.device is None or _virtual(self.device) is None:
+            return None
+        overlaps = {
+            min(end_s, made.end_s + _LATE_S) - max(begin_s, made.begin_s - _EARLY_S): made.label
+            for made in self._performed[-20:]
+        }
+        longest = max(overlaps, default=0.0)
+        return overlaps[longest] if longest > 0.0 else ""
+
+    def _set(self, **changed: Any) -> None:
+        with self._lock:
+            self.now = replace(self.now, **changed)
 
     def _swap(self, fresh: _BundleRun) -> None:
         """Continue with another bundle, and end the current event."""
@@ -397,9 +445,8 @@ class LiveReader:
                 self.now,
                 generation=self.now.generation + 1,
                 state="warming",
+                answer=None,
                 probabilities=None,
-                network=None,
-                gate=None,
                 reaction=None,
             )
         self.changed.notify()
@@ -407,20 +454,17 @@ class LiveReader:
     def _end_event(self, t_s: float) -> None:
         """End the current event, if any; the caller must hold the lock."""
         if self.now.event is not None:
-            self._change_event(end_s=max(t_s, self.now.event.begin_s))
+            self._change_event(self.now.event, end_s=max(t_s, self.now.event.begin_s))
             self.now = replace(self.now, changes=self._changes)
 
 
-def _problem(device: TappedDevice, before: str) -> str:
-    """Return why no frame arrives; without a new reason, return ``before``, the previous one."""
-    if device.state == "waiting":
-        return str(device.gaps[-1].reason) if device.gaps else before
-    if device.buffer.count == 0 and device.counters.malformed >= _UNREADABLE:
-        return (
-            f"The toy sends lines, but none is a frame of the layout '{device.layout.name}' of the bundle "
-            f"({len(device.layout.wire)} numbers): choose a bundle for this toy, and check the cable."
-        )
-    return before
+def _no_bundle() -> ConfigError:
+    return ConfigError("No bundle is chosen: choose one, or train one first.", reason="no_network")
+
+
+def _virtual(device: TappedDevice) -> VirtualDevice | None:
+    inner = device.inner
+    return inner if isinstance(inner, VirtualDevice) else None
 
 
 def _simulated(url: str) -> bool:

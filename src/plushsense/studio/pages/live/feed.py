@@ -1,0 +1,285 @@
+"""Send the state of the live reader to the pages, and define the browser component that displays it."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+from nicegui import context
+from nicegui.element import Element
+from nicegui.events import GenericEventArguments
+
+from plushsense.core.errors import PlushSenseError
+from plushsense.runtime.decisions import DecideSpec
+from plushsense.studio.app.guard import is_loopback
+from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, LINES, on_change
+from plushsense.studio.app.words import Words
+from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.state import UNREAD, EventSpan, LiveState, Performed, Situation
+
+WINDOW_S = 8.0
+"""Length of the displayed signals, in seconds."""
+STRIP_S = 60.0
+"""Length of the time line of events, in seconds."""
+PACE_S = 0.04
+"""Minimum time between two messages to a page; less than the 50 ms between two decisions in real time."""
+RATES_HZ = (1, 2, 5, 10, 20)
+"""Rates to choose from: how often a page displays the decision, and how often it draws the signals."""
+_CLOCK_S = 0.001
+"""Tolerance of timers, in seconds."""
+_MAX_BEHIND = 60
+"""Number of unconfirmed messages after which sending pauses; a page confirms messages about once a second."""
+
+Message = dict[str, Any]
+
+
+class Feed:
+    """Source of the messages for one page; it tracks what was sent and whether the page keeps up. Not thread-safe.
+
+    Attributes:
+        hidden: whether the page is in the background. It is then sent nothing, and afterwards the whole state.
+        away: whether the connection is lost, which has the same effect.
+        plot_s, decision_s: minimum time between two messages with signals, and with the decision of the network. A lost
+            signal is sent at once.
+
+    Args:
+        explain: returns the sentence of an error in the language of the page.
+    """
+
+    def __init__(self, reader: LiveReader, explain: Callable[[PlushSenseError], str] = str) -> None:
+        self._reader, self._explain = reader, explain
+        self.plot_s = self.decision_s = PACE_S
+        self.hidden = self.away = False
+        self._generation = -1
+        self._place = 0
+        self._change = 0
+        self._sent = self._seen = 0
+        self._performed = 0
+        self._plotted_at = self._decided_at = -math.inf
+        self._rare: tuple[Any, ...] = ()
+        self._round_ms: float | None = None
+        self._watched: tuple[int, float] | None = None
+
+    def wait_s(self) -> float:
+        """Return the number of seconds until the next message may be sent."""
+        due = min(self._plotted_at + self.plot_s, self._decided_at + self.decision_s)
+        return max(0.0, due - time.perf_counter())
+
+    @property
+    def holds(self) -> bool:
+        """True if no message should be sent now, because the page is hidden, disconnected or too far behind."""
+        return self.hidden or self.away or self._sent - self._seen > _MAX_BEHIND
+
+    def seen(self, number: int) -> None:
+        """Record that the page has drawn message ``number``."""
+        if self.holds:
+            self._plotted_at = self._decided_at = -math.inf
+        if self._watched is not None and number >= self._watched[0]:
+            self._round_ms = 1000.0 * (time.perf_counter() - self._watched[1])
+            self._watched = None
+        self._seen = max(self._seen, number)
+
+    def again(self) -> None:
+        """Make the next message contain the whole state, after the page was hidden or disconnected."""
+        self._generation = -1
+        self._seen = self._sent
+
+    def scene(self) -> Message:
+        """Return the whole state, for a page that opens or becomes visible, or after a change of toy or bundle."""
+        reader = self._reader
+        now, device, bundle = reader.now, reader.device, reader.bundle
+        self._generation = now.generation
+        self._change = self._performed = 0
+        scene: Message = {"window": WINDOW_S, "strip": STRIP_S, "simulated": reader.choice.simulated}
+        scene |= {"channels": [], "classes": [], "gate_rules": 0, "layout": "", "numbers": 0, "person": False}
+        self._place = 0
+        if device is not None and bundle is not None:
+            channels = device.layout.channels
+            scene["channels"] = [
+                {"name": c.name, "unit": c.unit, "step": c.step, "offset": c.offset, "scale": c.scale} for c in channels
+            ]
+            scene["classes"] = [{"label": g.label, "affect": g.affect} for g in bundle.gestures.gestures]
+            scene |= {"layout": device.layout.name, "numbers": len(device.layout.wire)}
+            scene["person"] = reader.person is not None
+            scene["gate_rules"] = len(DecideSpec.from_dict(bundle.decision).gate.rules)
+            self._place = max(0, device.buffer.count - int(WINDOW_S * device.layout.rate_hz))
+        self._rare = ()
+        return scene | {"first": self._message(now, True, True)}
+
+    def message(self) -> tuple[str, Message] | None:
+        """Return the method to call in the browser and its argument, or None if nothing should be sent."""
+        if self.holds:
+            return None
+        now, host = self._reader.now, time.perf_counter() + _CLOCK_S
+        plot = host >= self._plotted_at + self.plot_s
+        decision = host >= self._decided_at + self.decision_s or now.situation.kind in UNREAD
+        if now.generation != self._generation:
+            plot = decision = True
+        if plot:
+            self._plotted_at = host
+        if decision:
+            self._decided_at = host
+        if now.generation != self._generation:
+            return "scene", self.scene()
+        return ("update", self._message(now, plot, decision)) if plot or decision else None
+
+    def _message(self, now: LiveState, plot: bool, decision: bool) -> Message:
+        """Return the signals, the decision, or both, as far as the page does not have them."""
+        device = self._reader.device
+        self._sent += 1
+        if self._watched is None:
+            self._watched = (self._sent, time.perf_counter())
+        message: Message = {
+            "n": self._sent,
+            "t": round(now.t_s, 3),
+            "at": round(1000.0 * now.arrived, 2),
+            "out": round(1000.0 * time.time(), 2),
+        }
+        if plot and device is not None:
+            piece = device.buffer.since(self._place, int(WINDOW_S * device.layout.rate_hz))
+            self._place = piece.end
+            message["x"] = [round(s, 3) for s in piece.seconds.tolist()]
+            message["y"] = piece.values.astype(int).T.tolist()
+        if now.latency_s is not None:
+            message["lat"] = round(1000.0 * now.latency_s, 2)
+        if self._round_ms is not None:
+            message["round"] = round(self._round_ms, 1)
+        return message | self._decision(now) if decision else message
+
+    def _decision(self, now: LiveState) -> Message:
+        # Integer thousandths are precise enough for the length of a bar.
+        shares = now.probabilities
+        message: Message = {"p": None if shares is None else [round(1000.0 * p) for p in shares]}
+        if now.changes > self._change:
+            message["spans"] = [_span(s) for s in self._reader.spans(self._change)]
+            self._change = now.changes
+        if now.performed > self._performed:
+            message["did"] = [_performed(p) for p in self._reader.performed(self._performed)]
+            self._performed = now.performed
+        # These values change rarely, so they are sent only after a change.
+        situation = _situation(now.situation)
+        rare = (situation, now.ended, now.next_gesture)
+        if rare != self._rare:
+            self._rare = rare
+            message["now"] = {
+                **situation,
+                "why": "" if now.ended is None else self._explain(now.ended),
+                "next": now.next_gesture,
+            }
+        return message
+
+
+def _situation(situation: Situation) -> Message:
+    sure = None if situation.confidence is None else round(100.0 * situation.confidence)
+    return {**vars(situation), "confidence": sure}
+
+
+def _performed(performed: Performed) -> Message:
+    return {
+        "id": performed.number,
+        "from": round(performed.begin_s, 2),
+        "to": round(performed.end_s, 2),
+        "label": performed.label,
+    }
+
+
+def _span(span: EventSpan) -> Message:
+    return {
+        "id": span.number,
+        "from": round(span.begin_s, 2),
+        "to": None if span.end_s is None else round(span.end_s, 2),
+        "affect": span.affect,
+        "gesture": span.gesture,
+        "source": span.source,
+        "sure": None if span.confidence is None else round(100.0 * span.confidence),
+        "eyes": span.eyes,
+        "sound": span.sound,
+    }
+
+
+class LiveView(Element, component="live_view.js"):
+    """Browser component that displays the messages of ``feed``, with texts from ``words``.
+
+    Elements that are added to it are displayed beside the current event.
+    """
+
+    def __init__(self, words: Words, feed: Feed) -> None:
+        super().__init__()
+        self._feed = feed
+        self._props.update(
+            words=words.table("live"),
+            gestures=words.table("gestures"),
+            affects={key: words.affect(key) for key in AFFECT_COLOURS},
+            signs=dict(AFFECT_SIGNS),
+            colours=dict(AFFECT_COLOURS),
+            lines=list(LINES),
+            locale=words.language,
+            # Latency can be measured only if browser and studio use the same clock.
+            sameClock=is_loopback(context.client.ip),
+            start=feed.scene(),
+        )
+        self.classes("w-full")
+        self.on("seen", self._seen)
+        self.on("visible", self._visible)
+
+    def push(self) -> None:
+        """Send the next message to the browser, if there is one."""
+        if (due := self._feed.message()) is not None:
+            self.run_method(*due)
+
+    def _seen(self, event: GenericEventArguments) -> None:
+        held_back = self._feed.holds
+        self._feed.seen(int(event.args["n"]))
+        if held_back:
+            # If the toy has stopped sending, no change would trigger the withheld message, so send it now.
+            self.push()
+
+    def _visible(self, event: GenericEventArguments) -> None:
+        visible = bool(event.args["on"])
+        if visible and self._feed.hidden:
+            self._feed.hidden = False
+            self._feed.again()
+            self.push()
+        self._feed.hidden = not visible
+
+
+def follow(view: LiveView, feed: Feed, reader: LiveReader) -> None:
+    """Push a message to the view after each change, at most every `PACE_S`, and not while it is disconnected."""
+    client = context.client
+    loop = asyncio.get_running_loop()
+    timer: asyncio.TimerHandle | None = None
+
+    def push() -> None:
+        nonlocal timer
+        timer = None
+        if not client.has_socket_connection:
+            feed.away = True
+            return
+        with client:
+            view.push()
+
+    def update() -> None:
+        nonlocal timer
+        if timer is not None:
+            return
+        if (wait_s := feed.wait_s()) > 0.0:
+            timer = loop.call_later(wait_s, push)
+        else:
+            push()
+
+    def connected() -> None:
+        if feed.away:
+            feed.away = False
+            feed.again()
+        push()
+
+    def deleted() -> None:
+        if timer is not None:
+            timer.cancel()
+
+    on_change(reader.changed, update)
+    client.on_connect(connected)
+    client.on_delete(deleted)

@@ -1,0 +1,155 @@
+"""Log the events of a session: rows for a CSV file, and a table for printing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from markupsafe import Markup
+from nicegui import ui
+
+from plushsense.reports.table import Table
+from plushsense.studio.app.shell import AFFECT_SIGNS, Page, button, html, moment, on_change, tag
+from plushsense.studio.app.words import Words
+from plushsense.studio.app.workspace import plain_name
+from plushsense.studio.pages.live.feedback import Feedback
+from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.state import EventSpan
+from plushsense.studio.widgets.elements import table_html
+
+_PRINT = """
+.lv-print { display: none; }
+@media print {
+  .q-header, .ps-main:has(.lv-print:not(:empty)) > *:not(.lv-print) { display: none !important; }
+  .lv-print { display: block !important; color: #000; background: #fff; }
+  body, body.body--dark { background: #fff !important; color: #000 !important; }
+  .lv-print tr { break-inside: avoid; } .lv-print * { border-color: #999 !important; color: #000 !important; }
+}
+"""
+
+
+def log_rows(events: Sequence[EventSpan], marks: Mapping[int, tuple[str, str]]) -> list[dict[str, Any]]:
+    """Return one row for each event, with plain values for a file.
+
+    Args:
+        marks: of the events that were marked as wrong, number to person and right gesture.
+    """
+    rows = []
+    for event in events:
+        person, right = marks.get(event.number, ("", ""))
+        rows.append(
+            {
+                "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.localtime(event.at)),
+                "toy_s": round(event.begin_s, 2),
+                "lasted_s": None if event.end_s is None else round(event.end_s - event.begin_s, 2),
+                "gesture": event.gesture or "",
+                "affect": event.affect,
+                "confidence": None if event.confidence is None else round(event.confidence, 3),
+                "source": event.source,
+                "eyes": event.eyes,
+                "sound": event.sound,
+                "really": "" if event.really is None else event.really or "nothing",
+                "marked_wrong": "yes" if event.number in marks else "",
+                "right": right,
+                "person": event.subject or person,
+                "network": event.network,
+                "simulated": "yes" if event.simulated else "no",
+            }
+        )
+    return rows
+
+
+def printed(words: Words, events: Sequence[EventSpan], marks: Mapping[int, tuple[str, str]]) -> Markup:
+    """Return the log as a page for printing, in the language of ``words``."""
+    virtual = any(event.really is not None for event in events)
+    head = [words(f"log.{key}") for key in ("time", "person", "gesture", "affect", "confidence", "lasted", "reaction")]
+    head += [words("log.really")] if virtual else []
+    head.append(words("log.marked"))
+    rows = []
+    for event in events:
+        person, right = marks.get(event.number, ("", ""))
+        reaction = [words(f"live.eyes_{event.eyes}")] if event.eyes else []
+        reaction += [words.get(f"live.sound_{event.sound}", event.sound)] if event.sound else []
+        row = [
+            time.strftime("%H:%M:%S", time.localtime(event.at)),
+            event.subject or person,
+            words.gesture(event.gesture) if event.gesture else words("live.some_gesture"),
+            f"{AFFECT_SIGNS[event.affect]} {words.affect(event.affect)}",
+            "" if event.confidence is None else f"{words.number(100.0 * event.confidence)} %",
+            "" if event.end_s is None else f"{words.number(event.end_s - event.begin_s, 1)} s",
+            ", ".join(reaction),
+        ]
+        row += [words.gesture(event.really or words("log.nothing"))] if virtual and event.really is not None else []
+        row += [""] if virtual and event.really is None else []
+        wrong = words("log.wrong_right", right=words.gesture(right)) if right else words("log.wrong")
+        rows.append([*row, wrong if event.number in marks else ""])
+    networks = ", ".join(dict.fromkeys(event.network for event in events))
+    about = (
+        words("log.about", when=moment(events[0].session), network=networks) if events else words("live.events_none")
+    )
+    mark = words("shell.simulation") if any(event.simulated for event in events) else ""
+    return Markup("<h2>{}</h2><p>{}</p><p><b>{}</b></p>{}").format(
+        words("log.title"), about, mark, table_html(head, rows, numbers=(4, 5)) if rows else ""
+    )
+
+
+class LogButtons:
+    """Buttons that save and print the log of a session, and the choice of the session if there are several."""
+
+    def __init__(self, page: Page, reader: LiveReader) -> None:
+        self._page, self._reader = page, reader
+        words = page.words
+        ui.add_css(_PRINT)
+        with ui.row().classes("w-full items-center ps-small-gap q-mt-sm"):
+            self._count = tag(ui.label("").classes("ps-dim"), "log-count")
+            self._session = tag(ui.select({}, label=words("log.session")).classes("w-64"), "log-session")
+            self._save = button("log-save", words("log.save"), self._download, icon="download")
+            self._print = button("log-print", words("log.print"), self._open_print, icon="print")
+        self._session.on_value_change(self._update)
+        self._numbers = (-1, -1)
+        on_change(reader.changed, self._update_after_event)
+        self._update_after_event()
+
+    def add_sheet(self) -> None:
+        """Add the element that is printed; call this where the other sections of the page are added."""
+        self._sheet = html().classes("lv-print w-full")
+
+    def _events(self) -> list[EventSpan]:
+        return [event for event in self._reader.events() if event.session == self._session.value]
+
+    def _update_after_event(self) -> None:
+        # Called after every decision, mostly without a new event.
+        now = self._reader.now
+        if self._numbers == (numbers := (now.generation, now.changes)):
+            return
+        self._numbers = numbers
+        sessions = list(dict.fromkeys(event.session for event in self._reader.events()))
+        if sessions != list(self._session.options):
+            # A new session is chosen, unless an earlier one was chosen by hand.
+            newest = self._session.value in (None, *list(self._session.options)[-1:])
+            value = sessions[-1] if newest and sessions else self._session.value
+            self._session.set_options({start: moment(start) for start in sessions}, value=value)
+            self._session.set_visibility(len(sessions) > 1)
+        self._update()
+
+    def _update(self) -> None:
+        n = len(self._events())
+        self._count.set_text(self._page.words("log.one" if n == 1 else "log.count", n=n))
+        for control in (self._save, self._print):
+            control.set_enabled(n > 0)
+
+    def _marks(self) -> dict[int, tuple[str, str]]:
+        return self._page.workspace.part(Feedback).marks()
+
+    def _download(self) -> None:
+        events = self._events()
+        text = Table.from_rows("log", "", log_rows(events, self._marks())).csv()
+        people = sorted({event.subject for event in events if event.subject})
+        name = "-".join(["live", time.strftime("%Y-%m-%d-%H%M", time.localtime(events[0].session)), *people])
+        ui.download.content(text, f"{plain_name(name, 'live')}.csv", "text/csv")
+
+    def _open_print(self) -> None:
+        self._sheet.set_content(printed(self._page.words, self._events(), self._marks()))
+        # The browser prints what it has drawn, so wait until the table is there.
+        ui.run_javascript("requestAnimationFrame(() => requestAnimationFrame(() => print()))")
