@@ -1,4 +1,4 @@
-"""Do to folders of recordings what the published scripts of the paper do: record, move by label, truncate, save windows.
+"""Do to folders of recordings what the published scripts of the paper do: record, move, truncate, save.
 
 The scripts are ``PlushSamples.pde``, ``a_move_labelled_data.m``, ``c_training_data_truncation.m`` and
 ``d_data_preparation.m``; each function here names the one whose files it writes. People are virtual.

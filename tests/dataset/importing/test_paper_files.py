@@ -12,6 +12,7 @@ from plushsense.dataset.importing.build import ImportSummary, group_flags
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.importing.truncation import CHOICES
 from plushsense.dataset.marks import BY_HAND, read_marks
+from plushsense.dataset.quality.checking import check
 from support import paper_scripts as scripts
 
 RECORDINGS = 3 * len(scripts.GESTURES) * 2
@@ -150,3 +151,11 @@ def test_flags_of_one_kind_are_one_warning() -> None:
         "c: 1 value outside the valid range (ears; first in row 3)",
         "2 recordings or streams, for instance d: the same content as a/x_1_2",
     ]
+
+
+def test_zeros_of_the_accelerometer_that_stand_for_low_values_are_found(tmp_path: Path) -> None:
+    scripts.record(tmp_path / "study")
+    (found,) = check(imported(tmp_path / "study", tmp_path / "DS").dataset, only=["zeroed"]).findings
+    assert (found.severity, found.about) == ("warning", "")
+    assert found.message.startswith("2 channels (acc_x, acc_y) read exactly 0 in ")
+    assert "never less than -2000" in found.message
