@@ -10,6 +10,7 @@ from plushsense.core.errors import ConfigError
 from plushsense.jobs.progress import ProgressReporter
 
 _MOST_WARNINGS = 20
+_FEW = 5
 
 
 def _columns(texts: list[str]) -> dict[str, str]:
@@ -43,8 +44,13 @@ def run(args: argparse.Namespace) -> int:
         for proposal in done.proposals:
             say(f"suggestion: {proposal['reason']}: {proposal['advice']}")
         for status, entries in (("left out", done.left_out), ("rejected", done.rejected)):
+            by_reason: dict[str, list[str]] = {}
             for entry in entries:
-                say(f"{status}: {entry['file']}: {entry['reason']}")
+                by_reason.setdefault(entry["reason"], []).append(entry["file"])
+            for reason, files in by_reason.items():
+                several = f"{len(files)} files, for instance " if len(files) > _FEW else ""
+                for file in files[: 1 if several else _FEW]:
+                    say(f"{status}: {several}{file}: {reason}")
     new = f", {done.added['recordings']} of them new, {done.already_there} files already there" if args.add else ""
     emit(
         args,

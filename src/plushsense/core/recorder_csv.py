@@ -140,7 +140,8 @@ def parse_table(
 STREAM_NAME = "fulldatastream.csv"
 # A file of this name marks a folder of simulated recordings, so that scores on them can be marked too.
 SIMULATION_MARK = "SIMULATION.txt"
-_NAME = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12})\.csv$", re.IGNORECASE)
+# The authors' anonymising step writes " (1)" and so on behind a name that exists already, as file managers do.
+_NAME = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12})(?: \(\d{1,4}\))?\.csv$", re.IGNORECASE)
 # Layouts have at least 1 frame per second, so a larger median cannot be a delay.
 _SLOWEST_MS = 2000
 _PAUSE_MS = 60_000
@@ -204,7 +205,7 @@ class ReadResult:
 
 
 def parse_name(filename: str) -> RecordingName | None:
-    """Parse the file name of a recording; return None for any other name."""
+    """Parse the file name of a recording, which may have a number behind it: ``… (1).csv``; return None for others."""
     match = _NAME.match(Path(filename).name)
     if match is None:
         return None

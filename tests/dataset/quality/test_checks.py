@@ -177,6 +177,19 @@ def flat_stream(folder: Path) -> str:
     return change(folder / "streams" / "P3" / "fulldatastream.csv", with_values(slice(None), 5, 77))
 
 
+def zeroed(folder: Path) -> str:
+    """Turn the toy, so that one axis reaches below -2000, and write 0 for such values as the authors' recorder does."""
+
+    def how(frames: Frames) -> Frames:
+        values = frames.values.copy()
+        values[:, 11] -= 1600
+        return replace(frames, values=np.where(values < -2000, 0, values))
+
+    for path in [*(folder / "recordings").rglob("*.csv"), *(folder / "streams").rglob("*.csv")]:
+        change(path, how)
+    return ""
+
+
 def saturated(folder: Path) -> str:
     return change(
         recording(folder), lambda f: replace(f, values=np.minimum(f.values, [9999, 9999, 9999, 400, *[20000] * 9]))
@@ -354,6 +367,7 @@ PLANTS: list[tuple[str, Callable[[Path], str]]] = [
     ("stuck", hung),
     ("flat", flat),
     ("flat", flat_stream),
+    ("zeroed", zeroed),
     ("saturated", saturated),
     ("drift", drifting),
     ("drift", drifting_without_stream),

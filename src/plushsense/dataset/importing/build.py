@@ -14,6 +14,7 @@ from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
 from plushsense.dataset.importing.sources import COMPANIONS, LEFT_OUT, SourceFile, SourceScan
+from plushsense.dataset.importing.truncation import truncation_marks
 from plushsense.dataset.index import DUPLICATE_FOLDER, IndexBuild, apply_marks, build_index, write_index_files
 from plushsense.dataset.marks import Mark, append_marks, read_marks
 from plushsense.dataset.store import (
@@ -175,11 +176,12 @@ NO_PEOPLE = (
 
 @dataclass
 class ImportSummary:
-    """Result of an import; ``rejected``, ``left_out`` and ``warnings`` have an entry for each file or warning.
+    """Result of an import; ``rejected`` and ``left_out`` have an entry for each file, ``warnings`` for each kind.
 
     ``recordings``, ``subjects``, ``gestures`` and ``streams`` describe the data set after the import; ``added`` counts
     new recordings and streams, ``already_there`` the files that existed already, ``companions`` the copied sidecars,
-    session heads and logs, ``excluded`` the new recordings that are excluded.
+    session heads and logs, ``excluded`` the new recordings that are excluded, ``trimmed`` the trims by the choices of
+    the authors' truncation script. Each recording's own warnings are its flags in the index.
     """
 
     dataset: Dataset
@@ -197,6 +199,7 @@ class ImportSummary:
     added: dict[str, int] = field(default_factory=dict)
     already_there: int = 0
     proposals: list[dict[str, Any]] = field(default_factory=list)
+    trimmed: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -252,6 +255,11 @@ class ImportedFiles:
     def kept(self) -> dict[str, SourceFile]:
         """Copied files by their path below the data set."""
         return dict(self._origin)
+
+    @property
+    def sources(self) -> dict[str, Path]:
+        """Sources of copied files, and of those that existed already, by their path below the data set."""
+        return {file: path for path, file in (self.copier.already | self.copier.copied).items()}
 
     def count(self, kind: str) -> int:
         """Count the copied files of a kind."""
@@ -350,14 +358,15 @@ def create_dataset(
         listed, notes = merge_people({}, search.people, people, {r.subject for r in built.dataset.recordings})
         if listed:
             write_people(work, listed)
-        if marks := [Mark(i, "exclude", RECORDER, why) for i, why in account.set_aside_reasons().items() if why]:
-            append_marks(work, marks)
+        trims, remarks = truncation_marks(search.choices, built.dataset.recordings, account.sources)
+        marks = [Mark(i, "exclude", RECORDER, why) for i, why in account.set_aside_reasons().items() if why]
+        append_marks(work, marks + trims)
         (work / HEAD).write_text(head.to_toml(), encoding="utf-8")
         infos = apply_marks(built.dataset.recordings, read_marks(work), head.gestures)
         write_index_files(Dataset(work, head, infos, built.dataset.streams))
         account.check()
     dataset = Dataset(dest, head, infos, built.dataset.streams)
-    return summarize_import(dataset, account, search.notes + notes, set(account.kept))
+    return summarize_import(dataset, account, search.notes + notes + remarks, set(account.kept), len(trims))
 
 
 def read_copied(account: ImportedFiles, head: DatasetHead, progress: Progress | None) -> IndexBuild:
@@ -367,8 +376,10 @@ def read_copied(account: ImportedFiles, head: DatasetHead, progress: Progress | 
     return built
 
 
-def summarize_import(dataset: Dataset, account: ImportedFiles, notes: list[str], new: set[str]) -> ImportSummary:
-    """Return the summary of an import that added the files ``new``."""
+def summarize_import(
+    dataset: Dataset, account: ImportedFiles, notes: list[str], new: set[str], trims: int = 0
+) -> ImportSummary:
+    """Return the summary of an import that added the files ``new``, and ``trims`` of recordings."""
     unknown = any(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings)
     mine = [r for r in dataset.recordings if r.file in new]
     flagged = [s for s in dataset.streams if s.file in new] + mine
@@ -379,7 +390,7 @@ def summarize_import(dataset: Dataset, account: ImportedFiles, notes: list[str],
         sorted({r.gesture for r in dataset.recordings}),
         len(dataset.streams),
         account.rejected,
-        [f"{info.id}: {flag}" for info in flagged for flag in info.flags],
+        group_flags((info.id, flag) for info in flagged for flag in info.flags),
         0.0,
         [*([SIMULATED] if dataset.head.simulated else ()), *notes, *([NO_PEOPLE] if unknown else ())],
         left_out=account.left_out,
@@ -387,4 +398,24 @@ def summarize_import(dataset: Dataset, account: ImportedFiles, notes: list[str],
         excluded=sum(r.excluded for r in mine),
         added={"recordings": len(mine), "streams": account.count(STREAMS)},
         already_there=len(account.copier.already),
+        trimmed=trims,
     )
+
+
+_PARTS = re.compile(r"\([^()]*\)|'[^']*'|(?<= as ).+|[+-]?\d+(?:\.\d+)?( \w+?)?s?\b")
+
+
+def group_flags(flags: Iterable[tuple[str, str]]) -> list[str]:
+    """Return one warning for each kind of flag.
+
+    Args:
+        flags: the id of a recording or stream, and the message of a check. Messages are of one kind if they differ
+            only in numbers, names in quotes or at the end behind "as", and remarks in brackets.
+    """
+    kinds: dict[str, list[tuple[str, str]]] = {}
+    for identity, flag in flags:
+        kinds.setdefault(_PARTS.sub(lambda part: f"#{part[1] or ''}", flag), []).append((identity, flag))
+    return [
+        (f"{len(found)} recordings or streams, for instance " if len(found) > 1 else "") + ": ".join(found[0])
+        for found in kinds.values()
+    ]

@@ -40,6 +40,7 @@ from plushsense.dataset.importing.build import (
 )
 from plushsense.dataset.importing.proposals import adopt, matching_layouts, propose_settings
 from plushsense.dataset.importing.sources import (
+    LEFT_OUT,
     SourceFile,
     SourceScan,
     classify_files,
@@ -55,9 +56,10 @@ from plushsense.dataset.importing.sources import (
     split_regular_files,
 )
 from plushsense.dataset.importing.tables import STREAM_ROLE, check_roles, read_table
+from plushsense.dataset.importing.truncation import CHOICES, Choice, read_choices, split_backups, truncation_marks
 from plushsense.dataset.importing.xdf import person_and_session, read_xdf
 from plushsense.dataset.index import open_dataset, rebuild_index
-from plushsense.dataset.marks import MARKS, Mark, append_marks
+from plushsense.dataset.marks import MARKS, Mark, append_marks, read_marks
 from plushsense.dataset.privacy.forget import read_removals
 from plushsense.dataset.store import (
     HEAD,
@@ -172,7 +174,9 @@ def add_to_dataset(
         if head.gestures != dataset.head.gestures:
             write_file(dest / HEAD, head.to_toml())
         marks = _new_marks(dest, account.set_aside_reasons())
-        append_marks(dest, marks)
+        both = (*dataset.recordings, *built.dataset.recordings)
+        trims, remarks = truncation_marks(search.choices, both, account.sources, read_marks(dest))
+        append_marks(dest, marks := marks + trims)
         if {p.subject: p for p in listed} != there:
             write_people(dest, listed)
         # Move companions first, so that a recording in the data set always has its sidecar.
@@ -184,7 +188,8 @@ def add_to_dataset(
             os.replace(work / file, target)
         rebuilt = rebuild_index(dest, head).dataset if new or marks else open_dataset(dest)
     come = sorted(set(rebuilt.subjects) - set(dataset.subjects))
-    return summarize_import(rebuilt, account, search.notes + notes + _returning_people_warning(dest, come), new)
+    notes += remarks + _returning_people_warning(dest, come)
+    return summarize_import(rebuilt, account, search.notes + notes, new, len(trims))
 
 
 def _returning_people_warning(dest: Path, come: list[str]) -> list[str]:
@@ -251,6 +256,11 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     all_files = source_files(source)
     simulated = is_simulation(around or source, all_files)
     files, refused = split_regular_files(f for f in all_files if f.name != SIMULATION_MARK)
+    files, originals = split_backups(source, files)
+    choices, of_choices, unread = _choices(source, files)
+    files = [f for f in files if f not in of_choices]
+    refused += [SourceFile(f, LEFT_OUT, reason=_ORIGINAL.format(backup)) for f, backup in originals.items()]
+    refused += of_choices.values()
     sessions = read_sessions(files)
     layout, notes = options.known_layout(common_layout(sessions, options.layout, options.layout_origin), files)
     gestures = options.known_gestures(layout)
@@ -266,7 +276,10 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     )
     classified = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in classified]
     people, more = people_of(sessions)
-    search = SourceScan(layout, gestures, shape if rest else "sessions", classified, people, notes=notes + more)
+    notes += more + unread
+    search = SourceScan(
+        layout, gestures, shape if rest else "sessions", classified, people, notes=notes, choices=choices
+    )
     for file in (f for f in rest if f.suffix.lower() == ".xdf"):
         name = printable_path(file.relative_to(source))
         person = None if file.parent == around else file.parent.resolve().name
@@ -283,6 +296,36 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
             search.notes.append(f"files that the mapping names do not exist ({len(missing)}): {listed}")
     search.simulated = simulated or any(not isinstance(h, str) and h.simulated for h in sessions.values())
     return search
+
+
+_ORIGINAL = (
+    "the uncut original, in '{}', of a recording that is imported: import that folder alone to have all its rows"
+)
+_CHOSEN = "no recording: its choices become marks of the recordings"
+
+
+def _choices(source: Path, files: Iterable[Path]) -> tuple[list[Choice], dict[Path, SourceFile], list[str]]:
+    """Read the choices of the truncation script in ``source``, or beside it, where the script writes them.
+
+    Returns:
+        The choices, the result for each such file in ``source``, and a note if the one beside it cannot be read.
+    """
+    inside = [f for f in files if f.name.casefold() == CHOICES]
+    beside = source.resolve().parent / CHOICES
+    choices: list[Choice] = []
+    results: dict[Path, SourceFile] = {}
+    notes: list[str] = []
+    for path in inside or ([beside] if beside.is_file() else []):
+        try:
+            choices += read_choices(path)
+            reason, kind = _CHOSEN, LEFT_OUT
+        except DatasetError as cause:
+            reason, kind = str(cause), ""
+        if path in inside:
+            results[path] = SourceFile(path, kind, reason=reason)
+        elif not kind:
+            notes.append(f"no trims are taken from the file beside the folder: {reason}")
+    return choices, results, notes
 
 
 def scan_zip(path: Path, options: ImportOptions) -> SourceScan:

@@ -18,6 +18,7 @@ from plushsense.core.gestures import NOBODY, GestureSet, plain_label
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, STREAM_NAME, parse_name
 from plushsense.core.toml import read_toml
+from plushsense.dataset.importing.truncation import Choice
 from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT, PersonInfo, read_csv_rows
 from plushsense.recording.session_files import SESSION_HEAD, SESSION_LOG, SIDECAR, SessionHead, discarded_recordings
 
@@ -50,7 +51,10 @@ class SourceFile:
 
 @dataclass
 class SourceScan:
-    """Result of searching a source: every file once (``found``), and layout, gestures and people of its sessions."""
+    """Result of searching a source: every file once (``found``), and layout, gestures and people of its sessions.
+
+    ``choices`` are those of the authors' truncation script.
+    """
 
     layout: Layout
     gestures: GestureSet | None
@@ -59,6 +63,7 @@ class SourceScan:
     people: list[PersonInfo] = field(default_factory=list)
     simulated: bool = False
     notes: list[str] = field(default_factory=list)
+    choices: list[Choice] = field(default_factory=list)
 
 
 def printable_path(path: Path) -> str:

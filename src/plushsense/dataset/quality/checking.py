@@ -70,6 +70,7 @@ CHECKS: dict[str, Check] = {
     "blank-rows": Check(recordings.blank_rows, (_R, _S), "warning", _SENSOR),
     "spikes": Check(recordings.spikes, (_R,), "warning", _SENSOR),
     "flat": Check(comparisons.flat, (_R, _S, _D), "error", "check the sensor's cable; exclude what it spoiled"),
+    "zeroed": Check(comparisons.zeroed, (_D,), "warning", "record again; the lost values cannot be restored"),
     "stuck": Check(comparisons.stuck, (_R, _S), "warning", _SENSOR),
     "saturated": Check(comparisons.saturated, (_R,), "warning", "widen the sensor's range, or accept strong touch"),
     "drift": Check(comparisons.drift, (_S, _P), "warning", "let the toy calibrate again between gestures"),

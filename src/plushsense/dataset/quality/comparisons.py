@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from plushsense.core.gestures import NOBODY
+from plushsense.core.layouts import ACCELERATION
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.quality.findings import PARTLY_THERE, Issue
 from plushsense.dataset.quality.measurements import (
@@ -32,6 +33,7 @@ _PLAIN = 0.25
 _GENTLE = 0.5
 _SHORTEST_S = 0.3
 _RAIL = 0.99
+_ZEROS = 0.002
 _ALIKE = 3
 _OFTEN = 0.04
 _OVERLAP = 0.1
@@ -144,6 +146,38 @@ def _names(names: tuple[str, ...], at: np.ndarray) -> list[str]:
 def _channels(names: tuple[str, ...], at: np.ndarray) -> str:
     listed = ", ".join(_names(names, at))
     return f"channel {listed}" if len(at) == 1 else f"{len(at)} channels ({listed})"
+
+
+def zeroed(w: DatasetSummary) -> Iterator[Issue]:
+    """Find axes of an accelerometer in which 0 stands for every value under the limit of the capacitive channels.
+
+    The authors' recorder (``PlushSamples.pde``) takes values under -2000 for garbage of capacitive sensors and writes 0
+    instead, in every column. Such an axis is never lower, and 0 is more frequent than the 20 values beside it together.
+    """
+    channels = w.dataset.layout.channels
+    axes = [c for c, ch in enumerate(channels) if ch.kind == ACCELERATION]
+    limits = [
+        v for v, ch in zip(w.dataset.layout.valid_min_int.tolist(), channels, strict=True) if ch.kind in LEVEL_KINDS
+    ]
+    if not (axes and limits and w.recordings) or (limit := max(limits)) >= 0:
+        return
+    zeros, near = (np.array([getattr(o, key) for o in w.recordings]) for key in ("zeros", "near_zeros"))
+    lowest = np.min([o.lowest for o in w.recordings], axis=0)
+    highest = np.max([o.highest for o in w.recordings], axis=0)
+    rows = sum(o.rows for o in w.recordings)
+    # A sensor that never reaches the limit on the other side either has no values that could have been replaced.
+    reaches = max(highest[axes]) > -limit
+    often = (zeros.sum(axis=0) > np.maximum(near.sum(axis=0), _ZEROS * rows)) & (highest > lowest)
+    affected = np.array([c for c in axes if reaches and often[c] and lowest[c] >= limit], dtype=np.int64)
+    if len(affected):
+        share = 100 * zeros[:, affected].any(axis=1).mean()
+        yield Issue(
+            f"{_channels(w.dataset.layout.names, affected)} {'reads' if len(affected) == 1 else 'read'} exactly 0 in "
+            f"{100 * zeros[:, affected].sum(axis=0).max() / rows:.1f} % of the rows (in {share:.0f} % of the "
+            f"recordings) and never less than {limit}: the authors' recorder writes 0 for every value under {limit}, "
+            "so that magnitude and direction are wrong there",
+            channels=tuple(affected.tolist()),
+        )
 
 
 def stuck(w: DatasetSummary) -> Iterator[Issue]:

@@ -129,6 +129,7 @@ def duration_s(frames: Frames) -> float:
 
 LEVEL_KINDS = ("capacitive", "proximity")
 """Kinds of channels whose level shows touch; the level of other kinds also changes as the toy is turned."""
+NEAR_ZERO = 10
 _HOP_S = 0.1
 _CHUNK_S = 10.0
 _NOISE = 2.0
@@ -144,8 +145,9 @@ class RecordingSummary:
     for streams; for channels of `LEVEL_KINDS` it is at least the height above the recording's 10th percentile. ``runs``
     (C,) is the length in rows of the longest run of one value, which begins at row ``run_at``; ``top_runs`` and
     ``top_at`` are the same at the highest or lowest value ``top``, which occurs in ``top_rows`` rows. ``spread`` (C,)
-    is the range from the 2nd to the 98th percentile, ``low`` the 10th percentile, ``lows`` (K, C) the 10th percentile
-    of every 10 s of a stream. ``content`` is a hash of the values, b"" for a stream.
+    is the range from the 2nd to the 98th percentile, ``lowest`` and ``highest`` the extremes, ``zeros`` counts the rows
+    that are 0 and ``near_zeros`` those from 1 to `NEAR_ZERO` steps beside it, ``low`` the 10th percentile, ``lows`` (K,
+    C) the 10th percentile of every 10 s of a stream. ``content`` is a hash of the values, b"" for a stream.
     """
 
     info: RecordingInfo | StreamInfo
@@ -162,6 +164,10 @@ class RecordingSummary:
     top_rows: NDArray[np.int64]
     spread: NDArray[np.float64]
     low: NDArray[np.float64]
+    lowest: NDArray[np.int64]
+    highest: NDArray[np.int64]
+    zeros: NDArray[np.int64]
+    near_zeros: NDArray[np.int64]
     content: bytes
     lows: NDArray[np.float64] | None = None
 
@@ -234,6 +240,10 @@ def summarize(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) 
         (values == top).sum(axis=0),
         q98 - q2,
         low,
+        values.min(axis=0),
+        values.max(axis=0),
+        zeros := (values == 0).sum(axis=0),
+        (np.abs(values) <= NEAR_ZERO).sum(axis=0) - zeros,
         # Hash the values only, since copies may have other names and clocks.
         b"" if stream else hashlib.sha256(np.ascontiguousarray(frames.values).tobytes()).digest(),
         lows,

@@ -1,0 +1,161 @@
+"""Folders as the paper's published scripts leave them: how many recordings each gives, and one warning for a kind."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from plushsense.core.recorder_csv import parse_name
+from plushsense.dataset.importing.build import ImportSummary, group_flags
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.importing.truncation import CHOICES
+from plushsense.dataset.marks import BY_HAND, read_marks
+from plushsense.dataset.quality.checking import check
+from support import paper_scripts as scripts
+
+RECORDINGS = 3 * len(scripts.GESTURES) * 2
+
+
+def imported(source: Path, dest: Path, integers: int = 15, **more: object) -> ImportSummary:
+    return import_recordings(source, dest, layout=f"plush-{integers}", **more)  # type: ignore[arg-type]
+
+
+def kinds(done: ImportSummary) -> list[str]:
+    """Warnings without those that the virtual people and the missing person codes cause."""
+    known = ("these recordings are of the virtual toy", "the folders are gestures")
+    return [w for w in done.to_dict()["warnings"] if not w.startswith(known)]
+
+
+@pytest.fixture
+def labelled(tmp_path: Path) -> Path:
+    """A study after the first script; two recordings had the same name, so that one has " (1)" behind it."""
+    root = tmp_path / "study"
+    scripts.record(root)
+    mine = min((root / scripts.SESSIONS / "P01").glob("Tail pull*"))
+    other = min((root / scripts.SESSIONS / "P02").glob("Tail pull*"))
+    other.rename(other.with_name(mine.name))
+    scripts.move_by_label(root)
+    return root
+
+
+@pytest.mark.parametrize("integers", [15, 14])
+def test_a_folder_for_each_person(tmp_path: Path, integers: int) -> None:
+    scripts.record(tmp_path / "study", integers=integers)
+    done = imported(tmp_path / "study", tmp_path / "DS", integers)
+    assert (done.recordings, done.subjects, done.streams) == (RECORDINGS, 3, 3)
+    assert len(kinds(done)) == (integers == 14), kinds(done)
+    assert all(r.stream and not r.excluded for r in done.dataset.recordings)
+    assert all("delays" in w and w.startswith("21 recordings or streams") for w in kinds(done))
+
+
+def test_names_that_exist_twice(labelled: Path, tmp_path: Path) -> None:
+    odd = [p for p in (labelled / scripts.LABELLED).rglob("*.csv") if p.stem.endswith(" (1)")]
+    assert len(odd) == 1
+    done = imported(labelled, tmp_path / "DS")
+    assert done.recordings == RECORDINGS
+    assert [r.id for r in done.dataset.recordings if r.id.endswith(" (1)")] == [f"unknown/{odd[0].stem}"]
+    # The script gives this file the name of another recording, so that the rows in the name are not its own.
+    assert ["its name states" in w for w in kinds(done)] == [True]
+    name = parse_name("Tail pull_1760094338537_252 (12).csv")
+    assert name is not None
+    assert (name.label, name.epoch_ms, name.rows) == ("Tail pull", 1760094338537, 252)
+    assert parse_name("Tail pull_1760094338537_252 (copy).csv") is None
+
+
+def test_choices_before_the_truncation_are_marks(labelled: Path, tmp_path: Path) -> None:
+    chosen = scripts.choose(labelled)
+    for number, source in enumerate((labelled, labelled / scripts.LABELLED)):
+        done = imported(source, tmp_path / f"DS{number}")
+        assert (done.recordings, done.trimmed, len(kinds(done))) == (RECORDINGS, RECORDINGS - 1, 2)
+        states = read_marks(done.dataset.path)
+        for r in done.dataset.recordings:
+            name = Path(r.file).name
+            rows, cut = chosen.get(name, (r.rows, 0))
+            assert (r.start, r.stop, r.rows) == (cut, rows, rows), name
+            assert (name in chosen) == (r.id in states and states[r.id].how == BY_HAND)
+
+
+def test_the_backup_of_the_truncation_brings_no_recordings(labelled: Path, tmp_path: Path) -> None:
+    chosen = scripts.choose(labelled)
+    scripts.truncate(labelled, chosen)
+    done = imported(labelled, tmp_path / "DS")
+    assert done.recordings == done.added["recordings"] == RECORDINGS
+    originals = [e for e in done.left_out if scripts.BACKUP in e["file"]]
+    assert len(originals) == RECORDINGS
+    assert {"uncut original" in e["reason"] for e in originals} == {True}
+    # One warning states what the choices did, the other that names state the rows before the cut.
+    assert len(kinds(done)) == 2, kinds(done)
+    assert [w.partition(" ")[0] for w in kinds(done) if "its name states" in w] == ["9"]
+    assert all(r.start == 0 and r.stop == r.rows for r in done.dataset.recordings)
+    cut = {Path(r.file).name: r.rows for r in done.dataset.recordings}
+    assert all(cut[name] == rows - n for name, (rows, n) in chosen.items())
+
+
+def test_the_backup_alone_brings_the_whole_recordings_and_the_choices(labelled: Path, tmp_path: Path) -> None:
+    chosen = scripts.choose(labelled)
+    backup = scripts.truncate(labelled, chosen)
+    later = scripts.truncate(labelled, chosen, backup=scripts.BACKUP.replace("05-06", "06-01"))
+    done = imported(backup, tmp_path / "DS")
+    assert (done.recordings, done.trimmed) == (RECORDINGS, RECORDINGS - 1)
+    assert sum(r.start for r in done.dataset.recordings) == 40 * sum(n > 0 for _, n in chosen.values())
+    # Without the cut recordings, a backup is no twin: the oldest one is imported.
+    shutil.rmtree(labelled / scripts.LABELLED)
+    both = imported(labelled, tmp_path / "DS2")
+    assert both.recordings == RECORDINGS
+    assert {later.name in e["file"] for e in both.left_out if "uncut" in e["reason"]} == {True}
+
+
+def test_choices_that_come_later_are_added_but_decide_nothing_twice(labelled: Path, tmp_path: Path) -> None:
+    assert imported(labelled, tmp_path / "DS").trimmed == 0
+    scripts.choose(labelled)
+    done = import_recordings(labelled, tmp_path / "DS", add_to=True)
+    assert (done.added["recordings"], done.trimmed) == (0, RECORDINGS - 1)
+    assert import_recordings(labelled, tmp_path / "DS", add_to=True).trimmed == 0
+
+
+def test_choices_that_cannot_be_used(labelled: Path, tmp_path: Path) -> None:
+    path = labelled / CHOICES
+    for number, (text, reason) in enumerate(
+        [
+            ("file,subject\na,b\n", "has no column filename, fullpath, length, truncaten"),
+            ("FileName,FullPath,Length,TruncateN\na.csv,C:\\x\\a.csv,12,lots\n", "line 2 has Length '12'"),
+            ("FileName,FullPath,Length,TruncateN\na.csv,C:\\x\\a.csv,12,-1\n", "whole numbers from 0 on"),
+            ("FileName,FullPath,Length,TruncateN\na.csv,C:\\x\\a.csv,1e999,0\n", "whole numbers from 0 on"),
+        ]
+    ):
+        path.write_text(text)
+        done = imported(labelled, tmp_path / f"in{number}")
+        assert [reason in e["reason"] for e in done.rejected if e["file"] == CHOICES] == [True], text
+        done = imported(labelled / scripts.LABELLED, tmp_path / f"beside{number}")
+        assert sum(reason in w for w in done.to_dict()["warnings"]) == 1
+        assert done.trimmed == 0
+    name = next(p.name for p in (labelled / scripts.LABELLED).rglob("*.csv"))
+    path.write_text(f'\ufeff"File Name","Full Path",Length,TruncateN\n{name},/x/{name},9999,5\n')
+    done = imported(labelled, tmp_path / "other")
+    assert done.trimmed == 0
+    assert any("1 do not fit" in w for w in kinds(done))
+
+
+def test_flags_of_one_kind_are_one_warning() -> None:
+    flags = [
+        ("a", "3 gaps over 50 ms, the longest 120 ms (after row 7)"),
+        ("b", "1 gap over 50 ms, the longest 80 ms (after row 12)"),
+        ("c", "1 value outside the valid range (ears; first in row 3)"),
+        ("d", "the same content as a/x_1_2"),
+        ("e", "the same content as a/y_1_2"),
+    ]
+    assert group_flags(flags) == [
+        "2 recordings or streams, for instance a: 3 gaps over 50 ms, the longest 120 ms (after row 7)",
+        "c: 1 value outside the valid range (ears; first in row 3)",
+        "2 recordings or streams, for instance d: the same content as a/x_1_2",
+    ]
+
+
+def test_zeros_of_the_accelerometer_that_stand_for_low_values_are_found(tmp_path: Path) -> None:
+    scripts.record(tmp_path / "study")
+    (found,) = check(imported(tmp_path / "study", tmp_path / "DS").dataset, only=["zeroed"]).findings
+    assert (found.severity, found.about) == ("warning", "")
+    assert found.message.startswith("2 channels (acc_x, acc_y) read exactly 0 in ")
+    assert "never less than -2000" in found.message
