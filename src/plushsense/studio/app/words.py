@@ -12,7 +12,7 @@ from importlib import import_module, resources
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import PlushSenseError
+from plushsense.core.errors import Note, PlushSenseError
 
 LANGUAGES = {"en": "English", "lv": "Latviešu"}
 """Maps language code to name; ``<code>.toml`` is the name of the files of texts."""
@@ -57,10 +57,21 @@ class Words:
             message: the sentence in English, as the command line prints it.
             reason, values: those of the `PlushSenseError`. Without a text for ``reason``, ``message`` is quoted.
         """
-        text = self._texts.get(f"errors.{reason}")
-        if text is not None:
-            return text.format(**(values or {}))
+        if f"errors.{reason}" in self._texts:
+            return self.note({"message": message, "reason": reason, "values": values or {}})
         return self._texts["errors.other"].format(message=message) if message else ""
+
+    def note(self, note: str | Mapping[str, Any]) -> str:
+        """Return the sentence of a `Note`, or of the table that `plushsense.studio.tasks` makes of it.
+
+        A text without a reason is quoted, with a remark that it is in English.
+        """
+        table = note if isinstance(note, Mapping) else {"message": str(note), **getattr(note, "__dict__", {})}
+        text = self._texts.get(f"errors.{table.get('reason')}", "")
+        if text:
+            values = {key: self.note(v) if isinstance(v, (Note, Mapping)) else v for key, v in table["values"].items()}
+            return text.format(**values)
+        return self._texts["errors.note"].format(message=table["message"])
 
     def unit(self, unit: str) -> str:
         """Return the name of a unit in this language, or ``unit`` itself if it has none."""

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import uuid
-from collections.abc import Awaitable, Callable
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
-from nicegui import context, events, run, ui
+from nicegui import context, run, ui
 
-from plushsense.core.errors import BundleError, ConfigError, PlushSenseError
-from plushsense.core.layouts import layout_names
-from plushsense.models.bundle import Bundle
-from plushsense.studio.app.guard import UPLOAD_BYTES
-from plushsense.studio.app.jobs import INCOMING, RUNNING, Jobs
+from plushsense.core.errors import PlushSenseError
+from plushsense.studio.app.jobs import RUNNING, Jobs
 from plushsense.studio.app.shell import Page, address, button, html, on_change, tag
 from plushsense.studio.app.toys import PERSONS, Toys
-from plushsense.studio.app.workspace import BUNDLES, DATASETS, WORK
+from plushsense.studio.app.workspace import DATASETS, WORK
+from plushsense.studio.pages.home.incoming import IncomingSection
 from plushsense.studio.pages.home.overview import NextStep, Overview, WorkspaceSummary, next_step
 from plushsense.studio.pages.home.sections import (
     SMALL,
@@ -29,6 +25,7 @@ from plushsense.studio.pages.home.sections import (
     simulation_badge,
     titled_card,
 )
+from plushsense.studio.widgets.elements import style
 
 
 def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
@@ -126,11 +123,6 @@ def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
         toys.search()
 
 
-ARCHIVE_BYTES = UPLOAD_BYTES - 1_000_000
-"""Maximum size of an uploaded zip in bytes; the request that carries it is slightly larger."""
-BUNDLE_BYTES = 64_000_000
-
-
 def bundles(page: Page, actions: FileActions) -> Callable[[WorkspaceSummary], None]:
     """Build the section that lists trained networks; return the function that fills it."""
     box = titled_card(page, "home.bundles", "bundles")
@@ -160,87 +152,6 @@ def bundles(page: Page, actions: FileActions) -> Callable[[WorkspaceSummary], No
                         page_links(page, ("live", "export"), entry.name, model=entry.path)
 
     return fill
-
-
-def uploads(page: Page, jobs: Jobs, on_bundle: Callable[[], Awaitable[None]]) -> None:
-    """Build the section for uploads of a zip of recordings or a bundle; call ``on_bundle`` after storing a bundle."""
-    words = page.words
-
-    async def take(file: events.UploadEventArguments) -> None:
-        """Store the uploaded file under a random name; then check and move a bundle, or start to import a zip."""
-        name = Path(file.file.name.replace("\\", "/")).name
-        kind = Path(name).suffix.lower()
-        uploader.reset()
-        folder = page.workspace.folder / WORK / INCOMING
-        with page.show_errors():
-            if kind not in (".zip", ".plush"):
-                raise ConfigError(f"'{name}' is neither a .zip of recordings nor a .plush bundle: choose one of these.")
-            limit = BUNDLE_BYTES if kind == ".plush" else ARCHIVE_BYTES
-            if file.file.size() > limit:
-                raise ConfigError(f"'{name}' is larger than the {limit / 1e6:g} MB that are accepted.")
-            title = str(name_field.value or "").strip() or _plain(Path(name).stem)
-            place = page.workspace.new(*((BUNDLES, f"{title}.plush") if kind == ".plush" else (DATASETS, title)))
-            stored = folder / f"{uuid.uuid4().hex}{kind}"
-            await run.io_bound(lambda: folder.mkdir(parents=True, exist_ok=True))
-            try:
-                await file.file.save(stored)
-                if kind == ".plush":
-                    await run.io_bound(_move_bundle, stored, place, name)
-                    page.say(words("home.bundle_came", name=place.stem), "good")
-                    await on_bundle()
-                    return
-            except BaseException:
-                stored.unlink(missing_ok=True)
-                raise
-            spec = {"archive": str(stored), "dest": str(place), "name": place.name}
-            if layout.value:
-                spec["layout"] = str(layout.value)
-            jobs.start("import", spec, words("home.import_title", name=place.name))
-            name_field.set_value("")
-            page.say("")
-
-    archive_mb, bundle_mb = ARCHIVE_BYTES // 1_000_000, BUNDLE_BYTES // 1_000_000
-    with titled_card(page, "home.incoming", "incoming"):
-        ui.label(words("home.incoming_about", mb=archive_mb, bundle=bundle_mb)).classes("ps-dim")
-        with ui.row().classes("items-end ps-small-gap w-full"):
-            name_field = tag(ui.input(words("home.incoming_name")).classes("ps-wide"), "incoming-name")
-            options = {"": words("home.layout_of_sessions"), **{n: n for n in layout_names()}}
-            layout = ui.select(options, value="", label=words("home.layout")).classes("ps-wide")
-        uploader = ui.upload(
-            max_file_size=ARCHIVE_BYTES,
-            on_begin_upload=lambda: page.say(words("home.receiving")),
-            on_upload=take,
-            on_rejected=lambda: page.say(words("home.upload_rejected", mb=archive_mb), "error"),
-            auto_upload=True,
-        )
-        # Quasar's uploader is not accessible: a separate button opens its file dialog.
-        tag(uploader.props("accept=.zip,.plush").style("display: none"), "upload")
-        choose = button("choose-file", words("home.choose_file"), icon="upload_file")
-        choose.on("click", js_handler=f"() => runMethod({uploader.id}, 'pickFiles', [])")
-
-
-def _move_bundle(stored: Path, place: Path, name: str) -> None:
-    """Check an uploaded bundle and move it from ``stored`` to ``place``; ``name`` is the name of the uploaded file.
-
-    Raises:
-        BundleError: if the bundle cannot be read.
-        ConfigError: if ``place`` exists.
-    """
-    try:
-        Bundle.load(stored)
-    except BundleError as cause:
-        # The visitor knows the name of the uploaded file, not the path where it is stored.
-        raise BundleError(str(cause).replace(str(stored), name)) from None
-    place.parent.mkdir(parents=True, exist_ok=True)
-    if place.exists():
-        raise ConfigError(f"'{place.stem}' exists already: give another name, nothing is replaced.")
-    stored.rename(place)
-
-
-def _plain(stem: str) -> str:
-    """Turn the stem of a file name into a valid name for a data set."""
-    plain = "".join(c if c.isalnum() or c in " _-" else " " for c in stem)
-    return " ".join(plain.split())[:60] or "recordings"
 
 
 def invitation(page: Page) -> None:
@@ -273,6 +184,7 @@ async def show(page: Page) -> None:
     """Build the page."""
     workspace = page.workspace
     overview, jobs, toys = workspace.part(Overview), workspace.part(Jobs), workspace.part(Toys)
+    style()
     summary = await run.io_bound(overview.look)
     step = NextStepCard(page, jobs, toys)
     with ui.element("div").classes("ps-two w-full"):
@@ -281,7 +193,7 @@ async def show(page: Page) -> None:
             datasets = DatasetSection(page, jobs, actions)
             sessions = SessionSection(page, jobs)
             networks = bundles(page, actions)
-            uploads(page, jobs, lambda: refresh())
+            IncomingSection(page, jobs, lambda: refresh())
             discarded = DiscardedSection(page, actions)
         with ui.column().classes("w-full"):
             toy_section(page, toys)
