@@ -125,7 +125,7 @@ def test_data_sets_and_networks_are_renamed_discarded_and_deleted(studio: Fixtur
     assert browser.complaints == []
 
 
-def test_the_toy_is_chosen_and_tested(studio: Fixture, look: Fixture) -> None:
+def test_the_toy_is_chosen_and_tested(studio: Fixture, look: Fixture, server: Callable[[bytes], str]) -> None:
     one = studio("--speed", "10")
     browser = look()
     page = browser.open(one.url)
@@ -135,24 +135,30 @@ def test_the_toy_is_chosen_and_tested(studio: Fixture, look: Fixture) -> None:
     page.get_by_role("option", name="Person 12").click()
     marked(page, "virtual").click()
     marked(page, "chosen").get_by_text("virtual://?person=12").wait_for()
-    marked(page, "test").click()
-    marked(page, "message").get_by_text("The toy works").wait_for()
+    marked(page, "trial").get_by_text("The toy works").wait_for()
     # Another tab shows the same toy, and hears of a change.
     second = browser.open(one.url)
     marked(second, "chosen").get_by_text("person=12").wait_for()
-    for wrong in ("http://x", "replay:///etc/passwd"):
-        marked(page, "address").fill(wrong)
+    wrong = {"http://x": "is no kind of toy", "tcp://10.0.0.1:99999": "from 1 to 65535", "": "Enter the address"}
+    wrong |= {"serial:///dev/nothing": "There is no port /dev/nothing", "replay:///etc/passwd": "/etc/passwd"}
+    for address, reason in wrong.items():
+        marked(page, "address").fill(address)
         marked(page, "use").click()
-        marked(page, "message").get_by_text(wrong.partition("//")[2]).wait_for()
+        marked(page, "toy").get_by_role("alert").get_by_text(reason).wait_for()
     marked(page, "address").fill("virtual://?person=3")
     marked(page, "use").click()
     marked(second, "chosen").get_by_text("person=3").wait_for()
     marked(page, "address").fill("tcp://127.0.0.1:9")
-    marked(page, "use").click()
+    page.keyboard.press("Enter")
     marked(page, "chosen").get_by_text("tcp://127.0.0.1:9").wait_for()
-    marked(page, "test").click()
-    page.get_by_role("alert").get_by_text("127.0.0.1:9").wait_for()
+    marked(page, "trial").get_by_text("does not answer on port 9").wait_for()
     assert axe(page) == []
+    # A toy with older firmware: its layout is found, and one press uses it.
+    address = server(b" ".join([b"1"] * 13) + b" 10\n")
+    marked(page, "address").fill(address)
+    marked(page, "use").click()
+    marked(page, "use-layout").click()
+    marked(page, "chosen").get_by_text(f"{address}?layout=plush-14").wait_for()
     assert browser.complaints == []
 
 

@@ -103,7 +103,9 @@ class LslDevice(Device):
         there = ", ".join(f"{s.name()} ({s.type() or 'no type'})" for s in self._pylsl.resolve_streams(0.5))
         raise DeviceError(
             f"'{self.url}': no LSL stream has the {key} '{value}' within {find_s:g} s; "
-            f"{f'there are {there}' if there else 'there is none on this network'}."
+            f"{f'there are {there}' if there else 'there is none on this network'}.",
+            reason="toy_no_lsl",
+            name=value,
         )
 
     def read(self) -> list[Frame] | None:

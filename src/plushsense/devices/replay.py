@@ -71,6 +71,8 @@ def open_replay(address: DeviceAddress, layout: Layout) -> ReplayDevice:
     if not address.place or not path.is_file():
         raise DeviceError(
             f"'{address.url}': there is no file '{path if address.place else ''}' to replay; "
-            "give the path of a recording or of a fulldatastream.csv."
+            "give the path of a recording or of a fulldatastream.csv.",
+            reason="toy_no_file",
+            file=path if address.place else "",
         )
     return ReplayDevice(address.url, layout, path, speed)

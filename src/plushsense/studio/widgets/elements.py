@@ -16,7 +16,7 @@ from nicegui import context, run, ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
-from plushsense.core.errors import BadInput
+from plushsense.core.errors import PlushSenseError
 from plushsense.core.gestures import plain_label
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import (
@@ -135,12 +135,12 @@ async def change_files(
 
 @contextmanager
 def errors_beside(page: Page, field: Any) -> Iterator[None]:
-    """Show an error of the user's input, raised in the block, beside ``field``, and others at the top of the page."""
+    """Show an error that is raised in the block beside ``field``, and one of the computer at the top of the page."""
     field.error = None
     with page.show_errors():
         try:
             yield
-        except BadInput as refusal:
+        except PlushSenseError as refusal:
             field.error = page.words.error(refusal)
 
 

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from nicegui import context, run, ui
 
-from plushsense.core.errors import PlushSenseError
 from plushsense.studio.app.jobs import RUNNING, Jobs
 from plushsense.studio.app.shell import Page, address, button, html, on_change, tag
-from plushsense.studio.app.toys import PERSONS, Toys
+from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.workspace import DATASETS, WORK
 from plushsense.studio.pages.home.incoming import IncomingSection
 from plushsense.studio.pages.home.overview import NextStep, Overview, WorkspaceSummary, next_step
 from plushsense.studio.pages.home.sections import (
-    SMALL,
     DatasetSection,
     DiscardedSection,
     FileActions,
@@ -25,102 +22,8 @@ from plushsense.studio.pages.home.sections import (
     simulation_badge,
     titled_card,
 )
+from plushsense.studio.pages.home.toy import ToySection
 from plushsense.studio.widgets.elements import style
-
-
-def toy_section(page: Page, toys: Toys) -> None:  # noqa: C901
-    """Build the section for choosing a toy, and search for toys unless a search was made before."""
-    words, workspace = page.words, page.workspace
-    with titled_card(page, "home.toy", "toy"):
-        chosen = ui.column().classes("w-full ps-small-gap").props('aria-live="polite"')
-        with ui.row().classes("items-end ps-small-gap w-full"):
-            options = {n: words("home.person", n=n) for n in range(1, PERSONS + 1)}
-            who = ui.select(options, value=7, label=words("home.virtual_person")).classes("ps-wide")
-            tag(who, "person")
-            button("virtual", words("home.choose_virtual"), lambda: choose(toys.person, int(who.value)), "unelevated")
-        others = ui.column().classes("w-full ps-small-gap")
-        with ui.row().classes("items-end ps-small-gap w-full"):
-            other = ui.input(words("home.address"), placeholder="tcp://192.168.1.20:3333").classes("ps-wide")
-            tag(other, "address")
-            button("use", words("home.use"), lambda: choose(toys.choose, str(other.value or "")))
-
-    testing = False
-
-    def choose(command: Callable[[Any], object], toy: Any) -> None:
-        with page.show_errors():
-            command(toy)
-            page.say("")
-
-    def show_chosen() -> None:
-        chosen.clear()
-        with chosen:
-            if not workspace.toy:
-                ui.label(words("home.no_toy")).classes("ps-dim")
-                return
-            with ui.row().classes("items-center ps-small-gap"):
-                tag(ui.label(words("home.chosen", url=workspace.toy)).classes("ps-break text-bold"), "chosen")
-                if toys.simulated:
-                    simulation_badge(page)
-            button("test", words("home.test"), test)
-
-    async def test() -> None:
-        nonlocal testing
-        if testing:
-            return
-        testing = True
-        page.say(words("home.testing"))
-        try:
-            result = await run.io_bound(toys.test)
-        except Exception as cause:  # noqa: BLE001, RUF100
-            text = " ".join(str(cause).split()) or type(cause).__name__
-            text = words.error(cause) if isinstance(cause, PlushSenseError) else words.explain(text)
-            page.say(text, "error")
-            return
-        finally:
-            testing = False
-        if result is None:
-            # The studio is ending.
-            return
-        values = {
-            "frames": result.frames,
-            "seconds": words.number(result.seconds, 1),
-            "layout": result.layout,
-            "malformed": result.malformed,
-            "rate": words.number(result.rate_hz),
-        }
-        key = "good" if result.fits and result.on_time else "slow" if result.fits else "malformed"
-        page.say(words(f"home.test_{key}", **values), "good" if key == "good" else "warning")
-
-    def show_others() -> None:
-        others.clear()
-        given = [(url, "", words("home.given")) for url in workspace.devices]
-        listed = [(d.url, d.name, d.description) for d in toys.listing.devices if d.kind != "virtual"]
-        with others:
-            for url, name, about in [*given, *listed]:
-                with ui.row().classes("ps-row items-center justify-between w-full no-wrap"):
-                    with ui.column().classes("ps-no-gap"):
-                        ui.label(name or url).classes("ps-break")
-                        ui.label(" · ".join(t for t in (url if name else "", about) if t)).classes("ps-dim ps-break")
-                    button("", words("home.choose"), lambda url=url: choose(toys.choose, url), SMALL, about=name or url)
-            if toys.searching:
-                with ui.row().classes("items-center ps-small-gap").props('role="status"'):
-                    ui.spinner(size="1.2em").props("aria-hidden=true")
-                    ui.label(words("home.looking"))
-                return
-            if toys.searched and not listed:
-                ui.label(words("home.none_found")).classes("ps-dim")
-            for note in toys.listing.notes:
-                ui.label(note).classes("ps-dim ps-note")
-            button("look", words("home.look_again" if toys.searched else "home.look"), toys.search, SMALL)
-
-    def update() -> None:
-        show_chosen()
-        show_others()
-
-    update()
-    on_change(toys.changed, update)
-    if not toys.searched:
-        toys.search()
 
 
 def bundles(page: Page, actions: FileActions) -> Callable[[WorkspaceSummary], None]:
@@ -196,7 +99,7 @@ async def show(page: Page) -> None:
             IncomingSection(page, jobs, lambda: refresh())
             discarded = DiscardedSection(page, actions)
         with ui.column().classes("w-full"):
-            toy_section(page, toys)
+            ToySection(page, toys)
             job_list = JobList(page, jobs)
             invitation(page)
 
