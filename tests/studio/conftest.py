@@ -6,6 +6,9 @@ import contextlib
 import importlib.util
 import os
 import shutil
+import socket
+import threading
+import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -36,6 +39,36 @@ def studio(tmp_path: Path) -> Iterator[Callable[..., Studio]]:
     assert not [line for each in begun for line in each.errors if "Traceback" in line], "".join(
         line for each in begun for line in each.errors
     )
+
+
+@pytest.fixture
+def server() -> Iterator[Callable[[bytes], str]]:
+    """A toy over TCP that sends the same line again and again to everybody; gives its URL."""
+    sockets: list[socket.socket] = []
+
+    def serve(line: bytes) -> str:
+        reader = socket.create_server(("127.0.0.1", 0))
+        sockets.append(reader)
+
+        def talk(connection: socket.socket) -> None:
+            with contextlib.suppress(OSError):
+                while line:
+                    connection.sendall(line)
+                    time.sleep(0.01)
+
+        def accept() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    connection, _ = reader.accept()
+                    sockets.append(connection)
+                    threading.Thread(target=talk, args=(connection,), daemon=True).start()
+
+        threading.Thread(target=accept, daemon=True).start()
+        return f"tcp://127.0.0.1:{reader.getsockname()[1]}"
+
+    yield serve
+    for one in sockets:
+        one.close()
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,25 +9,11 @@ from typing import Any
 import pytest
 
 from plushsense.studio.app.workspace import DATASETS, Workspace
-from plushsense.workflow.api import simulate
 from support.browsing import DESK, TABLET, axe, marked
 from support.recorded import record
 
 Fixture = Callable[..., Any]
 LONG_MS = 90_000
-
-
-def zipped(folder: Path) -> bytes:
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path in sorted(folder.rglob("*")):
-            if path.is_file():
-                archive.write(path, path.relative_to(folder))
-    return out.getvalue()
-
-
-def send(page: Any, name: str, data: bytes) -> None:
-    page.locator("input[type=file]").set_input_files({"name": name, "mimeType": "application/zip", "buffer": data})
 
 
 def test_from_nothing_to_a_data_set_by_one_click(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
@@ -141,7 +125,7 @@ def test_data_sets_and_networks_are_renamed_discarded_and_deleted(studio: Fixtur
     assert browser.complaints == []
 
 
-def test_the_toy_is_chosen_and_tested(studio: Fixture, look: Fixture) -> None:
+def test_the_toy_is_chosen_and_tested(studio: Fixture, look: Fixture, server: Callable[[bytes], str]) -> None:
     one = studio("--speed", "10")
     browser = look()
     page = browser.open(one.url)
@@ -151,89 +135,31 @@ def test_the_toy_is_chosen_and_tested(studio: Fixture, look: Fixture) -> None:
     page.get_by_role("option", name="Person 12").click()
     marked(page, "virtual").click()
     marked(page, "chosen").get_by_text("virtual://?person=12").wait_for()
-    marked(page, "test").click()
-    marked(page, "message").get_by_text("The toy works").wait_for()
+    marked(page, "trial").get_by_text("The toy works").wait_for()
     # Another tab shows the same toy, and hears of a change.
     second = browser.open(one.url)
     marked(second, "chosen").get_by_text("person=12").wait_for()
-    for wrong in ("http://x", "replay:///etc/passwd"):
-        marked(page, "address").fill(wrong)
+    wrong = {"http://x": "is no kind of toy", "tcp://10.0.0.1:99999": "from 1 to 65535", "": "Enter the address"}
+    wrong |= {"serial:///dev/nothing": "There is no port /dev/nothing", "replay:///etc/passwd": "/etc/passwd"}
+    for address, reason in wrong.items():
+        marked(page, "address").fill(address)
         marked(page, "use").click()
-        marked(page, "message").get_by_text(wrong.partition("//")[2]).wait_for()
+        marked(page, "toy").get_by_role("alert").get_by_text(reason).wait_for()
     marked(page, "address").fill("virtual://?person=3")
     marked(page, "use").click()
     marked(second, "chosen").get_by_text("person=3").wait_for()
     marked(page, "address").fill("tcp://127.0.0.1:9")
-    marked(page, "use").click()
+    page.keyboard.press("Enter")
     marked(page, "chosen").get_by_text("tcp://127.0.0.1:9").wait_for()
-    marked(page, "test").click()
-    page.get_by_role("alert").get_by_text("127.0.0.1:9").wait_for()
+    marked(page, "trial").get_by_text("does not answer on port 9").wait_for()
     assert axe(page) == []
+    # A toy with older firmware: its layout is found, and one press uses it.
+    address = server(b" ".join([b"1"] * 13) + b" 10\n")
+    marked(page, "address").fill(address)
+    marked(page, "use").click()
+    marked(page, "use-layout").click()
+    marked(page, "chosen").get_by_text(f"{address}?layout=plush-14").wait_for()
     assert browser.complaints == []
-
-
-def test_recordings_come_in_as_a_zip(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
-    simulate(tmp_path / "made", people=2, repetitions=1)
-    data = zipped(tmp_path / "made")
-    one = studio()
-    browser = look()
-    page = browser.open(one.url)
-    send(page, "notes.txt", b"hello")
-    page.get_by_role("alert").wait_for()
-    send(page, "broken.zip", b"PK not a zip")
-    marked(page, "job-refused").get_by_text("no zip, or a damaged one").wait_for()
-    bomb = io.BytesIO()
-    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("P01/Tail pull_1700000000000_300.csv", b"0" * 20_000_000)
-        archive.writestr("../../outside.csv", b"1")
-    page.get_by_role("combobox", name="Sensor layout of the toy").click()
-    page.get_by_role("option", name="plush-15").click()
-    send(page, "bomb.zip", bomb.getvalue())
-    marked(page, "job-refused").get_by_text("holds no recording").wait_for()
-    marked(page, "incoming-name").fill("brought")
-    send(page, "mine.zip", data)
-    marked(page, "job-done").get_by_text("people: 2").wait_for(timeout=LONG_MS)
-    assert "recordings: 51" in marked(page, "dataset").inner_text()
-    marked(page, "incoming-name").fill("brought")
-    send(page, "mine.zip", data)
-    page.get_by_role("alert").get_by_text("exists already").wait_for()
-    home = tmp_path / "home"
-    assert sorted(p.name for p in (home / DATASETS).iterdir()) == ["brought"]
-    assert list((home / "work" / "incoming").iterdir()) == []
-    assert not (tmp_path / "outside.csv").exists()
-    assert browser.complaints == []
-
-
-def test_the_button_opens_the_file_chooser(studio: Fixture, look: Fixture, furniture: Path, tmp_path: Path) -> None:
-    browser = look()
-    page = browser.open(studio().url)
-    with page.expect_file_chooser() as choosing:
-        page.get_by_role("button", name="Choose a .zip or .plush file").click()
-    choosing.value.set_files(furniture / "bundles" / "little.plush")
-    marked(page, "message").get_by_text("is added").wait_for()
-    assert [p.name for p in (tmp_path / "home" / "bundles").iterdir()] == ["little.plush"]
-    assert browser.complaints == []
-
-
-def test_a_file_that_is_too_large_is_refused(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
-    huge = tmp_path / "huge.zip"
-    with huge.open("wb") as file:
-        file.truncate(500_000_001)
-    page = look().open(studio().url)
-    page.locator("input[type=file]").set_input_files(str(huge))
-    page.get_by_role("alert").get_by_text("at most 500 MB").wait_for()
-    assert not (tmp_path / "home" / "work" / "incoming").exists()
-
-
-def test_a_bundle_comes_in(studio: Fixture, look: Fixture, furniture: Path, tmp_path: Path) -> None:
-    page = look().open(studio().url)
-    send(page, "bad.plush", b"nothing")
-    page.get_by_role("alert").get_by_text("bad.plush").wait_for()
-    send(page, "../../good one!.plush", (furniture / "bundles" / "little.plush").read_bytes())
-    marked(page, "message").get_by_text("is added").wait_for()
-    assert "gestures: 18" in marked(page, "bundle").inner_text()
-    assert [p.name for p in (tmp_path / "home" / "bundles").iterdir()] == ["good one.plush"]
-    marked(page, "next-sentence").get_by_text("is trained").wait_for()
 
 
 def test_a_full_home_with_broken_things(studio: Fixture, look: Fixture, home: Path) -> None:

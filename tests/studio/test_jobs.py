@@ -143,17 +143,12 @@ def test_an_id_that_is_none_is_refused(jobs: Jobs) -> None:
     jobs.stop("nothing")
 
 
-def test_files_that_nobody_waits_for_are_removed(workspace: Workspace) -> None:
-    sent = workspace.folder / WORK / INCOMING
+def test_uploaded_files_that_were_not_imported_are_removed(workspace: Workspace) -> None:
+    sent = workspace.folder / WORK / INCOMING / "1"
     sent.mkdir(parents=True)
-    for name in ("half.zip", "imported.zip", "stopped.zip"):
-        (sent / name).write_bytes(b"PK")
-    for number, state, name in ((1, DONE, "imported.zip"), (2, RUNNING, "stopped.zip")):
-        spec = {"archive": str(sent / name)}
-        job = {"id": str(number), "task": "import", "spec": spec, "title": name, "state": state}
-        (workspace.folder / WORK / f"{number}.json").write_text(json.dumps(job), encoding="utf-8")
-    assert [j.state for j in Jobs(workspace).all()] == [STOPPED, DONE]
-    assert [p.name for p in sent.iterdir()] == ["stopped.zip"]
+    (sent / "half.zip").write_bytes(b"PK")
+    assert Jobs(workspace).all() == []
+    assert not sent.exists()
 
 
 @pytest.mark.parametrize(

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -21,33 +20,6 @@ from plushsense.studio.app.workspace import Workspace
 @pytest.fixture
 def toys(tmp_path: Path) -> Toys:
     return Toys(Workspace(tmp_path / "home", devices=("replay:///given.csv",), toy="virtual://?person=2", speed=20.0))
-
-
-@pytest.fixture
-def server() -> Iterator[Callable[[bytes], str]]:
-    """A toy over TCP that says the same again and again; gives its URL."""
-    sockets: list[socket.socket] = []
-
-    def serve(line: bytes) -> str:
-        reader = socket.create_server(("127.0.0.1", 0))
-        sockets.append(reader)
-
-        def talk() -> None:
-            try:
-                talking, _ = reader.accept()
-                sockets.append(talking)
-                while line:
-                    talking.sendall(line)
-                    time.sleep(0.01)
-            except OSError:
-                pass
-
-        threading.Thread(target=talk, daemon=True).start()
-        return f"tcp://127.0.0.1:{reader.getsockname()[1]}"
-
-    yield serve
-    for one in sockets:
-        one.close()
 
 
 def test_looking_does_not_wait_and_rings(toys: Toys, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,6 +109,17 @@ def test_the_virtual_toy_passes(toys: Toys, monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_toy_of_another_layout_does_not_fit(toys: Toys, server: Callable[[bytes], str]) -> None:
     with pytest.raises(DeviceError, match=r"no frames of the layout 'plush-15'.*layout=plush-14"):
         toys.test(server(b"1 2 3\n"))
+
+
+def test_the_layout_of_another_firmware_is_found(toys: Toys, server: Callable[[bytes], str]) -> None:
+    url = toys.choose(server(b" ".join([b"1"] * 13) + b" 10\n"))
+    toys.try_out()
+    end = time.monotonic() + 60
+    while toys.trial is None or toys.trial.running:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    assert (toys.trial.result, toys.trial.layout) == (None, "plush-14")
+    assert room.with_layout(f"{url}?layout=x&a=1", "plush-14") == f"{url}?a=1&layout=plush-14"
 
 
 def test_a_slow_toy_fits_but_not_on_time(toys: Toys, server: Callable[[bytes], str]) -> None:

@@ -45,6 +45,26 @@ class PlushSenseError(Exception):
         self.reason, self.values = reason, values
 
 
+class Note(str):
+    """A sentence for the user that is no error: a note, or the reason why a file is refused.
+
+    It is a plain text for the command line. ``reason`` and ``values`` are as in `PlushSenseError`.
+    """
+
+    reason: str
+    values: dict[str, object]
+
+    def __new__(cls, message: str, *, reason: str = "", **values: object) -> Note:
+        note = super().__new__(cls, message)
+        note.reason, note.values = reason, values
+        return note
+
+    @classmethod
+    def of(cls, error: PlushSenseError) -> Note:
+        """Return the message of an error as a note."""
+        return cls(str(error), reason=error.reason, **error.values)
+
+
 class BadInput(PlushSenseError):
     """Invalid input of the user."""
 

@@ -134,7 +134,11 @@ def parse_table(
         rows, labels, malformed = _parse_slowly(lines, separator, len(keys), label_at)
         if rows:
             return np.array(rows), np.array(labels), malformed
-    raise FileFormatError(f"'{path.name}' has no usable row: each must hold {len(keys)} numbers ({', '.join(keys)}).")
+    raise FileFormatError(
+        f"'{path.name}' has no usable row: each must hold {len(keys)} numbers ({', '.join(keys)}).",
+        reason="rows_unusable",
+        n=len(keys),
+    )
 
 
 STREAM_NAME = "fulldatastream.csv"
@@ -253,7 +257,11 @@ def column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], bo
         return columns[:-1], header
     raise FileFormatError(
         f"'{path.name}' has {len(cells)} columns, but a file of layout '{layout.name}' has {len(columns)} "
-        f"({', '.join(columns)}): choose another --layout.{_suggest_layout(len(cells), layout)}"
+        f"({', '.join(columns)}): choose another --layout.{_suggest_layout(len(cells), layout)}",
+        reason="columns_differ",
+        n=len(cells),
+        layout=layout.name,
+        expected=len(columns),
     )
 
 
@@ -281,7 +289,8 @@ def read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as cause:
-        raise FileFormatError(f"'{path}' cannot be read: {cause.strerror or cause}.") from None
+        message = f"'{path}' cannot be read: {cause.strerror or cause}."
+        raise FileFormatError(message, reason="file_unreadable") from None
 
 
 def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool = False) -> ReadResult:  # noqa: C901
@@ -291,20 +300,22 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if b"\x00" in data[:4096]:
-        raise FileFormatError(f"'{path.name}' is not a text file: a recording is a CSV file in UTF-8.")
+        message = f"'{path.name}' is not a text file: a recording is a CSV file in UTF-8."
+        raise FileFormatError(message, reason="file_no_recording")
     data = data.lstrip()
     cut = whole_lines and b"\n" in data and not data.endswith(b"\n")
     if cut:
         data = data[: data.rfind(b"\n") + 1]
     if not data:
-        raise FileFormatError(f"'{path.name}' is empty: a recording has one row a sample.")
+        raise FileFormatError(f"'{path.name}' is empty: a recording has one row a sample.", reason="file_empty")
     end = data.find(b"\n")
     first = data if end < 0 else data[:end]
     if len(first) > LONGEST_LINE:
-        raise FileFormatError(f"'{path.name}' begins with a line of {len(first)} characters: it is not a recording.")
+        message = f"'{path.name}' begins with a line of {len(first)} characters: it is not a recording."
+        raise FileFormatError(message, reason="file_no_recording")
     keys, header = column_keys(first, layout, path)
     if header and (end < 0 or not data[end:].strip()):
-        raise FileFormatError(f"'{path.name}' has a header but no row.")
+        raise FileFormatError(f"'{path.name}' has a header but no row.", reason="file_empty")
     table, labels, malformed = parse_table(data, keys, 1 if header else 0, path)
     numeric = [k for k in keys if k != "label"]
     warnings: list[str] = ["the last line is cut off: left out"] if cut else []
@@ -323,7 +334,8 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
     steps = np.array([c.step for c in layout.channels])
     missing = [n for n in layout.names if n not in numeric]
     if missing:
-        raise FileFormatError(f"'{path.name}' has no column for {', '.join(missing)} of layout '{layout.name}'.")
+        message = f"'{path.name}' has no column for {', '.join(missing)} of layout '{layout.name}'."
+        raise FileFormatError(message, reason="column_missing", column=missing[0])
     values = table[:, [numeric.index(n) for n in layout.names]]
     host = column(HOST_MS)
     clock = column(DEVICE_MS)
@@ -339,7 +351,8 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
             clock = host
             warnings.append("no device clock: the host's time is used")
         else:
-            raise FileFormatError(f"'{path.name}' has no clock column: {DEVICE_MS}, {DELAY_MS} or {HOST_MS}.")
+            message = f"'{path.name}' has no clock column: {DEVICE_MS}, {DELAY_MS} or {HOST_MS}."
+            raise FileFormatError(message, reason="column_missing", column=DEVICE_MS)
     frames = Frames(as_whole(values if np.all(steps == 1.0) else values / steps), clock, host, labels)
     return ReadResult(frames, warnings, malformed + cut, header, integrated, cut)
 

@@ -67,7 +67,8 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
     """
     folder, target = Path(dataset), Path(file)
     if target.exists() or target.is_symlink():
-        raise DatasetError(f"'{target}' exists already: a backup never replaces another; give a new name.")
+        message = f"'{target}' exists already: a backup never replaces another; give a new name."
+        raise DatasetError(message, reason="name_exists", name=target.name)
     if folder.resolve() in target.resolve().parents:
         raise DatasetError(f"'{target}' lies in the data set itself: give a place outside of '{folder}'.")
     report = progress or (lambda done, total: None)
@@ -98,11 +99,15 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
                 archive.writestr(zip_entry(MANIFEST), text.encode("utf-8"))
             _verify(part, lambda n: report(total // 2 + n, total))
             if target.exists():
-                raise DatasetError(f"'{target}' appeared meanwhile: a backup never replaces another; give a new name.")
+                message = f"'{target}' appeared meanwhile: a backup never replaces another; give a new name."
+                raise DatasetError(message, reason="name_exists", name=target.name)
     except OSError as cause:
         raise DatasetError(
             f"The backup '{target}' cannot be written ({cause.strerror or cause}; '{cause.filename or target}'): "
-            "check the path and the disk."
+            "check the path and the disk.",
+            reason="system",
+            where=f" ('{cause.filename or target}')",
+            why=cause.strerror or str(cause),
         ) from None
     return _summary(target, manifest, tuple(f.path.as_posix() for f in listed if f.kind == "link"))
 
@@ -117,6 +122,15 @@ def check_backup(file: str | Path, progress: Progress | None = None) -> Backup:
     total = path.stat().st_size if path.is_file() else 0
     manifest = _verify(path, lambda n: progress(min(n, total), total) if progress is not None else None)
     return _summary(path, manifest)
+
+
+def is_backup(file: str | Path) -> bool:
+    """Return whether a file is a zip that holds the manifest of a backup; it may be damaged otherwise."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            return MANIFEST in archive.namelist()
+    except _NO_MANIFEST:
+        return False
 
 
 def restore(file: str | Path, dest: str | Path, progress: Progress | None = None) -> Dataset:
@@ -142,7 +156,9 @@ def restore(file: str | Path, dest: str | Path, progress: Progress | None = None
             if again.hash != manifest["hash"]:
                 raise DatasetError(
                     f"The backup '{path}' restores another data set than the saved one ({len(again.recordings)} "
-                    f"recordings of {manifest['recordings']}): restore it with the PlushSense that wrote it."
+                    f"recordings of {manifest['recordings']}): restore it with the PlushSense that wrote it.",
+                    reason="backup_other",
+                    name=path.name,
                 )
     return open_dataset(folder)
 
@@ -159,7 +175,8 @@ def _store(archive: zipfile.ZipFile, folder: Path, path: PurePosixPath) -> dict[
                 member.write(chunk)
         after = os.fstat(file.fileno())
     if size != before.st_size or (before.st_mtime_ns, before.st_size) != (after.st_mtime_ns, after.st_size):
-        raise DatasetError(f"'{folder / path}' changed while it was saved: back up when nothing is recorded.")
+        message = f"'{folder / path}' changed while it was saved: back up when nothing is recorded."
+        raise DatasetError(message, reason="backup_changed", file=path.name)
     return {"path": path.as_posix(), "bytes": size, "sha256": digest.hexdigest()}
 
 
@@ -178,7 +195,8 @@ def _summary(file: Path, manifest: dict[str, Any], left_out: tuple[str, ...] = (
 
 
 def _damaged(path: Path, why: object) -> DatasetError:
-    return DatasetError(f"The backup '{path}' is damaged ({why}): use another copy of it.")
+    message = f"The backup '{path}' is damaged ({why}): use another copy of it."
+    return DatasetError(message, reason="backup_damaged", name=path.name)
 
 
 @contextmanager
@@ -187,19 +205,25 @@ def _open_backup(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]
     try:
         archive = zipfile.ZipFile(path)
     except FileNotFoundError:
-        raise DatasetError(f"There is no backup '{path}': check the path.") from None
+        raise DatasetError(
+            f"There is no backup '{path}': check the path.", reason="file_gone", name=path.name
+        ) from None
     except OSError as cause:
-        raise DatasetError(f"The backup '{path}' cannot be read ({cause.strerror or cause}).") from None
+        message = f"The backup '{path}' cannot be read ({cause.strerror or cause})."
+        raise DatasetError(message, reason="backup_damaged", name=path.name) from None
     except _BROKEN as cause:
-        raise DatasetError(f"'{path}' is no backup of PlushSense, or a damaged one ({cause}).") from None
+        message = f"'{path}' is no backup of PlushSense, or a damaged one ({cause})."
+        raise DatasetError(message, reason="backup_damaged", name=path.name) from None
     with archive:
         members = archive.infolist()
         names = [info.filename for info in members]
         if MANIFEST not in names:
-            raise DatasetError(f"'{path}' is no backup of PlushSense (it holds no {MANIFEST}), or a damaged one.")
+            message = f"'{path}' is no backup of PlushSense (it holds no {MANIFEST}), or a damaged one."
+            raise DatasetError(message, reason="backup_damaged", name=path.name)
         for info in members:
             if reason := _refusal(info):
-                raise DatasetError(f"The backup '{path}' is not used: '{info.filename}' in it is {reason}.")
+                message = f"The backup '{path}' is not used: '{info.filename}' in it is {reason}."
+                raise DatasetError(message, reason="backup_damaged", name=path.name)
         if len(set(names)) != len(names):
             raise _damaged(path, "it holds a name twice")
         manifest = _manifest_of(path, archive)
@@ -236,7 +260,9 @@ def _manifest_of(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
             raise ValueError("its manifest has another format")
         if table["version"] != VERSION:
             raise DatasetError(
-                f"The backup '{path}' has the version {table['version']!r}; this PlushSense reads {VERSION}."
+                f"The backup '{path}' has the version {table['version']!r}; this PlushSense reads {VERSION}.",
+                reason="backup_version",
+                name=path.name,
             )
         kinds = {"name": str, "recordings": int, "subjects": int, "hash": str, "files": list}
         entry_kinds = {"path": str, "bytes": int, "sha256": str}

@@ -221,8 +221,8 @@ class BleDevice(Device):
         raise DeviceError(
             f"'{self.url}': no Bluetooth device {described} advertised within {target.find_s:g} s; {here}; "
             "is it switched on, near, and not connected elsewhere?",
-            reason="toy_unreachable",
-            url=self.url,
+            reason="toy_no_bluetooth",
+            name=target.name or target.address,
         )
 
     def _characteristic(self, services: list[Any]) -> Any:
@@ -269,7 +269,7 @@ def scan(seconds: float, backends: BleBackends | None = None) -> list[BleAdverti
         asyncio.run_coroutine_threadsafe(look(), bluetooth_loop()).result()
     except Exception as cause:  # noqa: BLE001, RUF100
         words = in_words(cause)
-        raise DeviceError(f"{words[0].upper()}{words[1:]}.") from None
+        raise DeviceError(f"{words[0].upper()}{words[1:]}.", reason="bluetooth_unusable") from None
     return sorted(seen.values(), key=lambda s: (-s.rssi, s.name, s.address))
 
 
@@ -343,7 +343,8 @@ def open_ble(address: DeviceAddress, layout: Layout) -> BleDevice:
     if not (name.strip() if by_name else _MAC.match(place) or _UUID.match(place.lower())):
         raise DeviceError(
             f"'{address.url}' names no Bluetooth toy: write ble://AA:BB:CC:DD:EE:FF, the UUID that macOS gives in its "
-            "place, or ble://name:PlushName (plushsense devices lists them)."
+            "place, or ble://name:PlushName (plushsense devices lists them).",
+            reason="toy_ble_address",
         )
     service, tx = _uuid(address, "service"), _uuid(address, "tx")
     target = BleTarget(

@@ -13,7 +13,7 @@ from pathlib import Path
 import serial as pyserial
 from serial.tools import list_ports
 
-from plushsense.core.errors import DeviceError
+from plushsense.core.errors import DeviceError, Note
 from plushsense.core.layouts import Layout
 from plushsense.devices.base import Device, Frame, now_ms
 from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
@@ -37,7 +37,7 @@ def serial_ports() -> list[tuple[str, str]]:
 def search_serial(_: float) -> DeviceListing:
     """List the serial ports."""
     ports = [(name, "" if about == "n/a" else about) for name, about in serial_ports()]
-    notes = [] if ports else ["This computer has no serial port now."]
+    notes: list[str] = [] if ports else [Note("This computer has no serial port now.", reason="no_serial_port")]
     return DeviceListing([DeviceInfo(f"serial://{name}", "serial", name, about) for name, about in ports], notes)
 
 
@@ -82,33 +82,54 @@ def _reason(cause: Exception) -> str:
 
 def _refusal(url: str, port: str, cause: Exception) -> DeviceError:
     number = getattr(cause, "errno", None)
-    busy = f"'{url}': another program is using {port}; close it first."
+    cannot = DeviceError(
+        f"'{url}' cannot be opened: {cause if isinstance(cause, ValueError) else _reason(cause)}.",
+        reason="toy_unreachable",
+        url=url,
+    )
     if isinstance(cause, ValueError):
-        return DeviceError(f"'{url}' cannot be opened: {cause}.", reason="port_unusable", port=port)
+        return cannot
+    busy = f"'{url}': another program is using {port}; close it first."
     if os.name == "posix" and Path(port).exists():
         if number in (13, 1):
             message = f"'{url}': this user may not open {port}; on Linux join the group dialout and log in again."
-            return DeviceError(message, reason="port_denied", port=port)
+            return DeviceError(message, reason="toy_port_denied", port=port)
         if number == 11 or "lock" in str(cause).lower():
-            return DeviceError(busy, reason="port_busy", port=port)
-        return DeviceError(f"'{url}' cannot be opened: {_reason(cause)}.", reason="port_unusable", port=port)
+            return DeviceError(busy, reason="toy_port_busy", port=port)
+        return cannot
     if "access is denied" in str(cause).lower() or "PermissionError" in str(cause):
-        return DeviceError(busy, reason="port_busy", port=port)
-    ports = [name for name, _ in serial_ports()]
-    here = f"the ports here are {', '.join(ports)}" if ports else "this computer has no serial port now"
-    return DeviceError(f"'{url}': there is no port {port}; {here}.", reason="port_missing", port=port)
+        return DeviceError(busy, reason="toy_port_busy", port=port)
+    return _no_port(url, port)
+
+
+def _no_port(url: str, port: str) -> DeviceError:
+    ports = ", ".join(name for name, _ in serial_ports())
+    here = f"the ports here are {ports}" if ports else "this computer has no serial port now"
+    return DeviceError(
+        f"'{url}': there is no port {port}; {here}.", reason="toy_no_port", port=port, ports=ports or "–"
+    )
+
+
+def _port_of(address: DeviceAddress) -> str:
+    """Return the name of the port; raise an error for an address that is not ``serial://PORT``."""
+    address.check_keys(("baud",))
+    if not address.place.strip("/"):
+        message = f"'{address.url}' names no port: write serial:///dev/ttyUSB0 or serial://COM3."
+        raise DeviceError(message, reason="toy_serial_address")
+    place = address.place
+    return place[1:] if place.startswith("/") and place[1:].upper().startswith("COM") else place
+
+
+def check_serial(address: DeviceAddress) -> None:
+    """Raise DeviceError if the port does not exist."""
+    port = _port_of(address)
+    if not Path(port).exists() and port.upper() not in [name.upper() for name, _ in serial_ports()]:
+        raise _no_port(address.url, port)
 
 
 def open_serial(address: DeviceAddress, layout: Layout) -> SerialDevice:
     """Open ``serial:///dev/ttyUSB0?baud=115200`` or ``serial://COM3``."""
-    address.check_keys(("baud",))
-    if not address.place.strip("/"):
-        message = f"'{address.url}' names no port: write serial:///dev/ttyUSB0 or serial://COM3."
-        raise DeviceError(message, reason="url_bad", url=address.url)
-    place = address.place
-    if place.startswith("/") and place[1:].upper().startswith("COM"):
-        place = place[1:]
-    return SerialDevice(address.url, layout, place, address.whole("baud", BAUD, 50, 4_000_000))
+    return SerialDevice(address.url, layout, _port_of(address), address.whole("baud", BAUD, 50, 4_000_000))
 
 
 CONNECT_S = 5.0
@@ -125,12 +146,13 @@ class TcpDevice(Device):
             self._socket = socket.create_connection((host, port), timeout=CONNECT_S)
         except socket.gaierror:
             message = f"'{url}': there is no host '{host}'; check the name."
-            raise DeviceError(message, reason="toy_unreachable", url=url) from None
+            raise DeviceError(message, reason="toy_no_host", host=host) from None
         except ConnectionRefusedError:
             raise DeviceError(
                 f"'{url}': nobody listens on port {port} of {host}; start the toy there (plushsense toy --tcp {port}).",
-                reason="toy_unreachable",
-                url=url,
+                reason="toy_refused",
+                host=host,
+                port=port,
             ) from None
         except (TimeoutError, OSError, UnicodeError) as cause:
             silent = isinstance(cause, TimeoutError)
@@ -176,11 +198,16 @@ def _enable_keepalive(connection: socket.socket) -> None:
                 connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
 
-def open_tcp(address: DeviceAddress, layout: Layout) -> TcpDevice:
-    """Open ``tcp://host:port``."""
+def check_tcp(address: DeviceAddress) -> tuple[str, int]:
+    """Return host and port; raise an error for an address that is not ``tcp://host:port``."""
     address.check_keys(())
     match = re.fullmatch(r"(\[[^\]]+\]|[^:/\[\]]+):(\d{1,5})/?", address.place, re.ASCII)
     if match is None or not 1 <= int(match[2]) <= 65535:
         message = f"'{address.url}': a network toy is tcp://host:port, with a port from 1 to 65535."
-        raise DeviceError(message, reason="url_bad", url=address.url)
-    return TcpDevice(address.url, layout, match[1].strip("[]"), int(match[2]))
+        raise DeviceError(message, reason="toy_tcp_address")
+    return match[1].strip("[]"), int(match[2])
+
+
+def open_tcp(address: DeviceAddress, layout: Layout) -> TcpDevice:
+    """Open ``tcp://host:port``."""
+    return TcpDevice(address.url, layout, *check_tcp(address))

@@ -105,8 +105,8 @@ class LslDevice(Device):
         raise DeviceError(
             f"'{self.url}': no LSL stream has the {key} '{value}' within {find_s:g} s; "
             f"{f'there are {there}' if there else 'there is none on this network'}.",
-            reason="toy_unreachable",
-            url=self.url,
+            reason="toy_no_lsl",
+            name=value,
         )
 
     def read(self) -> list[Frame] | None:

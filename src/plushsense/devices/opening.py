@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from plushsense.core.errors import ConfigError, DeviceError, MissingExtraError, PlushSenseError, nearest
+from plushsense.core.errors import ConfigError, DeviceError, MissingExtraError, Note, PlushSenseError, nearest
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.devices.base import Device
 from plushsense.devices.reconnect import ReconnectingDevice
@@ -29,6 +29,12 @@ SCHEMES: dict[str, str] = {
     "virtual": "plushsense.devices.virtual.stream:open_virtual",
 }
 """For each scheme, ``module:function`` of a function (address, layout) that returns the open `Device`."""
+
+CHECKS: dict[str, str] = {
+    "serial": "plushsense.devices.bytestreams:check_serial",
+    "tcp": "plushsense.devices.bytestreams:check_tcp",
+}
+"""For some schemes, ``module:function`` of a function (address) that raises an error if no toy can be there."""
 
 SEARCHES: dict[str, str] = {
     "Serial ports": "plushsense.devices.bytestreams:search_serial",
@@ -60,8 +66,9 @@ class DeviceAddress:
                 raise ConfigError(
                     f"'{self.url}': unknown setting '{key}' of {self.scheme}://: "
                     f"accepted are {', '.join(accepted)}.{nearest(key, accepted)}",
-                    reason="url_bad",
-                    url=self.url,
+                    reason="toy_setting",
+                    key=key,
+                    known=", ".join(accepted),
                 )
 
     def whole(self, key: str, default: int, low: int = 0, high: int = 2**31 - 1) -> int:
@@ -71,7 +78,7 @@ class DeviceAddress:
             return default
         if not re.fullmatch(r"\d{1,10}", text, re.ASCII) or not low <= int(text) <= high:
             message = f"'{self.url}': {key} is '{text}'; accepted is a whole number, {low} to {high}."
-            raise ConfigError(message, reason="url_bad", url=self.url)
+            raise ConfigError(message, reason="toy_number", key=key, low=low, high=high)
         return int(text)
 
     def number(self, key: str, default: float, low: float = 0.0, high: float = 1e6) -> float:
@@ -85,7 +92,7 @@ class DeviceAddress:
             value = math.nan
         if not low <= value <= high:
             message = f"'{self.url}': {key} is '{text}'; accepted is a number, {low:g} to {high:g}."
-            raise ConfigError(message, reason="url_bad", url=self.url)
+            raise ConfigError(message, reason="toy_number", key=key, low=f"{low:g}", high=f"{high:g}")
         return value
 
 
@@ -97,14 +104,14 @@ def parse_url(url: str) -> DeviceAddress:
     """
     text = os.fspath(url).strip()
     if not text:
-        raise ConfigError(f"No device URL was given; accepted are {EXAMPLES}.", reason="no_toy")
+        raise ConfigError(f"No device URL was given; accepted are {EXAMPLES}.", reason="toy_no_address")
     match = re.match(r"([A-Za-z][A-Za-z0-9+.\-]+):(//)?", text)
     if match is None or (match[2] is None and match[1].lower() not in SCHEMES):
         if Path(text).is_file():
             return DeviceAddress(text, "replay", text)
         if re.fullmatch(r"/dev/\S+|COM\d+", text):
             message = f"'{text}' is a port, no recording to replay: write serial://{text}."
-            raise ConfigError(message, reason="url_bad", url=text)
+            raise ConfigError(message, reason="toy_is_port", port=text)
         place, query = _split_query(text, text)
         return DeviceAddress(text, "replay", place, query)
     scheme = match[1].lower()
@@ -112,8 +119,9 @@ def parse_url(url: str) -> DeviceAddress:
         raise ConfigError(
             f"'{text}': there is no scheme '{scheme}'; accepted are {', '.join(SCHEMES)}, as in {EXAMPLES}."
             f"{nearest(scheme, SCHEMES)}",
-            reason="url_bad",
-            url=text,
+            reason="toy_scheme",
+            scheme=scheme,
+            known=", ".join(f"{known}://" for known in SCHEMES),
         )
     place, query = _split_query(text[match.end() :], text)
     return DeviceAddress(text, scheme, place, query)
@@ -128,12 +136,18 @@ def _split_query(rest: str, url: str) -> tuple[str, dict[str, str]]:
         key, equals, value = part.partition("=")
         if not equals or not key:
             message = f"'{url}': '{part}' is no setting; write key=value, joined by &."
-            raise ConfigError(message, reason="url_bad", url=url)
+            raise ConfigError(message, reason="toy_query", part=part)
         if key in query:
             message = f"'{url}': the setting '{key}' stands there twice; leave one."
-            raise ConfigError(message, reason="url_bad", url=url)
+            raise ConfigError(message, reason="toy_query", part=key)
         query[key] = unquote(value.replace("+", " "))
     return place, query
+
+
+def check_address(address: DeviceAddress) -> None:
+    """Raise an error if no toy can be at an address: a port that does not exist, or a name that is not valid."""
+    if address.scheme in CHECKS:
+        pkgutil.resolve_name(CHECKS[address.scheme])(address)
 
 
 # Schemes whose data can end; a device of any other scheme can only disconnect.
@@ -223,11 +237,15 @@ def list_devices(scan_s: float = SCAN_S) -> DeviceListing:
         try:
             results[scheme] = pkgutil.resolve_name(search)(scan_s)
         except MissingExtraError as refusal:
-            results[scheme] = DeviceListing(notes=[f"{scheme}: not looked at. {refusal}"])
+            note = Note(f"{scheme}: not looked at. {refusal}", reason="search_missing", kind=scheme)
+            results[scheme] = DeviceListing(notes=[note])
         except PlushSenseError as refusal:
-            results[scheme] = DeviceListing(notes=[str(refusal)])
+            reason, values = (refusal.reason, refusal.values) if refusal.reason else ("search_failed", {"kind": scheme})
+            note = Note(str(refusal), reason=reason, **values)
+            results[scheme] = DeviceListing(notes=[note])
         except Exception as cause:  # noqa: BLE001, RUF100
-            results[scheme] = DeviceListing(notes=[f"{scheme} cannot be used: {' '.join(str(cause).split())}."])
+            message = f"{scheme} cannot be used: {' '.join(str(cause).split())}."
+            results[scheme] = DeviceListing(notes=[Note(message, reason="search_failed", kind=scheme)])
 
     threads = [threading.Thread(target=look, args=item, daemon=True) for item in SEARCHES.items()]
     for thread in threads:
@@ -235,7 +253,8 @@ def list_devices(scan_s: float = SCAN_S) -> DeviceListing:
     listing = DeviceListing()
     for thread, scheme in zip(threads, SEARCHES, strict=True):
         thread.join(scan_s + _GRACE_S)
-        part = results.get(scheme) or DeviceListing(notes=[f"{scheme} did not answer within {scan_s + _GRACE_S:g} s."])
+        late = Note(f"{scheme} did not answer within {scan_s + _GRACE_S:g} s.", reason="search_failed", kind=scheme)
+        part = results.get(scheme) or DeviceListing(notes=[late])
         listing.devices += part.devices
         listing.notes += part.notes
     listing.devices.append(DeviceInfo("virtual://?person=7", "virtual", "virtual toy", "in this program; a simulation"))

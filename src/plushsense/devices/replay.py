@@ -72,7 +72,7 @@ def open_replay(address: DeviceAddress, layout: Layout) -> ReplayDevice:
         raise DeviceError(
             f"'{address.url}': there is no file '{path if address.place else ''}' to replay; "
             "give the path of a recording or of a fulldatastream.csv.",
-            reason="replay_missing",
-            url=address.url,
+            reason="toy_no_file",
+            file=path if address.place else "",
         )
     return ReplayDevice(address.url, layout, path, speed)

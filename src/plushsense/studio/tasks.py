@@ -16,14 +16,16 @@ import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import ConfigError, DatasetError, PlushSenseError, ToolError
+from plushsense.core.errors import ConfigError, DatasetError, Note, PlushSenseError, ToolError
+from plushsense.dataset.backup import is_backup, restore
 from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
@@ -52,7 +54,7 @@ class TaskReporter:
     def write(self, **message: Any) -> None:
         """Write one line of JSON."""
         with self._lock:
-            self._out.write(json.dumps(message, ensure_ascii=True, default=str) + "\n")
+            self._out.write(json.dumps(_plain(message), ensure_ascii=True, default=str) + "\n")
             self._out.flush()
 
     def progress(self, **values: Any) -> None:
@@ -70,6 +72,15 @@ class TaskReporter:
     def warn(self, sentence: str) -> None:
         """Report a warning to the user."""
         self.write(warning=sentence)
+
+
+def _plain(value: Any) -> Any:
+    """Replace every `Note` in a value by a table of its message, reason and values, see `Words.note`."""
+    if isinstance(value, Note):
+        return {"message": str(value), "reason": value.reason, "values": _plain(value.values)}
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}
+    return [_plain(each) for each in value] if isinstance(value, list | tuple) else value
 
 
 class Clock:
@@ -115,20 +126,13 @@ UNPACKED = UnpackLimits(total_bytes=4_000_000_000, files=50_000)
 
 
 def run_import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Import ``sessions`` (folders in ``recordings``, collected in ``work``) or the zip ``archive`` into ``dest``.
+    """Import ``sessions`` (folders in ``recordings``, collected in ``work``) into ``dest``.
 
-    With ``add``, ``dest`` is an existing data set. The archive is the studio's copy and is removed afterwards.
+    With ``add``, ``dest`` is an existing data set.
     """
     settings: dict[str, Any] = {"add_to": True} if spec.get("add") else {"name": spec.get("name") or None}
-    if spec.get("layout"):
-        settings["layout"] = spec["layout"]
-    archive = Path(spec["archive"]) if spec.get("archive") else None
-    try:
-        with nullcontext(archive) if archive is not None else _collected(spec) as source:
-            done = import_recordings(source, spec["dest"], progress=reporter.count, limits=UNPACKED, **settings)
-    finally:
-        if archive is not None:
-            archive.unlink(missing_ok=True)
+    with _collected(spec) as source:
+        done = import_recordings(source, spec["dest"], progress=reporter.count, **settings)
     return {
         "dataset": str(spec["dest"]),
         "recordings": done.recordings,
@@ -162,6 +166,60 @@ def _link_or_copy(source: str, target: str) -> str:
     except OSError:
         shutil.copy2(source, target)
     return target
+
+
+def run_inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Make the data set ``dest`` of the folder or file of each path in ``sources``; return what it contains.
+
+    A source that cannot be imported is among ``rejected``, unless all are. ``layout`` and ``person`` may be "", see
+    `import_recordings`. A single backup is restored.
+    """
+    dest, sources = Path(spec["dest"]), [Path(source) for source in spec["sources"]]
+    shutil.rmtree(dest, ignore_errors=True)
+    notes: list[str] = []
+    rejected: list[dict[str, str]] = []
+    refusals: list[PlushSenseError] = []
+    restored = len(sources) == 1 and is_backup(sources[0])
+    flagged = 0
+    if restored:
+        restore(sources[0], dest, progress=reporter.count)
+        sources = []
+    for source in sources:
+        adding = dest.exists()
+        settings: dict[str, Any] = {} if adding or not spec["layout"] else {"layout": spec["layout"]}
+        try:
+            done = import_recordings(
+                source,
+                dest,
+                add_to=adding,
+                person=spec["person"],
+                guess_layout=not adding,
+                limits=UNPACKED,
+                progress=reporter.count,
+                **settings,
+            )
+        except PlushSenseError as refusal:
+            refusals.append(refusal)
+            rejected.append({"file": source.name, "reason": Note.of(refusal)})
+            continue
+        notes += done.notes
+        rejected += done.rejected
+        flagged += len(done.warnings)
+    if not dest.exists():
+        raise refusals[0]
+    dataset = open_dataset(dest)
+    return {
+        "name": dataset.head.name if restored else "",
+        "restored": restored,
+        "layout": dataset.head.layout.name,
+        "simulated": dataset.head.simulated,
+        "recordings": len(dataset.recordings),
+        "people": dict(Counter(r.subject for r in dataset.recordings)),
+        "gestures": dict(Counter(r.gesture for r in dataset.recordings)),
+        "notes": list(dict.fromkeys(notes)),
+        "flagged": flagged,
+        "rejected": rejected,
+    }
 
 
 def run_simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -424,6 +482,7 @@ TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
     "search": run_search,
     "evaluate": run_evaluate,
     "import": run_import,
+    "inspect": run_inspect,
     "publish": run_publish,
     "export": run_export,
     "verify": run_verify,

@@ -15,7 +15,7 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.errors import ConfigError, DatasetError, Note
 from plushsense.dataset.importing.build import DEVICE_NAME
 
 _CHUNK = 1 << 20
@@ -70,25 +70,25 @@ def zip_entry(name: str) -> zipfile.ZipInfo:
     return entry
 
 
-def _target(name: str) -> PurePosixPath | str:
+def member_target(name: str) -> PurePosixPath | Note:
     """Return the path of a member below the target folder, or the reason why it is refused."""
     plain = name.replace("\\", "/")
     if plain.startswith("/") or re.match(r"^[A-Za-z]:", plain):
-        return "its path is absolute: it would be written outside the target"
+        return Note("its path is absolute: it would be written outside the target", reason="file_outside")
     parts = [p for p in plain.split("/") if p not in ("", ".")]
     if ".." in parts:
-        return "its path holds '..': it would be written outside the target"
+        return Note("its path holds '..': it would be written outside the target", reason="file_outside")
     if not parts or len(parts) > _DEEPEST or len(plain) > _LONGEST_PATH:
-        return "its path is empty, too deep or too long"
+        return Note("its path is empty, too deep or too long", reason="file_name")
     for part in parts:
         if _FORBIDDEN.search(part) or part != part.rstrip(" .") or len(part.encode("utf-8", "replace")) > _LONGEST_NAME:
-            return "its name is not one that every file system can hold"
+            return Note("its name is not one that every file system can hold", reason="file_name")
         if DEVICE_NAME.match(part):
-            return f"'{part[:20]}' is the name of a device on Windows"
+            return Note(f"'{part[:20]}' is the name of a device on Windows", reason="file_name")
     try:
         plain.encode("utf-8")
     except UnicodeEncodeError:
-        return "its name is not UTF-8"
+        return Note("its name is not UTF-8", reason="file_name")
     return PurePosixPath(*parts)
 
 
@@ -96,15 +96,17 @@ def refusal(info: zipfile.ZipInfo, limits: UnpackLimits) -> str:
     """Return the reason to refuse a member by its directory entry; "" if it may be unpacked."""
     kind = stat.S_IFMT(info.external_attr >> 16)
     if kind == stat.S_IFLNK:
-        return "a symbolic link is not followed"
+        return Note("a symbolic link is not followed", reason="file_link")
     if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
-        return "not a regular file"
+        return Note("not a regular file", reason="file_link")
     if info.flag_bits & 0x41:
-        return "it is encrypted: unpack the archive with its password and import the folder"
+        message = "it is encrypted: unpack the archive with its password and import the folder"
+        return Note(message, reason="file_encrypted")
     if info.file_size > _SMALL_BYTES and info.file_size > limits.ratio * max(1, info.compress_size):
-        return (
+        return Note(
             f"it would swell {info.file_size / max(1, info.compress_size):.0f} times, more than the {limits.ratio:g} "
-            "that are allowed"
+            "that are allowed",
+            reason="file_swells",
         )
     return ""
 
@@ -144,7 +146,11 @@ def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list
     try:
         archive = zipfile.ZipFile(path)
     except DAMAGED as cause:
-        raise DatasetError(f"'{path}' is no zip, or a damaged one ({_message(cause)}): get another copy.") from None
+        raise DatasetError(
+            f"'{path}' is no zip, or a damaged one ({_message(cause)}): get another copy.",
+            reason="zip_damaged",
+            name=path.name,
+        ) from None
     with archive:
         members = [m for m in archive.infolist() if not m.filename.endswith("/")]
         total = sum(m.file_size for m in members)
@@ -152,28 +158,34 @@ def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list
             raise DatasetError(
                 f"'{path}' would unpack to {len(members)} files and {total / 1e9:.1f} GB; {limits.files} files and "
                 f"{limits.total_bytes / 1e9:g} GB are allowed: if you trust it, allow more (--max-gb) or unpack it "
-                "yourself."
+                "yourself.",
+                reason="zip_too_large",
+                name=path.name,
+                files=limits.files,
+                gb=f"{limits.total_bytes / 1e9:g}",
             )
         seen: set[str] = set()
         room = limits.total_bytes
         for info in members:
             name = info.filename.encode("utf-8", "backslashreplace").decode()
-            target = _target(info.orig_filename if "\x00" in info.orig_filename else info.filename)
+            target = member_target(info.orig_filename if "\x00" in info.orig_filename else info.filename)
             reason = target if isinstance(target, str) else refusal(info, limits)
             if isinstance(target, str) or reason:
                 refused.append((name, reason))
                 continue
             key = unicodedata.normalize("NFC", str(target)).casefold()
             if key in seen:
-                refused.append((name, "another member has the same name, but for case or accents"))
+                refused.append(
+                    (name, Note("another member has the same name, but for case or accents", reason="file_twice"))
+                )
                 continue
             seen.add(key)
             try:
                 room -= unpack_member(archive, info, folder / target, room)
             except (FileExistsError, NotADirectoryError, IsADirectoryError):
-                refused.append((name, "another member stands where its folder would be"))
+                refused.append((name, Note("another member stands where its folder would be", reason="file_twice")))
             except DAMAGED as cause:
-                refused.append((name, f"it is damaged: {_message(cause)}"))
+                refused.append((name, Note(f"it is damaged: {_message(cause)}", reason="file_damaged")))
     return refused
 
 

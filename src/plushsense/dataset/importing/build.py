@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import DatasetError
+from plushsense.core.errors import DatasetError, Note
 from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
@@ -30,8 +30,7 @@ from plushsense.dataset.store import (
 )
 from plushsense.recording.session_files import SESSION_LOG
 
-TWICE = "the same file was already imported"
-ORPHAN = "belongs to '{}', which was not imported"
+TWICE = Note("the same file was already imported", reason="file_twice")
 # Files to which the recorder only appends.
 APPENDED = (STREAM_NAME, SESSION_LOG)
 _LONGEST = 120
@@ -62,7 +61,11 @@ def refuse_merged(files: Sequence[SourceFile], there: Iterable[str] = ()) -> Non
     folders += [("sessions", f.session, session_folder(f.session), folder_name(f.subject)) for f in files if f.session]
     for kind, code, folder, within in folders:
         if len(folder.encode("utf-8")) > _LONGEST:
-            raise DatasetError(f"The code '{code[:40]}…' is too long: codes of {kind} have {_LONGEST} bytes at most.")
+            raise DatasetError(
+                f"The code '{code[:40]}…' is too long: codes of {kind} have {_LONGEST} bytes at most.",
+                reason="code_too_long",
+                code=f"{code[:40]}…",
+            )
         key = (folder.casefold(), within)
         first = codes.setdefault(key, code)
         if key in not_met and first == folder:
@@ -71,8 +74,16 @@ def refuse_merged(files: Sequence[SourceFile], there: Iterable[str] = ()) -> Non
             codes[key] = code
         elif first != code:
             raise DatasetError(
-                f"The {kind} '{first}' and '{code}' would share the folder '{folder}': rename one of them."
+                f"The {kind} '{first}' and '{code}' would share the folder '{folder}': rename one of them.",
+                reason="codes_alike",
+                a=first,
+                b=code,
             )
+
+
+def _orphan(name: str) -> Note:
+    """Return the reason to refuse a companion of the file ``name``, which was not imported."""
+    return Note(f"belongs to '{name}', which was not imported", reason="file_orphan")
 
 
 @dataclass
@@ -102,14 +113,14 @@ class Copier:
         try:
             raw = file.source.read_bytes()
         except OSError as cause:
-            return f"cannot be read: {cause.strerror or cause}"
+            return Note(f"cannot be read: {cause.strerror or cause}", reason="file_unreadable")
         content = hashlib.sha256(raw).hexdigest()
         if (existing := self.contents.get((file.kind, content))) is not None:
             self.already[file.source] = existing
             return ""
         folder = self._folder(file)
         if folder is None:
-            return ORPHAN.format(file.beside.name if file.beside else "")
+            return _orphan(file.beside.name if file.beside else "")
         companion = file.kind == COMPANIONS
         name = file.source.name
         place, again = folder, 1
@@ -167,10 +178,13 @@ def key_of(path: str, *, companion: bool) -> str:
 
 
 RECORDER = "recorder"
-SIMULATED = "these recordings are of the virtual toy: scores on them say nothing about a real toy"
-NO_PEOPLE = (
+SIMULATED = Note(
+    "these recordings are of the virtual toy: scores on them say nothing about a real toy", reason="simulated"
+)
+NO_PEOPLE = Note(
     "the folders are gestures, so the people are not known: splits by subject are not possible; "
-    "import again with --subjects map.csv (columns file,subject) if a mapping exists"
+    "import again with --subjects map.csv (columns file,subject) if a mapping exists",
+    reason="people_unknown",
 )
 
 
@@ -244,7 +258,7 @@ class ImportedFiles:
             self._remove(file)
             for source in self.copier.companions.pop(file, ()):
                 if (companion := self.copier.copied.get(source)) is not None:
-                    self.reject(self._origin[companion], ORPHAN.format(Path(file).name))
+                    self.reject(self._origin[companion], _orphan(Path(file).name))
                     self._remove(companion)
 
     def _remove(self, file: str) -> None:
@@ -297,7 +311,8 @@ def merge_people(
 ) -> tuple[list[PersonInfo], list[str]]:
     """Merge the people ``there`` with ``sessions``, which fill gaps, and the user's ``file``, which overrides both."""
     keys = ("age_group", "gender", "consent")
-    people, notes = dict(there), []
+    people = dict(there)
+    notes: list[str] = []
     for info in sessions:
         code = folder_name(info.subject)
         if code == NOBODY:
@@ -306,7 +321,8 @@ def merge_people(
         for key in keys:
             new, old = getattr(info, key), getattr(known, key)
             if new and old and new != old:
-                notes.append(f"the {key.replace('_', ' ')} of '{code}' is kept as '{old}'; a session states '{new}'")
+                message = f"the {key.replace('_', ' ')} of '{code}' is kept as '{old}'; a session states '{new}'"
+                notes.append(Note(message, reason="person_kept", person=code, old=old, new=new))
         values = {key: getattr(known, key) or getattr(info, key) for key in keys}
         people[code] = replace(known, **values, more=info.more | known.more)
     strangers = [code for code in file if folder_name(code) not in subjects]
@@ -347,9 +363,13 @@ def create_dataset(
         if not built.dataset.recordings:
             reasons = [*built.unreadable.values(), *(r["reason"] for r in account.rejected), *search.notes[-1:]]
             if not reasons:
-                raise DatasetError(f"'{source}' holds no finished recording yet, only a stream: record some first.")
+                message = f"'{source}' holds no finished recording yet, only a stream: record some first."
+                raise DatasetError(message, reason="import_only_stream")
             raise DatasetError(
-                f"'{source}' holds no recording that layout '{head.layout.name}' can read. The first: {reasons[0]}"
+                f"'{source}' holds no recording that layout '{head.layout.name}' can read. The first: {reasons[0]}",
+                reason="import_unreadable",
+                layout=head.layout.name,
+                first=reasons[0],
             )
         head = replace(head, gestures=extend_gestures(search.gestures, built.dataset))
         if {r.gesture for r in built.dataset.recordings} - set(head.gestures.labels):

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from plushsense.core.errors import ConfigError, DatasetError, FileFormatError
+from plushsense.core.errors import ConfigError, DatasetError, FileFormatError, Note
 from plushsense.core.files import write_file
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import Layout, layout_names, load_layout
@@ -38,7 +38,7 @@ from plushsense.dataset.importing.build import (
     read_copied,
     summarize_import,
 )
-from plushsense.dataset.importing.proposals import adopt, matching_layouts, propose_settings
+from plushsense.dataset.importing.proposals import adopt, matching_layouts, propose_settings, readable_layouts
 from plushsense.dataset.importing.sources import (
     LEFT_OUT,
     SourceFile,
@@ -89,7 +89,8 @@ def _locked_work_folder(dest: Path) -> Iterator[Path]:
             finally:
                 shutil.rmtree(work, ignore_errors=True)
     except Timeout:
-        raise DatasetError(f"Another import is adding to '{dest}' now: wait until it ends.") from None
+        message = f"Another import is adding to '{dest}' now: wait until it ends."
+        raise DatasetError(message, reason="import_runs") from None
 
 
 def _copier(dataset: Dataset, work: Path) -> Copier:
@@ -148,7 +149,9 @@ def add_to_dataset(
         if dataset.head.simulated != search.simulated:
             kinds = ("real", "virtual") if search.simulated else ("virtual", "real")
             raise DatasetError(
-                f"'{dest}' holds recordings of a {kinds[0]} toy, the source those of a {kinds[1]} one: keep them apart."
+                f"'{dest}' holds recordings of a {kinds[0]} toy, the source those of a {kinds[1]} one: keep them "
+                "apart.",
+                reason="real_and_virtual",
             )
         copier = _copier(dataset, work)
         account = ImportedFiles(search, copier)
@@ -161,7 +164,10 @@ def add_to_dataset(
             file, reason = account.rejected[0].values()
             raise DatasetError(
                 f"Nothing of the source fits '{dest}', whose layout is '{head.layout.name}': all "
-                f"{len(account.rejected)} files are rejected. The first: '{file}': {reason.rstrip('.')}."
+                f"{len(account.rejected)} files are rejected. The first: '{file}': {reason.rstrip('.')}.",
+                reason="import_unreadable",
+                layout=head.layout.name,
+                first=reason,
             )
         head = replace(head, gestures=extend_gestures(head.gestures, built.dataset))
         subjects = {r.subject for r in (*dataset.recordings, *built.dataset.recordings)}
@@ -198,10 +204,14 @@ def _returning_people_warning(dest: Path, come: list[str]) -> list[str]:
     if not come or not gone:
         return []
     days = ", ".join(dict.fromkeys(g.day for g in gone))
+    listed = f"{', '.join(come[:5])}{f' and {len(come) - 5} more' if len(come) > 5 else ''}"
     return [
-        f"people were removed from this data set ({len(gone)}; {days}), and {', '.join(come[:5])}"
-        f"{f' and {len(come) - 5} more' if len(come) > 5 else ''} were added now: remove a person again with  "
-        f"plushsense forget {dest} CODE"
+        Note(
+            f"people were removed from this data set ({len(gone)}; {days}), and {listed} were added now: remove a "
+            f"person again with  plushsense forget {dest} CODE",
+            reason="removed_return",
+            people=", ".join(come),
+        )
     ]
 
 
@@ -212,6 +222,8 @@ SHOWN = 5
 @dataclass(frozen=True)
 class ImportOptions:
     """Options of an import; ``layout``, ``gestures`` and ``mapping`` (file to person) may be None.
+
+    ``person`` and ``guess_layout`` are as in `import_recordings`.
 
     ``layout_origin`` describes the layout in messages; ``columns`` maps roles to column names; ``new_folder`` creates
     a temporary folder for unpacked or converted files.
@@ -224,6 +236,8 @@ class ImportOptions:
     layout_origin: str = "the given layout"
     columns: Mapping[str, str] = field(default_factory=dict)
     limits: UnpackLimits = field(default_factory=UnpackLimits)
+    person: str | None = None
+    guess_layout: bool = False
 
     def known_layout(self, own: Layout | None, files: Iterable[Path]) -> tuple[Layout, list[str]]:
         """Return the layout ``own`` of the source, else the given one, else the one that the header of a file names.
@@ -232,13 +246,19 @@ class ImportOptions:
         """
         if (layout := own or self.layout) is not None:
             return layout, []
+        files = list(files)
         found = matching_layouts(files)
+        if self.guess_layout and len(found) != 1:
+            found = readable_layouts(files, [layout.name for layout in found])[:1]
         if len(found) == 1:
-            return found[0], [f"the layout is '{found[0].name}', as the header of the files has its channels"]
+            name = found[0].name
+            message = f"the layout is '{name}', as the header of the files has its channels"
+            return found[0], [Note(message, reason="layout_guessed", layout=name)]
         fit = f"the header of the files fits {' and '.join(layout.name for layout in found)}. " if found else ""
         raise ConfigError(
             f"--layout is needed: {fit}Accepted are {', '.join(layout_names())}, or a TOML file of your own, which "
-            "names the channels (see docs/importing.md)."
+            "names the channels (see docs/importing.md).",
+            reason="layout_unknown",
         )
 
     def known_gestures(self, layout: Layout) -> GestureSet | None:
@@ -272,7 +292,7 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     classified = (
         refused
         + list(classify_session_files(sessions, in_session))
-        + classify_files(shape, source, plain, mapping, gestures)
+        + classify_files(shape, source, plain, mapping, gestures, options.person)
     )
     classified = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in classified]
     people, more = people_of(sessions)
@@ -283,12 +303,14 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     for file in (f for f in rest if f.suffix.lower() == ".xdf"):
         name = printable_path(file.relative_to(source))
         person = None if file.parent == around else file.parent.resolve().name
+        if file.parent == source and options.person is not None:
+            person = options.person or None
         if mapping is not None:
             person = mapping.get(name, mapping.get(file.name))
         try:
             _add_xdf(file, name, person, options, search)
         except FileFormatError as cause:
-            search.found.append(SourceFile(file, "", origin=name, reason=str(cause)))
+            search.found.append(SourceFile(file, "", origin=name, reason=Note.of(cause)))
     if mapping is not None:
         present = {name for f in rest for name in (f.name, f.relative_to(source).as_posix())}
         if missing := [name for name in mapping if name not in present]:
@@ -335,7 +357,9 @@ def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
     folder.mkdir()
     refused = unpack(path, folder, options.limits)
     if any(folder.rglob(HEAD)):
-        raise DatasetError(f"'{path}' holds a data set: unpack it and open the folder, it needs no import.")
+        message = f"'{path}' holds a data set: unpack it and open the folder, it needs no import."
+        raise DatasetError(message, reason="import_of_dataset", name=path.name)
+    options = replace(options, person=options.person or None)
     search = scan_folder(folder, options, around=path.resolve().parent)
     search.found += [SourceFile(path, "", origin=printable_path(Path(name)), reason=reason) for name, reason in refused]
     return search
@@ -344,7 +368,8 @@ def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
 def scan_xdf(path: Path, options: ImportOptions) -> SourceScan:
     """Convert and search an XDF file."""
     search = _scan_of_file(path, "xdf", options)
-    _add_xdf(path, path.name, (options.mapping or {}).get(path.name), options, search)
+    person = (options.mapping or {}).get(path.name) or options.person or None
+    _add_xdf(path, path.name, person, options, search)
     return search
 
 
@@ -362,7 +387,8 @@ def _add_xdf(path: Path, name: str, person: str | None, options: ImportOptions, 
     if subject is None:
         raise FileFormatError(
             f"the person of '{name}' is not known: name the person with --subjects map.csv (file,subject), or call the "
-            "file sub-<code>_ses-<session>.xdf as LabRecorder does"
+            "file sub-<code>_ses-<session>.xdf as LabRecorder does",
+            reason="person_unknown",
         )
     folder = options.new_folder("converted") / "xdf"
     stream = options.columns.get(STREAM_ROLE, "")
@@ -375,7 +401,7 @@ def scan_table(path: Path, options: ImportOptions) -> SourceScan:
         raise DatasetError(f"'{path}' is one recording: give the folder that holds the people's folders.")
     search = _scan_of_file(path, "table", options)
     check_roles(options.columns, search.layout)
-    person = (options.mapping or {}).get(path.name)
+    person = (options.mapping or {}).get(path.name) or options.person or None
     _add(read_table(path, path.name, options.new_folder("converted"), person, search.layout, options.columns), search)
     return search
 
@@ -426,7 +452,8 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
         elif source.is_file():
             if source.suffix.lower() not in FORMATS:
                 raise DatasetError(
-                    f"'{source}' cannot be imported: give a folder, or a file that ends in {', '.join(FORMATS)}."
+                    f"'{source}' cannot be imported: give a folder, or a file that ends in {', '.join(FORMATS)}.",
+                    reason="file_no_recording",
                 )
             search = FORMATS[source.suffix.lower()](source, options)
         else:
@@ -436,13 +463,16 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
     except OSError as cause:
         raise DatasetError(f"'{source}' cannot be read: {cause.strerror or cause} ({cause.filename}).") from None
     except FileFormatError as cause:
-        raise FileFormatError(f"'{source}': {cause}.") from None
+        raise FileFormatError(f"'{source}': {cause}.", reason=cause.reason, **cause.values) from None
     if not any(f.kind in ("recordings", "streams") for f in search.found):
         first = next((f" The first: '{f.origin}': {f.reason.rstrip('.')}." for f in search.found if f.reason), "")
+        unknown = any(getattr(f.reason, "reason", "") == "person_unknown" for f in search.found)
         raise DatasetError(
             f"'{source}' holds no recording: expected <label>_<epoch ms>_<rows>.csv in a folder per person"
             f"{' (or CSVs with a label column)' if search.shape == 'labelled-rows' else ''}; "
-            f"found {len(search.found)} other files.{first}"
+            f"found {len(search.found)} other files.{first}",
+            reason="person_unknown" if unknown else "import_nothing",
+            n=len(search.found),
         )
     return search
 
@@ -476,6 +506,8 @@ def import_recordings(
     columns: Mapping[str, str] | None = None,
     limits: UnpackLimits | None = None,
     adopt_proposals: bool = False,
+    person: str | None = None,
+    guess_layout: bool = False,
 ) -> ImportSummary:
     """Create a data set at ``dest`` from recordings, or add them to an existing one.
 
@@ -494,6 +526,9 @@ def import_recordings(
         limits: limits of unpacking a zip.
         adopt_proposals: put the proposed rate, gap and offsets (see `propose_settings`) into the layout of the new
             data set; otherwise they are only reported.
+        person: the person of files that name none: those directly in ``source``, in folders of gestures, and XDF files
+            and tables without a person. "" refuses them; None takes the name of the folder where there is one.
+        guess_layout: if no layout is given or stated, take the most probable built-in one that can read the files.
 
     Returns:
         The summary. Every source file is imported (possibly with warnings), left out, or rejected with a reason.
@@ -532,6 +567,8 @@ def import_recordings(
             "the given layout" if head is None else "that of the data set",
             columns or {},
             limits or UnpackLimits(),
+            person,
+            guess_layout,
         )
         search = scan_source(source, options)
         search.simulated = search.simulated or simulated

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -11,7 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.layouts import ACCELERATION, Layout, layout_names, load_layout
+from plushsense.core.errors import FileFormatError
+from plushsense.core.layouts import ACCELERATION, DEVICE_MS, Layout, layout_names, load_layout
+from plushsense.core.recorder_csv import read_recording
 from plushsense.dataset.store import Dataset
 
 DEFAULT_WINDOW_S = 2.5
@@ -68,6 +71,32 @@ def matching_layouts(files: Iterable[Path]) -> list[Layout]:
                 most = max(layout.n_channels for layout in found)
                 return [layout for layout in found if layout.n_channels == most]
     return []
+
+
+_SAMPLED_FILES, _SAMPLED_BYTES = 3, 200_000
+
+
+def readable_layouts(files: Iterable[Path], names: Sequence[str] = ()) -> list[Layout]:
+    """Return the built-in layouts (or those in ``names``) that read the first CSV files, the most probable first.
+
+    Layouts that differ only in the firmware's clock read the same files; the files tell a clock from delays.
+    """
+    samples: list[tuple[Path, bytes]] = []
+    for path in files:
+        if path.suffix.lower() == ".csv" and len(samples) < _SAMPLED_FILES:
+            with path.open("rb") as file:
+                data = file.read(_SAMPLED_BYTES)
+            samples.append((path, data if len(data) < _SAMPLED_BYTES else data[: data.rfind(b"\n") + 1]))
+    ranked: list[tuple[int, int, str]] = []
+    for name in names or layout_names():
+        layout, read, delays = load_layout(name), 0, 0
+        for path, data in samples:
+            with contextlib.suppress(FileFormatError):
+                delays += read_recording(path, layout, data).integrated
+                read += 1
+        if read:
+            ranked.append((-read, (DEVICE_MS not in layout.wire) != (delays > 0), name))
+    return [load_layout(name) for _, _, name in sorted(ranked)]
 
 
 def propose_settings(dataset: Dataset) -> list[Proposal]:

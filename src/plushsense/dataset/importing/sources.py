@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from plushsense.core.errors import BadInput, DatasetError
+from plushsense.core.errors import BadInput, DatasetError, Note
 from plushsense.core.gestures import NOBODY, GestureSet, plain_label
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, STREAM_NAME, parse_name
@@ -93,7 +93,11 @@ def source_files(source: Path) -> list[Path]:
                 if here == source
                 else f"'{here}' in '{source}' is a data set already: give the recorder's folder, or move it away first"
             )
-            raise DatasetError(f"{problem}; importing it again would mix its copies of files with its people.")
+            raise DatasetError(
+                f"{problem}; importing it again would mix its copies of files with its people.",
+                reason="import_of_dataset",
+                name=here.name,
+            )
         files += [here / name for name in sorted(names + [f for f in folders if (here / f).is_symlink()])]
     return files
 
@@ -127,17 +131,17 @@ def split_regular_files(files: Iterable[Path]) -> tuple[list[Path], list[SourceF
 def _refusal(path: Path) -> str:
     """Return the reason to refuse a file by its kind or name; "" if there is none."""
     if path.is_symlink():
-        return "a symbolic link is not followed"
+        return Note("a symbolic link is not followed", reason="file_link")
     if not path.is_file():
-        return "not a regular file"
+        return Note("not a regular file", reason="file_link")
     if path.name.startswith("._"):
-        return "metadata of macOS, no recording"
+        return Note("metadata of macOS, no recording", reason="file_of_system")
     try:
         path.name.encode("utf-8")
     except UnicodeEncodeError:
-        return "its name is not UTF-8: rename it"
+        return Note("its name is not UTF-8: rename it", reason="file_name")
     if any(c < " " or c == "\x7f" for c in path.name):
-        return "its name holds a control character: rename it"
+        return Note("its name holds a control character: rename it", reason="file_name")
     return ""
 
 
@@ -165,14 +169,27 @@ def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested:
         other = folders.setdefault(f.subject.casefold(), f.source.parent)
         if other != f.source.parent:
             a, b = (p.relative_to(source).as_posix() for p in (other, f.source.parent))
-            raise DatasetError(f"The person is not clear: '{a}' and '{b}' in '{source}' have the same name: {_ASK}.")
+            raise DatasetError(
+                f"The person is not clear: '{a}' and '{b}' in '{source}' have the same name: {_ASK}.",
+                reason="person_twice",
+                a=a,
+                b=b,
+            )
     places = set(folders.values())
     for place in sorted(places) if nested else ():
         above = next((p for p in place.parents if p in places), None)
         if above is not None:
             raise DatasetError(
-                f"The person is not clear: '{place}' lies in '{above}', and both hold recordings: {_ASK}."
+                f"The person is not clear: '{place}' lies in '{above}', and both hold recordings: {_ASK}.",
+                reason="person_nested",
+                a=place.name,
+                b=above.name,
             )
+
+
+def _where(subjects: dict[str, str] | None) -> str:
+    """Return where the person of a file is looked for."""
+    return "in the folder of a person" if subjects is None else "named in the mapping file of --subjects"
 
 
 def _mapped(path: Path, source: Path, subjects: dict[str, str]) -> str | None:
@@ -180,13 +197,22 @@ def _mapped(path: Path, source: Path, subjects: dict[str, str]) -> str | None:
     return subjects.get(path.relative_to(source).as_posix(), subjects.get(path.name))
 
 
+def _folder_person(path: Path, source: Path, person: str | None) -> str | None:
+    """Return the person whose folder holds a file; directly in ``source`` it is ``person``, unless that is None."""
+    return path.parent.resolve().name if path.parent != source or person is None else person or None
+
+
 def classify_gesture_recorder(
-    source: Path, files: list[Path], subjects: dict[str, str] | None, gestures: GestureSet | None
+    source: Path,
+    files: list[Path],
+    subjects: dict[str, str] | None,
+    gestures: GestureSet | None,
+    person: str | None = None,
 ) -> Iterator[SourceFile]:
     """Classify the files in the folders of the GestureRecorder.
 
     ``subjects`` maps file names (or paths below ``source``) to people; without it the nearest folder is the person,
-    or nobody if all its recordings are of the toy at rest.
+    or nobody if all its recordings are of the toy at rest. ``person`` is as in `import_recordings`.
     """
     # Folders are gestures, not people, if the label of every recording is the name of its folder.
     named = [(path, name) for path in files if (name := parse_name(path.name)) is not None]
@@ -201,24 +227,30 @@ def classify_gesture_recorder(
         elif path.parent in nobodys:
             subject = NOBODY
         elif by_label:
-            subject = UNKNOWN_SUBJECT
+            subject = person or UNKNOWN_SUBJECT
         else:
-            subject = path.parent.resolve().name
+            subject = _folder_person(path, source, person)
         if path.name.casefold() == STREAM_NAME.casefold():
-            if by_label or subject is None:
-                yield SourceFile(path, "", reason="a session stream whose person is not known")
+            if (by_label and not person) or subject is None:
+                note = Note("a session stream whose person is not known", reason="person_unknown")
+                yield SourceFile(path, "", reason=note)
             else:
                 yield SourceFile(path, STREAMS, subject)
         elif parse_name(path.name) is None:
-            yield SourceFile(path, "", reason="not a recording: its name is not <label>_<epoch ms>_<rows>.csv")
+            note = Note("not a recording: its name is not <label>_<epoch ms>_<rows>.csv", reason="file_no_recording")
+            yield SourceFile(path, "", reason=note)
         elif subject is None:
-            yield SourceFile(path, "", reason="not named in the mapping file of --subjects")
+            yield SourceFile(path, "", reason=Note(f"not {_where(subjects)}", reason="person_unknown"))
         else:
             yield SourceFile(path, RECORDINGS, subject)
 
 
 def classify_labelled_rows(
-    source: Path, files: list[Path], subjects: dict[str, str] | None, gestures: GestureSet | None
+    source: Path,
+    files: list[Path],
+    subjects: dict[str, str] | None,
+    gestures: GestureSet | None,
+    person: str | None = None,
 ) -> Iterator[SourceFile]:
     """Classify CSVs with a label on every row: each file is a stream, and runs of equal labels are recordings."""
     one_person = all(path.parent == source for path in files)
@@ -226,33 +258,40 @@ def classify_labelled_rows(
         if subjects is not None:
             subject = _mapped(path, source, subjects)
         else:
-            subject = path.parent.resolve().name if one_person or path.parent != source else None
+            subject = _folder_person(path, source, person) if one_person or path.parent != source else person or None
         if path.suffix.lower() != ".csv":
-            yield SourceFile(path, "", reason="not a CSV file")
+            yield SourceFile(path, "", reason=Note("not a CSV file", reason="file_no_recording"))
         elif subject is None:
-            where = "in the folder of a person" if subjects is None else "named in the mapping file of --subjects"
-            yield SourceFile(path, "", reason=f"not {where}")
+            yield SourceFile(path, "", reason=Note(f"not {_where(subjects)}", reason="person_unknown"))
         else:
             yield SourceFile(path, STREAMS, subject)
 
 
-CLASSIFIERS: dict[str, Callable[[Path, list[Path], dict[str, str] | None, GestureSet | None], Iterator[SourceFile]]] = {
+CLASSIFIERS: dict[str, Callable[..., Iterator[SourceFile]]] = {
     "gesture-recorder": classify_gesture_recorder,
     "labelled-rows": classify_labelled_rows,
 }
 
 
 def classify_files(
-    shape: str, source: Path, files: list[Path], subjects: dict[str, str] | None, gestures: GestureSet | None
+    shape: str,
+    source: Path,
+    files: list[Path],
+    subjects: dict[str, str] | None,
+    gestures: GestureSet | None,
+    person: str | None = None,
 ) -> list[SourceFile]:
     """Classify regular files by the folder structure ``shape`` (a key of `CLASSIFIERS`); each is returned once.
 
     Raises:
         DatasetError: if the folders do not identify the people.
     """
-    classified = list(CLASSIFIERS[shape](source, files, subjects, gestures))
+    classified = list(CLASSIFIERS[shape](source, files, subjects, gestures, person))
     if subjects is None:
-        _refuse_unclear_people(source, classified, nested=shape == "gesture-recorder")
+        # A person that was named may have recordings in several folders of gestures.
+        _refuse_unclear_people(
+            source, [f for f in classified if f.subject != person], nested=shape == "gesture-recorder"
+        )
     return classified
 
 
@@ -279,11 +318,16 @@ def read_mapping(path: Path) -> dict[str, str]:
 
 
 # Suffixes of files that the recorder leaves behind if it is killed, or is still running.
+_UNFINISHED = Note(
+    "not finished when the recorder stopped; its rows are in the session's stream", reason="file_unfinished"
+)
 LEFT_OVER = {
-    ".part": "not finished when the recorder stopped; its rows are in the session's stream",
-    ".new": "not finished when the recorder stopped; its rows are in the session's stream",
-    ".torn": "damaged by a crash and renamed by the recorder; its rows are in the session's stream",
-    ".lock": "a lock of the recorder",
+    ".part": _UNFINISHED,
+    ".new": _UNFINISHED,
+    ".torn": Note(
+        "damaged by a crash and renamed by the recorder; its rows are in the session's stream", reason="file_unfinished"
+    ),
+    ".lock": Note("a lock of the recorder", reason="file_lock"),
 }
 
 Sessions = dict[Path, SessionHead | str]
@@ -300,10 +344,12 @@ def read_sessions(files: Iterable[Path]) -> Sessions:
             if head is not None and head.subject.strip():
                 Layout.from_dict(head.layout, "layout")
         except (BadInput, RecursionError) as cause:
-            sessions[path.parent] = f"its {SESSION_HEAD} cannot be used: {cause}"
+            message = f"its {SESSION_HEAD} cannot be used: {cause}"
+            sessions[path.parent] = Note(message, reason="session_unusable", file=SESSION_HEAD)
             continue
         if head is not None:
-            sessions[path.parent] = head if head.subject.strip() else f"its {SESSION_HEAD} names no subject"
+            nobody = Note(f"its {SESSION_HEAD} names no subject", reason="person_unknown")
+            sessions[path.parent] = head if head.subject.strip() else nobody
     return sessions
 
 
@@ -329,7 +375,11 @@ def common_layout(sessions: Sessions, given: Layout | None, of: str) -> Layout |
             other = f"'{own.name}'" if own.name != agreed.name else f"another '{own.name}'"
             raise DatasetError(
                 f"Session '{place.name}' was recorded with the layout {other}, but {of} is '{agreed.name}': "
-                "a data set has one layout, so import them apart."
+                "a data set has one layout, so import them apart.",
+                reason="layouts_differ",
+                session=place.name,
+                layout=own.name,
+                other=agreed.name,
             )
     if agreed is not None and agreed.is_labelled and any(isinstance(h, SessionHead) for h in sessions.values()):
         raise DatasetError(
@@ -358,7 +408,8 @@ def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceF
         discarded = discarded_recordings(place)
     except (BadInput, OverflowError, RecursionError) as cause:
         # Without the log it is unknown which recordings were discarded.
-        yield from (SourceFile(path, "", reason=f"its {SESSION_LOG} cannot be used: {cause}") for path in files)
+        note = Note(f"its {SESSION_LOG} cannot be used: {cause}", reason="session_unusable", file=SESSION_LOG)
+        yield from (SourceFile(path, "", reason=note) for path in files)
         return
     stream = place / STREAM_NAME
     mains = {p.with_suffix("").as_posix(): p for p in files if p == stream or parse_name(p.name) is not None}
@@ -376,17 +427,21 @@ def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceF
         elif name.endswith(SIDECAR):
             main = mains.get(path.with_suffix("").as_posix())
             if main is None:
-                yield of_session(LEFT_OUT, reason="the sidecar of a recording that is missing")
+                note = Note("the sidecar of a recording that is missing", reason="file_orphan")
+                yield of_session(LEFT_OUT, reason=note)
             else:
                 yield of_session(COMPANIONS, beside=main)
         else:
-            yield of_session("", reason="no file of a session: expected are recordings, sidecars, stream and log")
+            note = Note(
+                "no file of a session: expected are recordings, sidecars, stream and log", reason="file_no_recording"
+            )
+            yield of_session("", reason=note)
 
 
 def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:
     """Return the people of the sessions, with the latest value of each field, and a note for each changed value."""
     people: dict[str, PersonInfo] = {}
-    notes = []
+    notes: list[str] = []
     heads = sorted((h for h in sessions.values() if isinstance(h, SessionHead)), key=lambda h: h.started_ms)
     for head in heads:
         values = {key: _plain(getattr(head, key)) for key in ("age_group", "gender", "consent")}
@@ -394,10 +449,12 @@ def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:
         for key, value in values.items() if before is not None else ():
             earlier = getattr(before, key)
             if earlier and value and earlier != value:
-                notes.append(
+                message = (
                     f"the sessions of '{head.subject}' differ in {key.replace('_', ' ')} ('{earlier}', '{value}'): "
                     "the latest is kept"
                 )
+                values_of = {"person": head.subject, "old": earlier, "new": value}
+                notes.append(Note(message, reason="person_changed", **values_of))
             values[key] = value or earlier
         people[head.subject] = PersonInfo(head.subject, values["age_group"], values["gender"], values["consent"])
     return list(people.values()), notes

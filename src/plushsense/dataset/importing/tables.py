@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError, FileFormatError, nearest, need
+from plushsense.core.errors import ConfigError, FileFormatError, Note, nearest, need
 from plushsense.core.gestures import plain_label
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, Layout
 from plushsense.core.recorder_csv import (
@@ -76,9 +76,12 @@ def whole_steps(values: NDArray[np.float64], layout: Layout) -> tuple[NDArray[np
         between = np.mean(np.abs(scaled - rounded) > _BETWEEN, axis=0) > 0.1
         coarse = between & (np.std(scaled, axis=0) < _FEW_STEPS)
         if names := ", ".join(f"'{n}'" for n, is_coarse in zip(layout.names, coarse, strict=True) if is_coarse):
-            warning = (
+            warning = Note(
                 f"{names}: the values are small fractions of the step of layout '{layout.name}' and were rounded to "
-                "it: give a layout with a smaller step"
+                "it: give a layout with a smaller step",
+                reason="values_rounded",
+                columns=names,
+                layout=layout.name,
             )
     return np.clip(rounded, -LARGEST, LARGEST).astype(np.int64), warning
 
@@ -133,7 +136,8 @@ def write_session(
             at_ms += 1
         written_paths.add(path)
         if len(path.name.encode("utf-8")) > LONGEST_LABEL:
-            yield SourceFile(path, "", origin=name, reason="its label is too long for a file name")
+            note = Note("its label is too long for a file name", reason="label_too_long")
+            yield SourceFile(path, "", origin=name, reason=note)
             continue
         write_recording(path, frames.slice(cut.start, cut.stop), layout)
         yield SourceFile(path, RECORDINGS, subject, session=session, origin=name)
@@ -195,16 +199,22 @@ def choose_columns(there: list[str], layout: Layout, given: Mapping[str, str], d
             names = (given[role],)
         match = next((n.strip().casefold() for n in names if n.strip().casefold() in plain), None)
         if match is not None and plain.count(match) > 1:
-            raise FileFormatError(f"'{display_name}' has two columns '{match}': rename one of them")
+            message = f"'{display_name}' has two columns '{match}': rename one of them"
+            raise FileFormatError(message, reason="column_twice", file=display_name, column=match)
         if match is not None:
             chosen[role] = there[plain.index(match)]
         elif role in given or role in ("label", "time") or role in layout.names:
             if not any(plain):
-                raise FileFormatError(f"'{display_name}' begins with no line of column names: a table needs a header")
+                message = f"'{display_name}' begins with no line of column names: a table needs a header"
+                raise FileFormatError(message, reason="table_no_header", file=display_name)
             listed = ", ".join(t[:30] for t in there[:20]) + (", …" if len(there) > 20 else "")
             raise FileFormatError(
                 f"'{display_name}' has no column '{names[0]}'; it has {listed}: name the right one with "
-                f"--column {role}=NAME"
+                f"--column {role}=NAME",
+                reason="table_column_missing",
+                file=display_name,
+                column=names[0],
+                there=listed,
             )
     return chosen
 
@@ -234,9 +244,11 @@ def read_csv(path: Path, display_name: str, layout: Layout, given: Mapping[str, 
                 for push, index in number_at:
                     push(_number(row[index]))
     except UnicodeDecodeError:
-        raise FileFormatError(f"'{display_name}' is not UTF-8: save it as UTF-8") from None
+        message = f"'{display_name}' is not UTF-8: save it as UTF-8"
+        raise FileFormatError(message, reason="table_not_utf8", file=display_name) from None
     except csv.Error as cause:
-        raise FileFormatError(f"'{display_name}' is no CSV table: {cause}") from None
+        message = f"'{display_name}' is no CSV table: {cause}"
+        raise FileFormatError(message, reason="table_damaged", file=display_name) from None
     return ImportedColumns(
         names, texts, {role: np.array(v, dtype=np.float64) for role, v in numbers.items()}, malformed
     )
@@ -254,7 +266,8 @@ def read_parquet(path: Path, display_name: str, layout: Layout, given: Mapping[s
     """Read a Parquet table with polars."""
     with path.open("rb") as file:
         if file.read(4) != b"PAR1":
-            raise FileFormatError(f"'{display_name}' is no Parquet file: it does not begin with PAR1")
+            message = f"'{display_name}' is no Parquet file: it does not begin with PAR1"
+            raise FileFormatError(message, reason="table_damaged", file=display_name)
     pl = need("polars", extra="tables")
     try:
         with path.open("rb") as file:
@@ -264,7 +277,8 @@ def read_parquet(path: Path, display_name: str, layout: Layout, given: Mapping[s
             table = pl.read_parquet(file, columns=list(dict.fromkeys(names.values())))
         nested = next((n for n in table.columns if table[n].dtype.is_nested()), None)
         if nested is not None:
-            raise FileFormatError(f"'{display_name}' has more than one value in a cell of column '{nested}'")
+            message = f"'{display_name}' has more than one value in a cell of column '{nested}'"
+            raise FileFormatError(message, reason="table_damaged", file=display_name)
         texts = {
             r: [text.strip() for text in table[n].cast(pl.String).fill_null("").to_list()]
             for r, n in names.items()
@@ -279,7 +293,8 @@ def read_parquet(path: Path, display_name: str, layout: Layout, given: Mapping[s
         if not isinstance(cause, Exception) and type(cause).__name__ != "PanicException":
             raise
         message = " ".join(str(cause).split())[:120] or type(cause).__name__
-        raise FileFormatError(f"'{display_name}' cannot be read as Parquet: {message}") from None
+        message = f"'{display_name}' cannot be read as Parquet: {message}"
+        raise FileFormatError(message, reason="table_damaged", file=display_name) from None
     return ImportedColumns(names, texts, numbers, in_ms=in_ms)
 
 
@@ -302,10 +317,16 @@ def milliseconds(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple
     steps = np.diff(times[:100_000])
     forward = steps[np.isfinite(steps) & (steps > 0)]
     if not len(forward):
-        return 1.0, f"column '{name}' is read as milliseconds"
+        return 1.0, Note(f"column '{name}' is read as milliseconds", reason="time_unit", column=name, unit="ms")
     step = float(np.median(forward))
     unit = min(_UNITS, key=lambda u: abs(np.log(step * _UNITS[u] * rate_hz / 1000.0)))
-    return _UNITS[unit], f"column '{name}' is read as {unit}, as the rate of {rate_hz:g} Hz suggests"
+    message = f"column '{name}' is read as {unit}, as the rate of {rate_hz:g} Hz suggests"
+    return _UNITS[unit], Note(message, reason="time_unit", column=name, unit=unit)
+
+
+def _about(name: str, note: str) -> Note:
+    """Return a note about the file ``name``."""
+    return Note(f"{name}: {note}", reason="about_file", file=name, note=note)
 
 
 def _codes(texts: Iterable[str]) -> tuple[NDArray[np.int64], list[str]]:
@@ -331,7 +352,8 @@ def read_table(
     if "subject" not in columns.names and subject is None:
         raise FileFormatError(
             f"'{display_name}' has no column 'subject': name the right one with --column subject=NAME, or the person "
-            "with --subjects map.csv (file,subject)"
+            "with --subjects map.csv (file,subject)",
+            reason="person_unknown",
         )
     raw = np.column_stack([columns.numbers[n] for n in layout.names])
     times = columns.numbers["time"]
@@ -346,22 +368,25 @@ def read_table(
     known = np.array([bool(c) for c in codes], dtype=bool)[people] if rows else np.empty(0, bool)
     good = usable_rows(raw, device, host)
     if note:
-        yield f"{display_name}: {note}"
+        yield _about(display_name, note)
     for count, reason in (
         (columns.malformed, "of another width than the header"),
         (int(np.sum(~good)), "without a number in every column"),
         (int(np.sum(good & ~known)), "without a subject"),
     ):
         if count:
-            yield f"{display_name}: {count} row{'s' if count > 1 else ''} {reason} left out"
+            message = f"{count} row{'s' if count > 1 else ''} {reason} left out"
+            yield _about(display_name, Note(message, reason="rows_left_out", n=count))
     good &= known
     if not good.any():
         raise FileFormatError(
-            f"'{display_name}' has no usable row: each needs a subject, a time and {layout.n_channels} numbers"
+            f"'{display_name}' has no usable row: each needs a subject, a time and {layout.n_channels} numbers",
+            reason="rows_unusable",
+            n=layout.n_channels,
         )
     values, note = whole_steps(raw[good], layout)
     if note:
-        yield f"{display_name}: {note}"
+        yield _about(display_name, note)
     device_ms, host_ms = (np.round(clock[good]).astype(np.int64) for clock in (device, host))
     people, sessions, labels, takes = people[good], sessions[good], labels[good], takes[good]
     named = np.array([bool(plain_label(n)) and len(n) <= LONGEST_LABEL for n in label_names], dtype=bool)

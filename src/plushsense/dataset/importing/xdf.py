@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import FileFormatError, need
+from plushsense.core.errors import FileFormatError, Note, need
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import Layout, StreamColumns
 from plushsense.core.recorder_csv import LONGEST_LABEL, Frames
@@ -115,7 +115,8 @@ def complete_chunks(path: Path) -> tuple[int, int]:
     widths: dict[int, int] = {}
     with path.open("rb") as file:
         if file.read(4) != _MAGIC:
-            raise FileFormatError(f"'{path.name}' is no XDF file: it does not begin with {_MAGIC.decode()}")
+            message = f"'{path.name}' is no XDF file: it does not begin with {_MAGIC.decode()}"
+            raise FileFormatError(message, reason="xdf_damaged", file=path.name)
         good = 4
         while good < size:
             try:
@@ -177,7 +178,8 @@ def _load(path: Path, length: int) -> list[dict[str, Any]]:
             streams, _ = pyxdf.load_xdf(file, dejitter_timestamps=False)
         except Exception as cause:  # noqa: BLE001, RUF100
             message = " ".join(str(cause).split())[:120] or type(cause).__name__
-            raise FileFormatError(f"'{path.name}' cannot be read as XDF: {message}") from None
+            message = f"'{path.name}' cannot be read as XDF: {message}"
+            raise FileFormatError(message, reason="xdf_damaged", file=path.name) from None
     return list(streams)
 
 
@@ -232,7 +234,8 @@ def read_xdf(
     good, size = complete_chunks(path)
     streams = _load(path, good)
     if good < size:
-        yield f"{display_name}: cut off or damaged from byte {good} of {size} on; the bytes before are used"
+        message = f"{display_name}: cut off or damaged from byte {good} of {size} on; the bytes before are used"
+        yield Note(message, reason="xdf_cut", file=display_name)
     texts = [s for s in streams if _text(s, "channel_format") == "string"]
     fitting, others = [], []
     for stream in streams:
@@ -256,7 +259,7 @@ def read_xdf(
             else f"no stream fits layout '{layout.name}': "
             + ("; ".join(f"'{n}': {r}" for n, r in others[:5]) or f"there are {len(texts)} of texts and no other")
         )
-        raise FileFormatError(why)
+        raise FileFormatError(why, reason="xdf_streams", n=len(fitting), layout=layout.name)
     stream, name, columns = fitting[0]
     frames, times, notes = _frames(stream, layout, columns)
     markers = [

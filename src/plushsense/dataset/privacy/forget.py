@@ -122,11 +122,13 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
     folder = Path(dataset)
     DatasetHead.read(folder)
     if not subject.strip():
-        raise DatasetError("No person was named: give the code of one, as  plushsense info  shows it.")
+        message = "No person was named: give the code of one, as  plushsense info  shows it."
+        raise DatasetError(message, reason="forget_nobody")
     table = read_people(folder)
     if subject in (NOBODY, UNKNOWN_SUBJECT):
         raise DatasetError(
-            f"'{subject}' is no person, but the folder of recordings without one: exclude such recordings by a mark."
+            f"'{subject}' is no person, but the folder of recordings without one: exclude such recordings by a mark.",
+            reason="forget_nobody",
         )
     files = list_files(folder)
     own = [f for f in files if f.person == subject]
@@ -135,7 +137,9 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
     if intent is not None and intent.subject != subject:
         raise DatasetError(
             f"The removal of another person from '{folder}' was interrupted: finish it first, with  "
-            f"plushsense forget {folder} {intent.subject} --yes"
+            f"plushsense forget {folder} {intent.subject} --yes",
+            reason="forget_interrupted",
+            person=intent.subject,
         )
     # An incomplete line or another spelling is not enough: the code must be exact, since the removal is permanent.
     marked = any(_parsed(line) is not None for line in about)
@@ -146,13 +150,17 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
         if not _record_lines(folder) or match_code(subject, known):
             raise DatasetError(
                 f"'{folder}' knows no person '{subject}': it knows {', '.join(known) or 'nobody'}."
-                f"{nearest(subject, known)}"
+                f"{nearest(subject, known)}",
+                reason="forget_unknown",
             )
     lost = [f for f in missing_files(folder) if PurePosixPath(f).parts[1] != subject]
     if intent is None and lost and not absent:
         raise DatasetError(
             f"'{folder}' lacks {len(lost)} raw file{'s' if len(lost) > 1 else ''} of other people ('{lost[0]}'): "
-            "restore them first, since the removal deletes the list that they are missing from."
+            "restore them first, since the removal deletes the list that they are missing from.",
+            reason="forget_missing",
+            n=len(lost),
+            file=lost[0],
         )
     leftovers = _leftovers(folder, files)
     evaluations = sorted((folder / EVALUATIONS).iterdir()) if (folder / EVALUATIONS).is_dir() else []
@@ -212,7 +220,9 @@ def forget(dataset: str | Path, subject: str) -> RemovalPlan:
     except OSError as cause:
         raise DatasetError(
             f"'{cause.filename or folder}' cannot be removed ({cause.strerror or cause}): close the programs that use "
-            "it, then give the same command again to finish."
+            "it, then give the same command again to finish.",
+            reason="forget_locked",
+            file=cause.filename or folder.name,
         ) from None
     # The removal is complete even if the data set has other problems; opening it later reports them.
     with contextlib.suppress(DatasetError):

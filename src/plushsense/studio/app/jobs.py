@@ -23,7 +23,7 @@ from plushsense.studio.app.workspace import WORK, ChangeSignal, Workspace
 UNFINISHED = ".unfinished-"
 """Prefix of temporary folders in the work folder; leftovers are removed when the studio starts."""
 INCOMING = "incoming"
-"""Folder in the work folder for uploaded files not yet imported; unused ones are removed when the studio starts."""
+"""Folder in the work folder for uploaded files that are not imported yet; it is removed when the studio starts."""
 RUNNING, DONE, REFUSED, STOPPED = "running", "done", "refused", "stopped"
 _MAX_REPORTS = 2000
 # Keys of a spec that are never stored, because they may contain names of people.
@@ -88,12 +88,7 @@ class Jobs:
                 # A job that was stored as running ended with the studio that started it.
                 job.state = STOPPED if job.state == RUNNING else job.state
                 self._jobs[job.id] = job
-        # Keep only uploads that a stopped job needs to resume.
-        resumable = {str(job.spec.get("archive")) for job in self._jobs.values() if job.state == STOPPED}
-        for file in self._folder.glob(f"{INCOMING}/*"):
-            if str(file) not in resumable:
-                with contextlib.suppress(OSError):
-                    file.unlink()
+        shutil.rmtree(self._folder / INCOMING, ignore_errors=True)
 
     def all(self, *tasks: str) -> list[StudioJob]:
         """Return the jobs of the given tasks (by default of all tasks), newest first."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -11,11 +12,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError, DeviceError
+from plushsense.core.errors import ConfigError, DeviceError, PlushSenseError
 from plushsense.core.layouts import layout_names
 from plushsense.core.recorder_csv import Frames
 from plushsense.devices.base import Device, Frame
-from plushsense.devices.opening import SCAN_S, DeviceListing, list_devices, open_device, parse_url
+from plushsense.devices.opening import (
+    DEFAULT_LAYOUT,
+    SCAN_S,
+    DeviceListing,
+    check_address,
+    list_devices,
+    open_device,
+    parse_url,
+)
 from plushsense.devices.reconnect import ConnectionGap
 from plushsense.recording.recorder import is_virtual, speed_of, with_speed
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
@@ -166,6 +175,8 @@ _TIMEOUT_S = 6.0
 _ENOUGH = 20
 # If the share of malformed lines is higher, the toy probably has another layout.
 _MAX_MALFORMED = 0.2
+# Without a single frame, as many malformed lines are enough to know that the layout is another.
+_MALFORMED = 30
 _SLOW, _FAST = 0.8, 1.25
 
 
@@ -205,12 +216,34 @@ def _unfit(url: str, layout: str, malformed: int) -> DeviceError:
     return DeviceError(message, reason="toy_silent", url=url, s=f"{_TIMEOUT_S:g}")
 
 
+@dataclass
+class ToyTrial:
+    """Test of a toy in the background: while ``running`` there is neither ``result`` nor ``error``.
+
+    ``layout`` is another built-in layout that the toy's frames have, "" for none.
+    """
+
+    url: str
+    running: bool = True
+    result: ConnectionTest | None = None
+    error: Exception | None = None
+    layout: str = ""
+
+
+def with_layout(url: str, layout: str) -> str:
+    """Return the URL of a toy with another layout."""
+    place, _, settings = url.partition("?")
+    kept = [s for s in settings.split("&") if s and not s.startswith("layout=")]
+    return f"{place}?{'&'.join([*kept, f'layout={layout}'])}"
+
+
 class Toys:
     """The toys found by a background search, and the choice of one; every change notifies `changed`."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.changed = ChangeSignal()
         self.listing = DeviceListing()
+        self.trial: ToyTrial | None = None
         self.searching = False
         self.searched = False
         self._workspace = workspace
@@ -246,9 +279,41 @@ class Toys:
             layout = address.query.get("layout")
             if layout is not None and layout not in layout_names():
                 self._workspace.inside(layout)
-        self._workspace.toy = url
+        if url != self._workspace.toy:
+            self._workspace.toy, self.trial = url, None
         self.changed.notify()
         return url
+
+    def check(self, url: str) -> None:
+        """Raise an error if no toy can be at this address, see `check_address`."""
+        check_address(parse_url(url.strip()))
+
+    def try_out(self) -> None:
+        """Test the chosen toy in the background; `trial` has the state and the result."""
+        trial = self.trial = ToyTrial(self._workspace.toy)
+        self.changed.notify()
+        threading.Thread(target=self._try_out, args=(trial,), daemon=True).start()
+
+    def _try_out(self, trial: ToyTrial) -> None:
+        try:
+            trial.result = self.test(trial.url)
+        except Exception as cause:  # noqa: BLE001, RUF100
+            trial.error = cause
+        unreadable = getattr(trial.error, "reason", "") == "toy_unreadable"
+        if unreadable or (trial.result is not None and not trial.result.fits):
+            trial.layout = self._fitting_layout(trial.url)
+        trial.running = False
+        if trial is self.trial:
+            self.changed.notify()
+
+    def _fitting_layout(self, url: str) -> str:
+        """Return the layout whose frames a toy sends, or "" if it is none of the built-in ones."""
+        given = parse_url(url).query.get("layout") or DEFAULT_LAYOUT
+        for name in layout_names():
+            with contextlib.suppress(PlushSenseError):
+                if name != given and self.test(with_layout(url, name)).fits:
+                    return name
+        return ""
 
     def person(self, number: int) -> str:
         """Choose the virtual toy used by virtual person ``number``, and return its URL."""
@@ -277,7 +342,7 @@ class Toys:
         frames, first, last = 0, None, None
         until = time.monotonic() + _TIMEOUT_S
         with open_device(url) as device:
-            while time.monotonic() < until:
+            while time.monotonic() < until and (frames or device.counters.malformed < _MALFORMED):
                 received = device.read()
                 if received is None:
                     break

@@ -12,7 +12,7 @@ from importlib import import_module, resources
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import PlushSenseError
+from plushsense.core.errors import Note, PlushSenseError
 from plushsense.core.sentences import Sentence
 
 LANGUAGES = {"en": "English", "lv": "Latviešu"}
@@ -58,9 +58,8 @@ class Words:
             message: the sentence in English, as the command line prints it.
             reason, values: those of the `PlushSenseError`. Without a text for ``reason``, ``message`` is quoted.
         """
-        text = self._texts.get(f"errors.{reason}")
-        if text is not None:
-            return text.format(**(values or {}))
+        if f"errors.{reason}" in self._texts:
+            return self.note({"message": message, "reason": reason, "values": values or {}})
         return self._texts["errors.other"].format(message=message) if message else ""
 
     def sentence(self, sentence: str) -> str:
@@ -84,6 +83,18 @@ class Words:
             if isinstance(value, str)
             else str(value)
         )
+
+    def note(self, note: str | Mapping[str, Any]) -> str:
+        """Return the sentence of a `Note`, or of the table that `plushsense.studio.tasks` makes of it.
+
+        A text without a reason is quoted, with a remark that it is in English.
+        """
+        table = note if isinstance(note, Mapping) else {"message": str(note), **getattr(note, "__dict__", {})}
+        text = self._texts.get(f"errors.{table.get('reason')}", "")
+        if text:
+            values = {key: self.note(v) if isinstance(v, (Note, Mapping)) else v for key, v in table["values"].items()}
+            return text.format(**values)
+        return self._texts["errors.note"].format(message=table["message"])
 
     def unit(self, unit: str) -> str:
         """Return the name of a unit in this language, or ``unit`` itself if it has none."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import time
-from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from nicegui import context, run, ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
+from plushsense.core.errors import PlushSenseError
 from plushsense.core.gestures import plain_label
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import (
@@ -129,6 +131,17 @@ async def change_files(
             await change_files(page, lambda: back(result), page.words("shell.undone"), refresh)
 
         page.say(message, "good", None if undo is None else take_back)
+
+
+@contextmanager
+def errors_beside(page: Page, field: Any) -> Iterator[None]:
+    """Show an error that is raised in the block beside ``field``, and one of the computer at the top of the page."""
+    field.error = None
+    with page.show_errors():
+        try:
+            yield
+        except PlushSenseError as refusal:
+            field.error = page.words.error(refusal)
 
 
 def summary(text: str) -> ui.html:

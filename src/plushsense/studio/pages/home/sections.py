@@ -291,7 +291,7 @@ class JobList:
 
     def update(self) -> None:
         """Display the current state of the jobs."""
-        jobs = self._jobs.all()
+        jobs = [j for j in self._jobs.all() if not j.spec.get("dry")]
         running = [j for j in jobs if j.state == RUNNING]
         displayed = [*running, *[j for j in jobs if j.state != RUNNING][:_MAX_EARLIER]]
         current = tuple((j.id, j.state) for j in displayed)
@@ -333,7 +333,7 @@ class JobList:
             if job.state == RUNNING:
                 self._button("stop", job, lambda: self._jobs.stop(job.id))
                 return
-            if job.state == STOPPED and not job.spec.get("archive"):
+            if job.state == STOPPED:
                 self._button("again", job, lambda: self._jobs.resume(job.id))
             self._button("drop", job, lambda: self._jobs.drop(job.id))
 
@@ -363,8 +363,8 @@ class JobList:
             if job.spec.get("add"):
                 facts.append(words("home.new", n=result["added"]["recordings"]))
             ui.label(" · ".join(facts))
-        warnings = [str(w) for w in (*job.warnings, *result.get("warnings", ()))]
-        rejected = [f"{r['file']}: {r['reason']}" for r in result.get("rejected", ())]
+        warnings = [words.note(w) for w in (*job.warnings, *result.get("warnings", ()))]
+        rejected = [f"{r['file']}: {words.note(r['reason'])}" for r in result.get("rejected", ())]
         for key, lines in (("warnings", warnings), ("rejected", rejected)):
             if lines:
                 with ui.expansion(words(f"home.{key}", n=len(lines))).classes("w-full").props("dense"):

@@ -1,0 +1,380 @@
+"""Import files from the browser: upload them, show what they contain, and keep them as a data set or network."""
+
+from __future__ import annotations
+
+import shutil
+import uuid
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+from fastapi import HTTPException
+from nicegui import context, run, ui
+from nicegui.elements.upload import Upload
+from nicegui.elements.upload_files import FileUpload
+
+from plushsense.core.errors import BundleError, ConfigError, Note, PlushSenseError
+from plushsense.core.files import write_file
+from plushsense.core.gestures import NOBODY
+from plushsense.core.layouts import layout_names, load_layout
+from plushsense.core.recorder_csv import STREAM_NAME, parse_name
+from plushsense.dataset.importing.archives import UnpackLimits, member_target
+from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead
+from plushsense.models.bundle import Bundle
+from plushsense.studio.app.guard import UPLOAD_BYTES
+from plushsense.studio.app.jobs import DONE, INCOMING, RUNNING, Jobs, StudioJob
+from plushsense.studio.app.shell import Page, button, heading, on_change, on_page, tag
+from plushsense.studio.app.workspace import BUNDLES, DATASETS, WORK, Workspace, plain_name
+from plushsense.studio.pages.home.sections import simulation_badge, titled_card
+from plushsense.studio.widgets.elements import errors_beside, facts, notice, summary
+
+ARCHIVE_BYTES = UPLOAD_BYTES - 1_000_000
+"""Maximum size of an uploaded file in bytes; the request that carries it is slightly larger."""
+BUNDLE_BYTES = 64_000_000
+_LIMITS = UnpackLimits(total_bytes=4_000_000_000, files=50_000)
+_ACCEPTED = ".zip,.plush,.csv,.xdf,.parquet"
+# Files that desktops leave in folders; nobody chose them.
+_OF_DESKTOPS = (".DS_Store", "Thumbs.db", "desktop.ini")
+_MAX_LINES = 40
+
+
+class Incoming:
+    """Uploaded files of one page, and the data set that is made of them, in a folder of their own.
+
+    Recordings are in ``files``; archives and tables, each of which is imported by itself, are in ``single``.
+    """
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
+        self.folder = workspace.folder / WORK / INCOMING / uuid.uuid4().hex
+        self.dataset = self.folder / "dataset"
+        self.refused: list[Note] = []
+        self.bundles: list[str] = []
+        """Names of the networks that were added."""
+        self._names: list[str] = []
+        self._count = self._bytes = 0
+
+    @property
+    def sources(self) -> list[Path]:
+        """The files and the folder to import."""
+        single = sorted((self.folder / "single").glob("*"))
+        return [*single, *(p for p in (self.folder / "files",) if p.is_dir())]
+
+    @property
+    def name(self) -> str:
+        """The name of the first archive, file or folder that was uploaded."""
+        return self._names[0] if self._names else ""
+
+    async def store(self, file: FileUpload) -> None:
+        """Store an uploaded file; a network is checked and added to the networks at once.
+
+        Raises:
+            ConfigError: for too many files or bytes.
+            OSError: for errors of the disk.
+        """
+        target = member_target(unquote(file.name))
+        if isinstance(target, Note):
+            self.refused.append(Note(file.name, reason="about_file", file=unquote(file.name), note=target))
+            return
+        if target.name in _OF_DESKTOPS:
+            return
+        kind = target.suffix.lower()
+        self._count, self._bytes = self._count + 1, self._bytes + file.size()
+        if self._count > _LIMITS.files or self._bytes > _LIMITS.total_bytes:
+            message = f"More than {_LIMITS.files} files or {_LIMITS.total_bytes / 1e9:g} GB: import them in parts."
+            gb = f"{_LIMITS.total_bytes / 1e9:g}"
+            raise ConfigError(message, reason="upload_too_much", files=_LIMITS.files, gb=gb)
+        table = kind == ".csv" and parse_name(target.name) is None and target.name.lower() != STREAM_NAME
+        alone = kind in (".zip", ".parquet", ".plush") or (table and len(target.parts) == 1)
+        place = self.folder / ("single" if alone else "files") / (target.name if alone else target)
+        await run.io_bound(lambda: place.parent.mkdir(parents=True, exist_ok=True))
+        await file.save(place)
+        if kind == ".plush":
+            await run.io_bound(self._add_bundle, place)
+        else:
+            self._names.append(target.parts[0] if len(target.parts) > 1 else target.stem)
+
+    def _add_bundle(self, stored: Path) -> None:
+        """Check an uploaded network, and move it to the networks of the studio."""
+        name = plain_name(stored.stem, "network")
+        try:
+            if stored.stat().st_size > BUNDLE_BYTES:
+                message = f"'{stored.name}' is larger than {BUNDLE_BYTES / 1e6:g} MB."
+                raise ConfigError(message, reason="bundle_too_large", mb=f"{BUNDLE_BYTES / 1e6:g}")
+            Bundle.load(stored)
+            place = self._workspace.new(BUNDLES, f"{name}.plush")
+            place.parent.mkdir(parents=True, exist_ok=True)
+            stored.rename(place)
+            self.bundles.append(name)
+        except BundleError:
+            note = Note("it is no network of PlushSense, or a damaged one", reason="bundle_damaged")
+            self.refused.append(Note(stored.name, reason="about_file", file=stored.name, note=note))
+        except ConfigError as refusal:
+            self.refused.append(Note(stored.name, reason="about_file", file=stored.name, note=Note.of(refusal)))
+        finally:
+            stored.unlink(missing_ok=True)
+
+    def keep(self, name: str) -> Path:
+        """Move the data set that was made of the files to the data sets of the studio, and remove the files.
+
+        Raises:
+            ConfigError: for a name that is not a plain file name, or that exists already.
+        """
+        place = self._workspace.new(DATASETS, name)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        write_file(self.dataset / HEAD, replace(DatasetHead.read(self.dataset), name=place.name).to_toml())
+        self.dataset.rename(place)
+        self.clear()
+        return place
+
+    def clear(self) -> None:
+        """Remove the files."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self._names.clear()
+        self._count = self._bytes = 0
+
+
+class UploadArea(Upload, component="incoming.js"):
+    """Area of the page that uploads chosen or dropped files and folders, with their paths, in batches.
+
+    Args:
+        store: called with each file; an error ends the upload.
+        finish: called at the end with the values ``ok``, ``cancelled`` and ``large``, paths of files over the limit.
+    """
+
+    def __init__(
+        self,
+        store: Callable[[FileUpload], Awaitable[None]],
+        finish: Callable[[dict[str, Any]], Awaitable[None]],
+        texts: Mapping[str, str],
+    ) -> None:
+        super().__init__()
+        self._store = store
+        self._props.update(accept=_ACCEPTED, limit=ARCHIVE_BYTES, texts=dict(texts))
+        self.on("finish", lambda event: finish(event.args))
+
+    async def handle_uploads(self, files: list[FileUpload]) -> None:
+        """Store the files before the browser gets its answer."""
+        for file in files:
+            try:
+                await self._store(file)
+            except (PlushSenseError, OSError):
+                raise HTTPException(507) from None
+
+
+class IncomingSection:
+    """Section that imports files: choose or drop them, see what they contain, name the data set, import.
+
+    Args:
+        refresh: shows the data sets and networks again.
+    """
+
+    def __init__(self, page: Page, jobs: Jobs, refresh: Callable[[], Awaitable[None]]) -> None:
+        self._page, self._words, self._jobs, self._refresh = page, page.words, jobs, refresh
+        self._incoming = Incoming(page.workspace)
+        self._job: StudioJob | None = None
+        self._problem: Exception | None = None
+        self._progress: ui.label | None = None
+        self._layout = self._person = ""
+        self._ended = True
+        words = self._words
+        with titled_card(page, "home.incoming", "incoming"):
+            about = words("home.incoming_about", mb=ARCHIVE_BYTES // 1_000_000)
+            texts = {"sending": words("home.receiving"), "cancel": words("shell.cancel")}
+            with UploadArea(self._store, self._finish, texts) as area, ui.column().classes("w-full ps-small-gap"):
+                ui.label(about).classes("ps-dim")
+                with ui.row().classes("ps-small-gap"):
+                    for key, folder in (("choose_files", "false"), ("choose_folder", "true")):
+                        choose = button(key, words(f"home.{key}"), icon="folder" if folder == "true" else "upload_file")
+                        # In the browser, since it opens its dialog only as the answer to a click.
+                        choose.on("click", js_handler=f"() => runMethod({area.id}, 'pick', [{folder}])")
+            self._box = ui.column().classes("w-full ps-small-gap").props('aria-live="polite"')
+        on_change(jobs.changed, self._update)
+        context.client.on_delete(self._leave)
+
+    # Upload ---------------------------------------------------------------------------------------------------
+
+    async def _store(self, file: FileUpload) -> None:
+        try:
+            await self._incoming.store(file)
+        except (PlushSenseError, OSError) as problem:
+            self._problem = problem
+            raise
+
+    async def _finish(self, end: dict[str, Any]) -> None:
+        words, incoming, page = self._words, self._incoming, self._page
+        problem, self._problem = self._problem, None
+        refused, incoming.refused = incoming.refused, []
+        refused += [
+            Note(path, reason="about_file", file=path, note=Note("too large", reason="file_too_large", mb=_MB))
+            for path in end["large"]
+        ]
+        if end["cancelled"] or not end["ok"]:
+            await self._cancel()
+            with page.show_errors():
+                if problem is not None:
+                    raise problem
+                page.say(words("home.upload_cancelled" if end["cancelled"] else "home.upload_broken"), "warning")
+            return
+        added, incoming.bundles = incoming.bundles, []
+        if added:
+            page.say(words("home.bundle_came", name="”, “".join(added)), "good")
+            await self._refresh()
+        if refused:
+            page.say(" ".join(words.note(note) for note in refused[:_MAX_LINES]), "error")
+        if incoming.sources:
+            self._inspect()
+
+    # Preview --------------------------------------------------------------------------------------------------
+
+    def _inspect(self) -> None:
+        """Start the job that makes a data set of the files, with the current layout and person."""
+        if self._job is not None:
+            self._jobs.stop(self._job.id)
+        spec = {
+            "sources": [str(path) for path in self._incoming.sources],
+            "dest": str(self._incoming.dataset),
+            "layout": self._layout,
+            "person": self._person,
+            "dry": True,
+        }
+        self._ended = False
+        with self._page.show_errors():
+            self._job = self._jobs.start("inspect", spec, self._words("home.inspecting"))
+        self._update()
+
+    def _update(self) -> None:
+        job = self._job
+        if job is None or self._ended:
+            return
+        if job.state == RUNNING:
+            done, total = job.progress.get("done"), job.progress.get("total")
+            text = self._words("home.inspecting") + (f" {done} / {total}" if total else "")
+            if self._progress is None:
+                self._box.clear()
+                with self._box, ui.row().classes("items-center ps-small-gap").props('role="status"'):
+                    ui.spinner(size="1.2em").props("aria-hidden=true")
+                    self._progress = tag(ui.label(text), "inspecting")
+            self._progress.set_text(text)
+            return
+        self._ended = True
+        self._show(job)
+
+    def _show(self, job: StudioJob) -> None:
+        """Show what the files contain, or why they cannot be imported, with the fields that may mend it."""
+        words, result = self._words, job.result
+        self._progress = None
+        self._box.clear()
+        with self._box, tag(ui.column().classes("ps-row w-full ps-small-gap"), "preview"):
+            reasons = [r["reason"]["reason"] for r in result.get("rejected", ()) if isinstance(r["reason"], dict)]
+            unknown_person = "person_unknown" in (job.reason, *reasons) or UNKNOWN_SUBJECT in result.get("people", ())
+            heading(words("home.preview"), 3)
+            if job.state == DONE:
+                self._contents(result)
+            elif job.reason != "person_unknown":
+                message = words.explain(job.message, job.reason, job.values) or words("home.stopped")
+                tag(notice(message, "error"), "preview-problem")
+            if not result.get("restored"):
+                self._settings(str(result.get("layout", self._layout)), unknown_person, job.reason)
+            if job.state == DONE:
+                self._keep_row(result)
+            else:
+                button("import-cancel", words("shell.cancel"), on_page(self._cancel), "flat")
+
+    def _contents(self, result: dict[str, Any]) -> None:
+        words, people = self._words, result["people"]
+        names = {NOBODY: words("home.nobody"), UNKNOWN_SUBJECT: "?"}
+        if result["simulated"]:
+            simulation_badge(self._page)
+        if result["restored"]:
+            ui.label(words("home.is_backup", name=result["name"]))
+        rows = [
+            (words("home.preview_people"), ", ".join(f"{names.get(p, p)} ({n})" for p, n in people.items())),
+            (words("home.preview_recordings"), str(result["recordings"])),
+        ]
+        facts(rows)
+        gestures = [f"{words.gesture(label)}: {n}" for label, n in sorted(result["gestures"].items())]
+        self._lines("preview_gestures", gestures)
+        notes = [words.note(note) for note in result["notes"] if note["reason"] not in ("simulated", "layout_guessed")]
+        if result["flagged"]:
+            notes.append(words("home.flagged", n=result["flagged"]))
+        for note in notes:
+            ui.label(note).classes("ps-note ps-break")
+        self._lines("rejected", [f"{r['file']}: {words.note(r['reason'])}" for r in result["rejected"]])
+
+    def _lines(self, key: str, lines: list[str]) -> None:
+        if not lines:
+            return
+        with tag(ui.element("details").classes("w-full"), key):
+            summary(self._words(f"home.{key}", n=len(lines)))
+            for line in lines[:_MAX_LINES]:
+                ui.label(line).classes("ps-break ps-note")
+            if len(lines) > _MAX_LINES:
+                ui.label(self._words("home.more", n=len(lines) - _MAX_LINES)).classes("ps-dim")
+
+    def _settings(self, current: str, unknown_person: bool, reason: str) -> None:
+        """Add the fields of what the files do not state: the layout, and the person where it is not known."""
+        words = self._words
+
+        def change_layout(name: str) -> None:
+            self._layout = name
+            self._inspect()
+
+        def change_person() -> None:
+            if (code := str(person.value or "").strip()) != self._person:
+                self._person = code
+                self._inspect()
+
+        options = {
+            name: f"{name}: {words.get(f'home.layout_{name}', load_layout(name).title)}" for name in layout_names()
+        }
+        layout = ui.select(options, value=current if current in options else None, label=words("home.layout"))
+        tag(layout.classes("w-full"), "layout").on_value_change(lambda e: on_page(change_layout)(str(e.value)))
+        layout.props(f'hint="{words("home.layout_guessed")}"' if current and not self._layout else "")
+        if reason == "layout_unknown":
+            layout.error = words("errors.layout_unknown")
+        if unknown_person or self._person:
+            with ui.row().classes("items-start ps-small-gap w-full"):
+                person = tag(ui.input(words("home.whose"), value=self._person).classes("ps-wide"), "person-of-files")
+                person.on("keydown.enter", on_page(change_person))
+                button("person-use", words("home.whose_use"), on_page(change_person))
+            if unknown_person:
+                person.error = words("errors.person_unknown")
+
+    def _keep_row(self, result: dict[str, Any]) -> None:
+        words, workspace = self._words, self._page.workspace
+        plain = plain_name(result["name"] or self._incoming.name, words("home.new_dataset"))
+        free = workspace.free_name(DATASETS, plain, separator=" ")
+        name = tag(ui.input(words("home.name"), value=free).props("maxlength=64").classes("w-full"), "incoming-name")
+
+        async def keep() -> None:
+            with errors_beside(self._page, name):
+                place = await run.io_bound(self._incoming.keep, str(name.value or ""))
+                if place is not None:
+                    self._reset()
+                    self._page.say(words("home.imported", name=place.name), "good")
+                    await self._refresh()
+
+        with ui.row().classes("ps-small-gap"):
+            text = words("home.restore_backup" if result["restored"] else "home.import")
+            button("import", text, on_page(keep), "unelevated color=primary")
+            button("import-cancel", words("shell.cancel"), on_page(self._cancel), "flat")
+
+    async def _cancel(self) -> None:
+        await run.io_bound(self._leave)
+        self._reset()
+
+    def _reset(self) -> None:
+        self._job, self._progress, self._layout, self._person, self._ended = None, None, "", "", True
+        self._box.clear()
+
+    def _leave(self) -> None:
+        """Stop the job and remove the files."""
+        if self._job is not None:
+            self._jobs.stop(self._job.id)
+        self._incoming.clear()
+
+
+_MB = ARCHIVE_BYTES // 1_000_000

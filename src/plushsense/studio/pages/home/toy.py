@@ -1,0 +1,130 @@
+"""Build the section of the home page in which a toy is found, chosen and tried out."""
+
+from __future__ import annotations
+
+from nicegui import ui
+
+from plushsense.core.errors import PlushSenseError
+from plushsense.studio.app.shell import Page, button, on_change, on_page, tag
+from plushsense.studio.app.toys import PERSONS, Toys, ToyTrial, with_layout
+from plushsense.studio.pages.home.sections import SMALL, simulation_badge, titled_card
+from plushsense.studio.widgets.elements import errors_beside
+
+
+class ToySection:
+    """Section for choosing a toy; it searches for toys unless a search was made before."""
+
+    def __init__(self, page: Page, toys: Toys) -> None:
+        self._page, self._words, self._toys = page, page.words, toys
+        words = self._words
+        with titled_card(page, "home.toy", "toy"):
+            self._chosen = ui.column().classes("w-full ps-small-gap").props('aria-live="polite"')
+            with ui.row().classes("items-end ps-small-gap w-full"):
+                options = {n: words("home.person", n=n) for n in range(1, PERSONS + 1)}
+                who = ui.select(options, value=7, label=words("home.virtual_person")).classes("ps-wide")
+                tag(who, "person")
+                text = words("home.choose_virtual")
+                button("virtual", text, lambda: self._choose(f"virtual://?person={who.value}"), "unelevated")
+            self._others = ui.column().classes("w-full ps-small-gap")
+            with ui.row().classes("items-start ps-small-gap w-full"):
+                field = ui.input(words("home.address"), placeholder="tcp://192.168.1.20:3333").classes("ps-wide")
+                self._address = tag(field, "address")
+                field.on("keydown.enter", self._use)
+                button("use", words("home.use"), self._use)
+        self._update()
+        on_change(toys.changed, self._update)
+        if not toys.searched:
+            toys.search()
+
+    def _use(self) -> None:
+        """Choose the toy at the address that was typed; an error is shown beside the field."""
+        with errors_beside(self._page, self._address):
+            url = str(self._address.value or "").strip()
+            self._toys.check(url)
+            self._toys.choose(url)
+            self._try_out()
+
+    def _choose(self, url: str) -> None:
+        with self._page.show_errors():
+            self._toys.choose(url)
+            self._try_out()
+
+    def _try_out(self) -> None:
+        """Try the chosen toy, unless a recorder is using it."""
+        self._page.say("")
+        if not self._page.workspace.recording:
+            self._toys.try_out()
+
+    def _update(self) -> None:
+        self._show_chosen()
+        self._show_others()
+
+    def _show_chosen(self) -> None:
+        words, toy, trial = self._words, self._page.workspace.toy, self._toys.trial
+        self._chosen.clear()
+        with self._chosen:
+            if not toy:
+                ui.label(words("home.no_toy")).classes("ps-dim")
+                return
+            with ui.row().classes("items-center ps-small-gap"):
+                tag(ui.label(words("home.chosen", url=toy)).classes("ps-break text-bold"), "chosen")
+                if self._toys.simulated:
+                    simulation_badge(self._page)
+            if trial is not None:
+                kind, text = self._describe(trial)
+                box = ui.row().classes(f"ps-message ps-message-{kind} w-full items-center no-wrap")
+                with tag(box.props('role="status"'), "trial"):
+                    if trial.running:
+                        ui.spinner(size="1.2em", color="inherit").props("aria-hidden=true")
+                    ui.label(text).classes("ps-break")
+            with ui.row().classes("ps-small-gap"):
+                if trial is not None and trial.layout:
+                    fitting, url = trial.layout, with_layout(trial.url, trial.layout)
+                    text = words("home.use_layout", layout=fitting)
+                    button("use-layout", text, on_page(lambda: self._choose(url)), "unelevated")
+                button("test", words("home.test"), on_page(self._try_out)).set_enabled(
+                    trial is None or not trial.running
+                )
+
+    def _describe(self, trial: ToyTrial) -> tuple[str, str]:
+        """Return the kind of message and the sentence about a trial."""
+        words, result = self._words, trial.result
+        if trial.running:
+            return "info", words("home.testing")
+        if trial.layout:
+            return "warning", words("home.test_other", layout=trial.layout)
+        if trial.error is not None:
+            error = trial.error
+            if isinstance(error, PlushSenseError):
+                return "error", words.error(error)
+            return "error", words.explain(" ".join(str(error).split()) or type(error).__name__)
+        assert result is not None
+        values = {"seconds": words.number(result.seconds, 1), "rate": words.number(result.rate_hz)}
+        key = "good" if result.fits and result.on_time else "slow" if result.fits else "malformed"
+        values |= {"frames": str(result.frames), "layout": result.layout, "malformed": str(result.malformed)}
+        return ("good" if key == "good" else "warning"), words(f"home.test_{key}", **values)
+
+    def _show_others(self) -> None:
+        words, toys = self._words, self._toys
+        self._others.clear()
+        given = [(url, "", words("home.given")) for url in self._page.workspace.devices]
+        listed = [(d.url, d.name, d.description) for d in toys.listing.devices if d.kind != "virtual"]
+        with self._others:
+            for url, name, about in [*given, *listed]:
+                with ui.row().classes("ps-row items-center justify-between w-full no-wrap"):
+                    with ui.column().classes("ps-no-gap"):
+                        ui.label(name or url).classes("ps-break")
+                        ui.label(" · ".join(t for t in (url if name else "", about) if t)).classes("ps-dim ps-break")
+                    button(
+                        "", words("home.choose"), on_page(lambda url=url: self._choose(url)), SMALL, about=name or url
+                    )
+            if toys.searching:
+                with ui.row().classes("items-center ps-small-gap").props('role="status"'):
+                    ui.spinner(size="1.2em").props("aria-hidden=true")
+                    ui.label(words("home.looking"))
+                return
+            if toys.searched and not listed:
+                ui.label(words("home.none_found")).classes("ps-dim")
+            for note in toys.listing.notes:
+                ui.label(words.note(note)).classes("ps-dim ps-note ps-break")
+            button("look", words("home.look_again" if toys.searched else "home.look"), toys.search, SMALL)

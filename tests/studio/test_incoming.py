@@ -1,0 +1,170 @@
+"""Files of the visitor become data sets and networks, with a preview, in the page's language."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from plushsense.core.errors import Note
+from plushsense.dataset.backup import backup
+from plushsense.studio.app.workspace import DATASETS
+from plushsense.studio.tasks import TaskReporter, run_inspect
+from support.browsing import TABLET, axe, marked
+
+Fixture = Callable[..., Any]
+LONG_MS = 90_000
+
+
+def recordings(furniture: Path, person: str, count: int = 3) -> list[Path]:
+    folder = furniture / "datasets" / "virtual" / "recordings" / person
+    return sorted(folder.rglob("*.csv"))[:count]
+
+
+def people(furniture: Path, folder: Path, *codes: str) -> Path:
+    """Copy some recordings of each person into a folder of theirs."""
+    for code in codes:
+        (folder / code).mkdir(parents=True)
+        for path in recordings(furniture, code):
+            shutil.copy(path, folder / code)
+    return folder
+
+
+def zipped(folder: Path, target: Path) -> Path:
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted(folder.rglob("*.csv")):
+            archive.write(path, path.relative_to(folder))
+    return target
+
+
+def inspect(dest: Path, *sources: Path, layout: str = "", person: str = "") -> dict[str, Any]:
+    spec = {"sources": [str(s) for s in sources], "dest": str(dest), "layout": layout, "person": person}
+    return run_inspect(spec, TaskReporter(io.StringIO()))
+
+
+def drop(page: Any, *paths: Path) -> None:
+    """Drop files or folders onto the page, as a person does with the mouse."""
+    session = page.context.new_cdp_session(page)
+    data = {"items": [], "files": [str(p) for p in paths], "dragOperationsMask": 1}
+    for kind in ("dragEnter", "dragOver", "drop"):
+        session.send("Input.dispatchDragEvent", {"type": kind, "x": 300, "y": 300, "data": data})
+
+
+def choose(page: Any, button: str, *paths: Path) -> None:
+    with page.expect_file_chooser() as chooser:
+        marked(page, button).click()
+    chooser.value.set_files([str(p) for p in paths] if button == "choose_files" else str(paths[0]))
+
+
+def test_sources_are_imported_together_and_what_is_refused_is_named(furniture: Path, tmp_path: Path) -> None:
+    folder = people(furniture, tmp_path / "files", "P01")
+    (folder / "notes.txt").write_text("hello")
+    packed = zipped(people(furniture, tmp_path / "more", "P02"), tmp_path / "more.zip")
+    broken = tmp_path / "broken.zip"
+    broken.write_bytes(b"PK no zip")
+    found = inspect(tmp_path / "D", broken, packed, folder)
+    assert found["people"] == {"P01": 3, "P02": 3}
+    assert (found["layout"], found["recordings"], found["simulated"]) == ("plush-15", 6, False)
+    reasons = {r["file"]: r["reason"].reason for r in found["rejected"]}
+    assert reasons == {"broken.zip": "zip_damaged", "notes.txt": "file_no_recording"}
+    assert [note.reason for note in found["notes"] if isinstance(note, Note)] == ["layout_guessed"]
+
+
+def test_the_person_of_loose_files_and_of_folders_of_gestures_can_be_given(furniture: Path, tmp_path: Path) -> None:
+    loose = tmp_path / "loose"
+    loose.mkdir()
+    for path in recordings(furniture, "P01"):
+        shutil.copy(path, loose)
+    with pytest.raises(Exception, match="holds no recording") as refused:
+        inspect(tmp_path / "D", loose)
+    assert refused.value.reason == "person_unknown"
+    assert inspect(tmp_path / "D", loose, person="S01")["people"] == {"S01": 3}
+    for path in list(loose.iterdir()):
+        (loose / path.name.split("_")[0]).mkdir(exist_ok=True)
+        path.rename(loose / path.name.split("_")[0] / path.name)
+    assert inspect(tmp_path / "D", loose)["people"] == {"unknown": 3}
+    assert inspect(tmp_path / "D", loose, person="S01")["people"] == {"S01": 3}
+
+
+def test_files_and_a_folder_are_chosen(studio: Fixture, look: Fixture, furniture: Path, tmp_path: Path) -> None:
+    packed = zipped(people(furniture, tmp_path / "two", "P01", "P02"), tmp_path / "mine.zip")
+    bad, broken = tmp_path / "bad.plush", tmp_path / "broken.zip"
+    bad.write_bytes(b"nothing")
+    broken.write_bytes(b"PK no zip")
+    bomb = tmp_path / "bomb.zip"
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("P01/Tail pull_1700000000000_300.csv", b"0" * 20_000_000)
+        archive.writestr("../../outside.csv", b"1")
+    browser = look(TABLET)
+    page = browser.open(studio().url)
+    home = tmp_path / "home"
+    choose(page, "choose_files", bad, furniture / "bundles" / "little.plush")
+    page.get_by_role("alert").get_by_text("bad.plush: this is no network").wait_for()
+    assert "gestures: 18" in marked(page, "bundle").inner_text()
+    assert [p.name for p in (home / "bundles").iterdir()] == ["little.plush"]
+    choose(page, "choose_files", broken)
+    marked(page, "preview-problem").get_by_text("“broken.zip” is no zip").wait_for(timeout=LONG_MS)
+    # Further files are added to those that are there.
+    choose(page, "choose_files", packed, bomb)
+    marked(page, "rejected").locator("summary").get_by_text("2").wait_for(timeout=LONG_MS)
+    marked(page, "rejected").locator("summary").click()
+    assert "P01 (3), P02 (3)" in marked(page, "preview").inner_text()
+    assert axe(page) == []
+    marked(page, "incoming-name").fill("brought")
+    marked(page, "import").click()
+    marked(page, "dataset").get_by_text("recordings: 6").wait_for()
+    choose(page, "choose_folder", tmp_path / "two")
+    marked(page, "incoming-name").fill("brought", timeout=LONG_MS)
+    marked(page, "import").click()
+    marked(page, "preview").get_by_role("alert").get_by_text("exists already").wait_for()
+    marked(page, "import-cancel").click()
+    marked(page, "preview").wait_for(state="detached")
+    assert [p.name for p in (home / DATASETS).iterdir()] == ["brought"]
+    assert list((home / "work" / "incoming").iterdir()) == []
+    assert not (tmp_path / "outside.csv").exists()
+    huge = tmp_path / "huge.zip"
+    with huge.open("wb") as file:
+        file.truncate(500_000_001)
+    choose(page, "choose_files", huge)
+    page.get_by_role("alert").get_by_text("larger than 500 MB").wait_for()
+    assert browser.complaints == []
+
+
+def test_files_are_dropped_and_what_is_missing_is_asked_in_latvian(
+    studio: Fixture, look: Fixture, furniture: Path, tmp_path: Path
+) -> None:
+    browser = look((390, 844), True, "lv")
+    page = browser.open(studio().url)
+    drop(page, *recordings(furniture, "P01"))
+    marked(page, "preview").get_by_text("Nav zināms, kura cilvēka").wait_for(timeout=LONG_MS)
+    marked(page, "person-of-files").fill("S05")
+    page.keyboard.press("Enter")
+    marked(page, "preview").get_by_text("S05 (3)").wait_for(timeout=LONG_MS)
+    marked(page, "preview").get_by_text("Uzminēts pēc failiem").wait_for()
+    # Other sensors do not fit: the reason is said, and the choice can be changed back.
+    for name in ("accel-3", "plush-15"):
+        marked(page, "preview").get_by_role("combobox").click()
+        page.get_by_role("option", name=name).click()
+        if name == "accel-3":
+            problem = marked(page, "preview-problem").get_by_text("Neviens fails neatbilst sensoriem")
+            problem.wait_for(timeout=LONG_MS)
+            assert axe(page) == []
+    marked(page, "import").wait_for(timeout=LONG_MS)
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert axe(page) == []
+    marked(page, "import").click()
+    marked(page, "message").get_by_text("ir gatava").wait_for()
+    saved = tmp_path / "virtual.zip"
+    backup(furniture / "datasets" / "virtual", saved)
+    drop(page, saved)
+    marked(page, "preview").get_by_text("datu kopas “virtual toy” rezerves kopija").wait_for(timeout=LONG_MS)
+    marked(page, "import").click()
+    marked(page, "dataset").get_by_text("virtual toy", exact=True).wait_for()
+    assert sorted(p.name for p in (tmp_path / "home" / DATASETS).iterdir())[1:] == ["virtual toy"]
+    assert "(Angliski:)" not in page.locator("body").inner_text()
+    assert browser.complaints == []
