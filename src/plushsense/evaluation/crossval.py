@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.gestures import NOBODY
 from plushsense.evaluation.leakage import audit_leakage
-from plushsense.evaluation.scores import FoldRecord, Predictions, compute_scores, gather_predictions, write_predictions
+from plushsense.evaluation.scores import (
+    FoldRecord,
+    Predictions,
+    compute_scores,
+    gather_predictions,
+    with_accuracy,
+    write_predictions,
+)
 from plushsense.jobs.journal import Journal, Result, job_id
 from plushsense.jobs.pool import Job, Report, run_jobs
 from plushsense.jobs.progress import JobInfo, JobProgress, JobsReporter
@@ -266,7 +273,7 @@ def evaluate(
         train_context=context_of(train_windows),
         seeds=[seed],
         table=table,
-        histories=[list(outcome["history"]) for outcome in outcomes],
+        histories=[with_accuracy(outcome["history"], parsed.apart) for outcome in outcomes],
         predictions=predictions,
     )
 

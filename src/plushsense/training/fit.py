@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import DivergedError, TrainingError
 from plushsense.models.arch import Arch
 from plushsense.models.net import Net
+from plushsense.scoring.metrics import accuracy_over_people
 from plushsense.training.augment import Channels, Transform, augmentations
 from plushsense.training.engine import Engine, FitState, Windows, engine, is_fast, slices, torch_threads
 from plushsense.training.spec import TrainSpec
@@ -38,7 +39,8 @@ class FittedNetwork:
     Attributes:
         weights: arrays by name, for `plushsense.models.reference.Network`.
         history: a row for each epoch: epoch (from 1), train_loss and train_accuracy (means over the batches, measured
-            while training), validation_loss and validation_accuracy (None without validation), learning_rate.
+            while training), validation_loss and validation_accuracy (None without validation) over all windows,
+            validation_accuracy_people (see `accuracy_over_people`), learning_rate.
         best_epoch: the epoch of ``weights``.
         kept: weights after each epoch in ``keep``.
         state: state to continue the training from; None with early stopping.
@@ -119,9 +121,7 @@ def fit(
                 for group in adam.param_groups:
                     group["lr"] = spec.learning_rate_at(epoch)
                 row["train_loss"], row["train_accuracy"] = _train(net, adam, x, y, spec, order, augment)
-                row["validation_loss"], row["validation_accuracy"] = (
-                    (None, None) if val_data is None else _measure(net, *val_data)
-                )
+                row |= _measure(net, val_data, validation)
                 row["learning_rate"] = spec.learning_rate_at(epoch)
                 _refuse_not_finite(row, spec)
                 history.append(row)
@@ -261,10 +261,18 @@ def _train(
     return float(sums[0]) / n_windows, float(sums[1]) / n_windows
 
 
-def _measure(net: Engine, x: Windows, y: Tensor) -> tuple[float, float]:
-    """Compute mean loss and accuracy without training."""
+def _measure(net: Engine, data: tuple[Windows, Tensor] | None, windows: WindowSet | None) -> dict[str, float | None]:
+    """Compute loss and accuracies of validation without training, as a part of a row of the history."""
+    if data is None or windows is None:
+        return dict.fromkeys(("validation_loss", "validation_accuracy", "validation_accuracy_people"))
+    x, y = data
     logits = net.logits(x)
-    return float(F.cross_entropy(logits, y)), float((logits.argmax(dim=1) == y).float().mean())
+    predicted = logits.argmax(dim=1)
+    return {
+        "validation_loss": float(F.cross_entropy(logits, y)),
+        "validation_accuracy": float((predicted == y).float().mean()),
+        "validation_accuracy_people": accuracy_over_people(windows.y, predicted.cpu().numpy(), windows.subject),
+    }
 
 
 def _tensors(windows: WindowSet, scaler: Scaler, arch: Arch, device: torch.device) -> tuple[Windows, Tensor]:

@@ -31,7 +31,7 @@ from plushsense.deploy.quantize import (
 from plushsense.evaluation.crossval import EpochProgress, Evaluation, FoldOutput, windows_fingerprint
 from plushsense.evaluation.crossval import evaluate as crossvalidate
 from plushsense.evaluation.leakage import warn_of_copies
-from plushsense.evaluation.scores import FoldRecord, gather_predictions
+from plushsense.evaluation.scores import FoldRecord, gather_predictions, with_accuracy
 from plushsense.evaluation.scores import compute_scores as score_predictions
 from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possible
 from plushsense.jobs.progress import JobProgress
@@ -68,6 +68,7 @@ if TYPE_CHECKING:
 # Age at which unfinished trainings are deleted: most are never resumed, and they contain data on people.
 _KEPT_S = 30 * 24 * 3600.0
 _SAVE_EVERY_S = 0.5
+FIRST_NETWORK = "first network"
 # Training warns if float and 8-bit predictions agree on a smaller share of the validation windows than this.
 _AGREEMENT = 0.95
 
@@ -195,8 +196,9 @@ def train(
             ``config.live`` that differ from the defaults are kept.
         journal: stores the progress of the training (see `unfinished`), so that an interrupted one resumes and gives
             the same bundle. The steps after the training are repeated.
-        progress: called with (epoch, maximum of epochs, the epoch's row), first for the epochs before an interruption;
-            not while the first network trains that finds hard negatives (context "anywhere").
+        progress: called with (epoch, maximum of epochs, the epoch's row), first for the epochs before an interruption.
+            Rows of the first network that finds hard negatives (``hard_share`` of the context "anywhere"), and of the
+            fine-tuning, have ``what``. The others have ``accuracy``, that of validation as ``scores`` counts it.
         warn: called with a sentence for everything that is left out, and if 8-bit arithmetic changes many predictions.
     """
     given = config or from_settings(arch=arch, filters=filters, **settings)
@@ -221,18 +223,19 @@ def train(
     from plushsense.training.fit import fit, predict
 
     train_on, watched = windows.take(train_at), scored.take(division.watch)
+    apart = division.split.apart
+    epoch_done = _reporting(progress, apart)
     if division.kind == WHOLE_PEOPLE:
         train_on = add_hard_negatives(
             train_on, dataset, network, config.windows, config.anywhere, gestures, config.training,
-            division.fold.subjects,
+            division.fold.subjects, _reporting(progress, apart, what=FIRST_NETWORK),
         )  # fmt: skip
     state = None if journal is None else ResumableTraining(journal, network, config.training, train_on, watched)
     start = state.load() if state else None
-    if start is not None and progress is not None:
-        for row in start.history:
-            progress(row["epoch"], config.training.epochs, row)
+    for row in start.history if start is not None else ():
+        epoch_done(row["epoch"], config.training.epochs, row)
     fitted = fit(
-        train_on, watched, network, config.training, progress,
+        train_on, watched, network, config.training, epoch_done,
         start=start, save=state.save if state else None, save_every_s=_SAVE_EVERY_S,
     )  # fmt: skip
     weights, scaler = fitted.weights, fitted.scaler
@@ -240,7 +243,7 @@ def train(
     if quantize_aware:
         from plushsense.training.quantized import fine_tune
 
-        tuned = fine_tune(train_on, network, weights, scaler, kept, config.training, quantize_aware, progress)
+        tuned = fine_tune(train_on, network, weights, scaler, kept, config.training, quantize_aware, epoch_done)
         weights = tuned.weights
     test = scored.take(test_at)
     sizes = (len(train_at), len(division.watch), len(test_at))
@@ -301,7 +304,18 @@ def train(
         state.discard()
     # `forget` cannot find an unsaved bundle: raise an error if a person was removed during the training.
     dataset.generation.check()
-    return Trained(bundle, fitted.history, scores, fitted.seconds + (state.before_s if state else 0.0))
+    history = with_accuracy(fitted.history, apart)
+    return Trained(bundle, history, scores, fitted.seconds + (state.before_s if state else 0.0))
+
+
+def _reporting(progress: EpochProgress | None, apart: bool, **more: str) -> EpochProgress:
+    """Return a callback for the epochs of a training, which adds ``accuracy`` and ``more`` to their rows."""
+
+    def report(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+        if progress is not None:
+            progress(epoch, epochs, with_accuracy([row], apart)[0] | more)
+
+    return report
 
 
 def _with_decisions(bundle: Bundle, dataset: Dataset, given: DecideSpec, warn: Warn) -> Bundle:
