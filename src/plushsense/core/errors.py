@@ -118,6 +118,25 @@ class MissingExtraError(PlushSenseError):
     """An optional package that is not installed."""
 
 
+class Notice(str):
+    """A sentence for the user that is no error, with ``reason`` and ``values`` as those of a `PlushSenseError`."""
+
+    reason: str
+    values: dict[str, object]
+
+    def __new__(cls, sentence: str, reason: str = "", **values: object) -> Notice:
+        notice = super().__new__(cls, sentence)
+        notice.reason, notice.values = reason, values
+        return notice
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _restored, (str(self), self.reason, self.values)
+
+
+def _restored(sentence: str, reason: str, values: dict[str, object]) -> Notice:
+    return Notice(sentence, reason, **values)
+
+
 def nearest(word: str, known: Iterable[str]) -> str:
     """Return the suggestion of a similar word to append to an error message, or "" if there is none."""
     lowered = {k.lower(): k for k in known}
@@ -149,5 +168,8 @@ def need(module: str, extra: str) -> ModuleType:
         if error.name is not None and error.name.split(".")[0] != top:
             raise
         raise MissingExtraError(
-            f"This needs the package '{top}', which is not installed: run  pip install 'plushsense[{extra}]'"
+            f"This needs the package '{top}', which is not installed: run  pip install 'plushsense[{extra}]'",
+            reason="not_installed",
+            package=top,
+            extra=extra,
         ) from error

@@ -123,7 +123,11 @@ def _require_windows(fold: Fold, recordings: Fold, split: Split) -> None:
         if not len(getattr(fold, name)):
             touched = ": every window that could train touches a tested recording in its stream"
             reason = touched if len(getattr(recordings, name)) else ""
-            raise BadInput(f"Split {split.text} leaves {fold.name} no windows to {name} with{reason}: use fewer folds.")
+            raise BadInput(
+                f"Split {split.text} leaves {fold.name} no windows to {name} with{reason}: use fewer folds.",
+                reason="fold_empty",
+                fold=fold.name,
+            )
 
 
 @dataclass(frozen=True)

@@ -283,7 +283,9 @@ def _tensors(windows: WindowSet, scaler: Scaler, arch: Arch, device: torch.devic
 
 def _check(windows: WindowSet, arch: Arch, purpose: str, some: bool = True) -> None:
     if some and not len(windows):
-        raise TrainingError(f"There are no windows to {purpose}: check the data set, the gestures and the split.")
+        raise TrainingError(
+            f"There are no windows to {purpose}: check the data set, the gestures and the split.", reason="no_windows"
+        )
     _, channels, samples = windows.x.shape
     if channels != arch.channels or len(windows.labels) != arch.classes:
         raise TrainingError(
@@ -302,7 +304,9 @@ def _refuse_not_finite(row: dict[str, Any], spec: TrainSpec) -> None:
         if row[name] is not None and not np.isfinite(row[name]):
             raise DivergedError(
                 f"The {name.replace('_', ' ')} is no longer a number in epoch {row['epoch']} at the learning rate "
-                f"{row['learning_rate']:g}: try a lower one, such as {spec.learning_rate / 10:g}."
+                f"{row['learning_rate']:g}: try a lower one, such as {spec.learning_rate / 10:g}.",
+                reason="diverged",
+                epoch=row["epoch"],
             )
 
 
@@ -319,5 +323,5 @@ def _device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if name == "cuda" and not torch.cuda.is_available():
-        raise TrainingError("There is no CUDA device to train on: use the device 'auto' or 'cpu'.")
+        raise TrainingError("There is no CUDA device to train on: use the device 'auto' or 'cpu'.", reason="no_cuda")
     return torch.device(name)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import BadInput, ConfigError, DivergedError
+from plushsense.core.errors import BadInput, ConfigError, DivergedError, Notice
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.crossval import fold_fingerprint, fold_windows, windows_fingerprint
@@ -173,11 +173,12 @@ def _warn_of_rare(dataset: Dataset, cut: _Cut, warn: Warn) -> None:
     if cut.split.apart and cut.grid.classes == ALL:
         rare = set(cut.gestures.labels) - set(shared_gestures(dataset)[0].labels)
         if rare:
-            warn(
+            sentence = (
                 f"{len(rare)} of the {len(cut.gestures)} classes are gestures that fewer than 90 % of the people made "
                 f"({', '.join(sorted(rare))}): the tested person may be the only one with a class; leave these classes "
                 "out with --classes shared"
             )
+            warn(Notice(sentence, "rare_gestures", gestures=sorted(rare)))
 
 
 @dataclass

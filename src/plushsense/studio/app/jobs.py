@@ -41,6 +41,8 @@ class StudioJob:
         spec: the argument of the task, as JSON values.
         state: `RUNNING`, `DONE`, `REFUSED` (``message`` says why; ``reason`` and ``values`` are those of the error) or
             `STOPPED` (by a person, or because the process or the studio ended).
+        warnings: sentences in English; ``reasons`` maps those with a text in other languages to ``reason`` and
+            ``values``, as arguments of `plushsense.studio.app.words.Words.explain`.
         progress: the newest report of the task, as JSON values; ``reports`` has earlier ones too, thinned out if many.
         result: the value that the task returned.
         begun_s, ended_s: seconds since 1970.
@@ -54,6 +56,7 @@ class StudioJob:
     progress: dict[str, Any] = field(default_factory=dict)
     reports: list[dict[str, Any]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    reasons: dict[str, Any] = field(default_factory=dict)
     result: dict[str, Any] = field(default_factory=dict)
     message: str = ""
     reason: str = ""
@@ -147,7 +150,7 @@ class Jobs:
             if job.state == RUNNING:
                 return job
             job.state, job.message, job.result, job.reports, job.warnings = RUNNING, "", {}, [], []
-            job.reason, job.values = "", {}
+            job.reason, job.values, job.reasons = "", {}, {}
         self._run(job)
         return job
 
@@ -229,7 +232,10 @@ class Jobs:
                     del job.reports[::2]
                 job.reports.append(job.progress)
             elif "warning" in message:
-                job.warnings.append(str(message["warning"]))
+                sentence = str(message["warning"])
+                job.warnings.append(sentence)
+                if message.get("reason"):
+                    job.reasons[sentence] = {key: message.get(key) for key in ("reason", "values")}
             else:
                 outcome = message
             self.changed.notify()

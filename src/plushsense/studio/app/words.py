@@ -59,8 +59,14 @@ class Words:
         """
         text = self._texts.get(f"errors.{reason}")
         if text is not None:
-            return text.format(**(values or {}))
+            return text.format(**{key: self._formatted(value) for key, value in (values or {}).items()})
         return self._texts["errors.other"].format(message=message) if message else ""
+
+    def _formatted(self, value: object) -> object:
+        """Format a value of an error: a list of gestures in this language, a number with its decimal separator."""
+        if isinstance(value, list | tuple):
+            return ", ".join(self.gesture(str(one)) for one in value)
+        return self.number(value, 1) if isinstance(value, float) else value
 
     def unit(self, unit: str) -> str:
         """Return the name of a unit in this language, or ``unit`` itself if it has none."""
