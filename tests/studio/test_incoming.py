@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from plushsense.core.errors import Note
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.backup import backup
 from plushsense.studio.app.workspace import DATASETS
 from plushsense.studio.tasks import TaskReporter, run_inspect
@@ -72,7 +72,7 @@ def test_sources_are_imported_together_and_what_is_refused_is_named(furniture: P
     assert (found["layout"], found["recordings"], found["simulated"]) == ("plush-15", 6, False)
     reasons = {r["file"]: r["reason"].reason for r in found["rejected"]}
     assert reasons == {"broken.zip": "zip_damaged", "notes.txt": "file_no_recording"}
-    assert [note.reason for note in found["notes"] if isinstance(note, Note)] == ["layout_guessed"]
+    assert [note.reason for note in found["notes"] if isinstance(note, Sentence)] == ["layout_guessed"]
 
 
 def test_the_person_of_loose_files_and_of_folders_of_gestures_can_be_given(furniture: Path, tmp_path: Path) -> None:

@@ -81,7 +81,8 @@ def test_without_patience_or_validation_every_epoch_is_trained(made: Make) -> No
     assert out.best_epoch == 12 and len(out.history) == 12
     assert out.history[-1]["validation_accuracy"] is not None
     assert set(out.history[0]) == {
-        "epoch", "train_loss", "train_accuracy", "validation_loss", "validation_accuracy", "learning_rate",
+        "epoch", "train_loss", "train_accuracy", "validation_loss", "validation_accuracy",
+        "validation_accuracy_people", "learning_rate",
     }  # fmt: skip
 
 

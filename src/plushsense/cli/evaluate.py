@@ -60,8 +60,12 @@ def lines(e: dict[str, Any]) -> list[str]:
     if units == "folds" and n > 1:
         out.append("an interval over so few folds is too narrow, and is not one over people")
     out += [f"{name:<16}{spread(e[key])}" for key, name in names.items()]
-    voted = e["by_recording"]
-    out.append(f"vote by recording, pooled: {', '.join(f'{name} {figure(voted[k])}' for k, name in names.items())}")
+    rest = e["nobody"]
+    if rest:
+        out.append(f"without recordings at rest: {rest['recordings']} recordings, accuracy {figure(rest['accuracy'])}")
+    for title, of in (("vote by recording", e["by_recording"]), ("pooled", e["pooled"])):
+        scores = ", ".join(f"{name} {figure(of[k])}" for k, name in names.items())
+        out.append(f"{title}{', with recordings at rest' if rest and title == 'pooled' else ''}: {scores}")
     for kind, part in e["by_context"].items():
         out.append(f"  on {kind} windows: accuracy {figure(part['accuracy'])} ({part['windows']} windows)")
     if "leakage" in e:

@@ -63,8 +63,8 @@ def report_epochs(title: str = "training") -> Callable[[int, int, dict[str, Any]
     def report(epoch: int, epochs: int, row: dict[str, Any]) -> None:
         loss = row["train_loss"]  # the loss of fine-tuning is of another kind, and small
         text = f"loss {loss:{'.3f' if loss >= 0.01 else '.1e'}}"
-        if row["validation_accuracy"] is not None:
-            text += f", validation accuracy {row['validation_accuracy']:.3f}"
+        if row["accuracy"] is not None:
+            text += f", validation accuracy {row['accuracy']:.3f}"
         phase = row.get("what", title)
         reporter = reporters.setdefault(phase, ProgressReporter(phase, "epochs", keep=True))
         reporter(epoch, epochs, detail=text)

@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
             f"{bundle}: {done.bundle.arch.symbol}, {done.bundle.arch.parameters:,} parameters, "
             f"epoch {scores['best_epoch']} of {len(done.history)} kept{mark}",
             f"accuracy {figure(scores['accuracy'])}, macro-F1 {figure(scores['macro_f1'])} on {scores['windows']} "
-            f"windows of {scores['said']}.",
+            f"windows of {scores['said']}{_counted(scores)}.",
             *(
                 [
                     f"In 8 bits, as in the toy: accuracy {figure(int8['accuracy'])}, macro-F1 "
@@ -50,6 +50,15 @@ def run(args: argparse.Namespace) -> int:
         ],
     )
     return 0
+
+
+def _counted(scores: Mapping[str, Any]) -> str:
+    from plushsense.reports.wording import MEAN
+    from plushsense.workflow.preparation import WHOLE_PEOPLE
+
+    rest = scores["nobody"]
+    apart = f", whose accuracy is {figure(rest['accuracy'])}" if rest else ""
+    return f" ({MEAN}{apart})" if scores["split"] == WHOLE_PEOPLE else ""
 
 
 def decided(decision: Mapping[str, Any]) -> list[str]:

@@ -36,33 +36,13 @@ class PlushSenseError(Exception):
 
     Args:
         message: the sentence.
-        reason: key of the sentence in other languages, "" for none; the studio has a text ``errors.<reason>`` for each.
+        reason: key of the sentence in other languages, "" for none; the studio has texts ``sentences.<reason>``.
         values: values that are filled into that text.
     """
 
     def __init__(self, message: str = "", *, reason: str = "", **values: object) -> None:
         super().__init__(message)
         self.reason, self.values = reason, values
-
-
-class Note(str):
-    """A sentence for the user that is no error: a note, or the reason why a file is refused.
-
-    It is a plain text for the command line. ``reason`` and ``values`` are as in `PlushSenseError`.
-    """
-
-    reason: str
-    values: dict[str, object]
-
-    def __new__(cls, message: str, *, reason: str = "", **values: object) -> Note:
-        note = super().__new__(cls, message)
-        note.reason, note.values = reason, values
-        return note
-
-    @classmethod
-    def of(cls, error: PlushSenseError) -> Note:
-        """Return the message of an error as a note."""
-        return cls(str(error), reason=error.reason, **error.values)
 
 
 class BadInput(PlushSenseError):
@@ -169,5 +149,8 @@ def need(module: str, extra: str) -> ModuleType:
         if error.name is not None and error.name.split(".")[0] != top:
             raise
         raise MissingExtraError(
-            f"This needs the package '{top}', which is not installed: run  pip install 'plushsense[{extra}]'"
+            f"This needs the package '{top}', which is not installed: run  pip install 'plushsense[{extra}]'",
+            reason="not_installed",
+            package=top,
+            extra=extra,
         ) from error

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Self
 
+from plushsense.core.errors import PlushSenseError
+
 
 class Sentence(str):
     """An English sentence, with the key and the values of its text in other languages.
@@ -20,10 +22,18 @@ class Sentence(str):
     reason: str
     values: dict[str, Any]
 
-    def __new__(cls, message: str, reason: str = "", /, **values: Any) -> Self:
+    def __new__(cls, message: str = "", /, reason: str = "", **values: Any) -> Self:
         sentence = super().__new__(cls, message)
         sentence.reason, sentence.values = reason, values
         return sentence
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self).from_dict, (self.to_dict(),)
+
+    @classmethod
+    def of(cls, error: PlushSenseError) -> Self:
+        """Return the sentence of an error."""
+        return cls(str(error), error.reason, **error.values)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, from which `from_dict` restores the sentence."""

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import DatasetError, FileFormatError, ForgottenError, Note
+from plushsense.core.errors import DatasetError, FileFormatError, ForgottenError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, Gesture, GestureSet, plain_label
 from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_bytes, read_recording, read_stream
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.files import (
     RECORDINGS_INDEX,
     STAMP,
@@ -177,7 +178,7 @@ def build_index(folder: Path, head: DatasetHead, progress: Progress | None = Non
             data = read_bytes(path)
             result = reader(path, head.layout, data)
         except FileFormatError as cause:
-            unreadable[path.relative_to(folder).as_posix()] = Note.of(cause)
+            unreadable[path.relative_to(folder).as_posix()] = Sentence.of(cause)
             continue
         subject = path.relative_to(folder / kind).parts[0]
         read = _RawFile(path, subject, result, hashlib.sha256(data).hexdigest())

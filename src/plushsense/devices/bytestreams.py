@@ -13,8 +13,9 @@ from pathlib import Path
 import serial as pyserial
 from serial.tools import list_ports
 
-from plushsense.core.errors import DeviceError, Note
+from plushsense.core.errors import DeviceError
 from plushsense.core.layouts import Layout
+from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Device, Frame, now_ms
 from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
 from plushsense.devices.wire import LineParser
@@ -37,7 +38,7 @@ def serial_ports() -> list[tuple[str, str]]:
 def search_serial(_: float) -> DeviceListing:
     """List the serial ports."""
     ports = [(name, "" if about == "n/a" else about) for name, about in serial_ports()]
-    notes: list[str] = [] if ports else [Note("This computer has no serial port now.", reason="no_serial_port")]
+    notes: list[str] = [] if ports else [Sentence("This computer has no serial port now.", reason="no_serial_port")]
     return DeviceListing([DeviceInfo(f"serial://{name}", "serial", name, about) for name, about in ports], notes)
 
 

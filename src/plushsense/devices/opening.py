@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from plushsense.core.errors import ConfigError, DeviceError, MissingExtraError, Note, PlushSenseError, nearest
+from plushsense.core.errors import ConfigError, DeviceError, MissingExtraError, PlushSenseError, nearest
 from plushsense.core.layouts import Layout, load_layout
+from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Device
 from plushsense.devices.reconnect import ReconnectingDevice
 
@@ -237,15 +238,15 @@ def list_devices(scan_s: float = SCAN_S) -> DeviceListing:
         try:
             results[scheme] = pkgutil.resolve_name(search)(scan_s)
         except MissingExtraError as refusal:
-            note = Note(f"{scheme}: not looked at. {refusal}", reason="search_missing", kind=scheme)
+            note = Sentence(f"{scheme}: not looked at. {refusal}", reason="search_missing", kind=scheme)
             results[scheme] = DeviceListing(notes=[note])
         except PlushSenseError as refusal:
             reason, values = (refusal.reason, refusal.values) if refusal.reason else ("search_failed", {"kind": scheme})
-            note = Note(str(refusal), reason=reason, **values)
+            note = Sentence(str(refusal), reason=reason, **values)
             results[scheme] = DeviceListing(notes=[note])
         except Exception as cause:  # noqa: BLE001, RUF100
             message = f"{scheme} cannot be used: {' '.join(str(cause).split())}."
-            results[scheme] = DeviceListing(notes=[Note(message, reason="search_failed", kind=scheme)])
+            results[scheme] = DeviceListing(notes=[Sentence(message, reason="search_failed", kind=scheme)])
 
     threads = [threading.Thread(target=look, args=item, daemon=True) for item in SEARCHES.items()]
     for thread in threads:
@@ -253,7 +254,7 @@ def list_devices(scan_s: float = SCAN_S) -> DeviceListing:
     listing = DeviceListing()
     for thread, scheme in zip(threads, SEARCHES, strict=True):
         thread.join(scan_s + _GRACE_S)
-        late = Note(f"{scheme} did not answer within {scan_s + _GRACE_S:g} s.", reason="search_failed", kind=scheme)
+        late = Sentence(f"{scheme} did not answer within {scan_s + _GRACE_S:g} s.", reason="search_failed", kind=scheme)
         part = results.get(scheme) or DeviceListing(notes=[late])
         listing.devices += part.devices
         listing.notes += part.notes

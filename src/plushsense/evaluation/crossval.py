@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.gestures import NOBODY
 from plushsense.evaluation.leakage import audit_leakage
-from plushsense.evaluation.scores import FoldRecord, Predictions, compute_scores, gather_predictions, write_predictions
+from plushsense.evaluation.scores import (
+    FoldRecord,
+    Predictions,
+    compute_scores,
+    gather_predictions,
+    with_accuracy,
+    write_predictions,
+)
 from plushsense.jobs.journal import Journal, Result, job_id
 from plushsense.jobs.pool import Job, Report, run_jobs
 from plushsense.jobs.progress import JobInfo, JobProgress, JobsReporter
@@ -121,7 +128,11 @@ def _require_windows(fold: Fold, recordings: Fold, split: Split) -> None:
         if not len(getattr(fold, name)):
             touched = ": every window that could train touches a tested recording in its stream"
             reason = touched if len(getattr(recordings, name)) else ""
-            raise BadInput(f"Split {split.text} leaves {fold.name} no windows to {name} with{reason}: use fewer folds.")
+            raise BadInput(
+                f"Split {split.text} leaves {fold.name} no windows to {name} with{reason}: use fewer folds.",
+                reason="fold_empty",
+                fold=fold.name,
+            )
 
 
 @dataclass(frozen=True)
@@ -272,7 +283,7 @@ def evaluate(
         train_context=context_of(train_windows),
         seeds=[seed],
         table=table,
-        histories=[list(outcome["history"]) for outcome in outcomes],
+        histories=[with_accuracy(outcome["history"], parsed.apart) for outcome in outcomes],
         predictions=predictions,
     )
 

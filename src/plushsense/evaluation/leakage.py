@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.gestures import NOBODY
+from plushsense.core.sentences import Sentence
 from plushsense.scoring.splits import Fold, Index
 from plushsense.windows.cut import WindowSet
 
@@ -78,11 +79,12 @@ def warn_of_copies(audit: Mapping[str, Any], warn: Callable[[str], None]) -> Non
     """Warn of scored windows that are copies of training windows, naming two recordings."""
     if audit["near_duplicates"]:
         first = audit["pairs"][0]
-        warn(
+        sentence = (
             f"{audit['near_duplicates']} of {audit['windows']} scored windows are copies, or nearly, of training "
             f"windows of another recording (as {first['scored']} of {first['trained']}), so the scores are too high: "
             "exclude one of the two recordings"
         )
+        warn(Sentence(sentence, "near_copies", first=first["scored"], second=first["trained"]))
 
 
 def _ids(windows: WindowSet, index: Index) -> NDArray[np.str_]:

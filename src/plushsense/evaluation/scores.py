@@ -2,11 +2,12 @@
 
 With a split by people, means are over people, and recordings of nobody (subject "none": the toy at rest) are reported
 separately; otherwise means are over folds. Pooled scores, classes and confusions count every window, as in the paper.
+Every figure of a result is one of these two, and is called *mean* or *pooled*.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -129,6 +130,12 @@ def read_predictions(path: str | Path) -> Predictions:
         )
     except (OSError, KeyError, polars.exceptions.PolarsError) as cause:
         raise BadInput(f"'{path}' holds no predictions of an evaluation ({cause}): evaluate again.") from None
+
+
+def with_accuracy(history: Iterable[Mapping[str, Any]], apart: bool) -> list[dict[str, Any]]:
+    """Return the epochs of a training with ``accuracy``, that of validation as `compute_scores` counts it."""
+    key = "validation_accuracy_people" if apart else "validation_accuracy"
+    return [{**row, "accuracy": row.get(key)} for row in history]
 
 
 Mask = NDArray[np.bool_]

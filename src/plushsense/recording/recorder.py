@@ -16,20 +16,21 @@ from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import STREAM_NAME
+from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Device, now_ms
 from plushsense.devices.opening import open_device, parse_url
 from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.recording.plan import load_protocol
 from plushsense.recording.session import OpenSession, check_session, check_subject, new_session, next_session
-from plushsense.recording.session_files import Message, SessionHead
+from plushsense.recording.session_files import SessionHead
 from plushsense.recording.states import RecorderState, RecorderStatus, RecordingMachine, StepResult, key_of, write_error
 from plushsense.recording.writer import BackgroundWriter, StreamFile
 
-_NO_DESCRIPTOR = Message(
+_NO_DESCRIPTOR = Sentence(
     "Too many files are open on this computer: saving waits until some are closed. Nothing is lost.", "saving_waits"
 )
-_RECORDING = Message("Recording: space stops it, r discards it.", "recording_first")
-_CANCELLED = Message("The countdown was cancelled.", "cancelled")
+_RECORDING = Sentence("Recording: space stops it, r discards it.", "recording_first")
+_CANCELLED = Sentence("The countdown was cancelled.", "cancelled")
 
 
 class Recorder(RecordingMachine):
@@ -112,7 +113,7 @@ class Recorder(RecordingMachine):
                 row=self._receiver.rows,
             )
             repairs = self.session.progress.repairs
-            self._advance(Message("; ".join(repairs), "repaired", n=len(repairs)), from_start=True)
+            self._advance(Sentence("; ".join(repairs), "repaired", n=len(repairs)), from_start=True)
         self._reader.start()
 
     def space(self) -> None:
@@ -125,21 +126,21 @@ class Recorder(RecordingMachine):
                         f"The toy sends lines, but none is a frame of {layout} ({fields} numbers): "
                         "is the layout right, and the cable sound?"
                     )
-                    self._show_message(Message(sentence, "unreadable", layout=layout, n=fields))
+                    self._show_message(Sentence(sentence, "unreadable", layout=layout, n=fields))
                 elif self._receiver.silent:
                     sentence = "Nothing comes from the toy: is it switched on and near?"
-                    self._show_message(Message(sentence, "silent"))
+                    self._show_message(Sentence(sentence, "silent"))
                 else:
                     self._begin()
             elif self._state == "countdown":
                 self._cancel(_CANCELLED)
             elif self._state == "recording" and self._take is not None:
                 if max(self._passed_s(), self._wall_s()) < self.protocol.shortest_s:
-                    self._show_message(Message("Too early to stop: still recording.", "too_early"))
+                    self._show_message(Sentence("Too early to stop: still recording.", "too_early"))
                 else:
                     self._stop("space")
             elif self._state == "paused":
-                self._show_message(Message("Paused: resume first (p).", "paused"))
+                self._show_message(Sentence("Paused: resume first (p).", "paused"))
 
     def redo(self, why: str = "") -> None:
         """Record again: stop the running recording, or else discard the last one, whose file is kept."""
@@ -147,18 +148,18 @@ class Recorder(RecordingMachine):
             if self._state == "countdown":
                 self._cancel(_CANCELLED)
             elif self._state == "recording":
-                self._abandon("redo", Message("Stopped: record it again.", "broken_off"))
+                self._abandon("redo", Sentence("Stopped: record it again.", "broken_off"))
             elif self._state in ("idle", "paused", "finished"):
                 key = self._plan.last
                 if key is None:
                     sentence = "There is no recording to repeat: go back to it (b)."
-                    self._show_message(Message(sentence, "nothing_to_repeat"))
+                    self._show_message(Sentence(sentence, "nothing_to_repeat"))
                     return
                 file = self._plan.discard(key)
                 more = {"why": why} if why else {}
                 self._log("redo", file=file, gesture=key[0], repetition=key[1], **more)
                 sentence = f"'{key[0]}', {key[1]}, is to be recorded again; skip (s) keeps the earlier recording."
-                self._ready(Message(sentence, "again", gesture=key[0], n=key[1]))
+                self._ready(Sentence(sentence, "again", gesture=key[0], n=key[1]))
 
     def skip(self) -> None:
         """Skip this step; if it was to be recorded again, use the earlier recording."""
@@ -169,15 +170,15 @@ class Recorder(RecordingMachine):
                 self._show_message(_RECORDING)
             elif self._state in ("idle", "paused"):
                 key = key_of(self._plan.step)
-                message = Message()
+                message = Sentence()
                 if file := self._plan.keep(key):
                     self._log("keep", file=file, gesture=key[0], repetition=key[1])
-                    message = Message("The earlier recording is kept.", "kept")
+                    message = Sentence("The earlier recording is kept.", "kept")
                 elif key not in self._plan.takes:
                     self._plan.skipped.add(key)
                     self._log_step("skip")
                     sentence = f"Skipped '{key[0]}', {key[1]}; go back to it with b."
-                    message = Message(sentence, "skipped", gesture=key[0], n=key[1])
+                    message = Sentence(sentence, "skipped", gesture=key[0], n=key[1])
                 self._advance(message)
 
     def go(self, number: int) -> None:
@@ -192,7 +193,7 @@ class Recorder(RecordingMachine):
                 self._log_step("go")
                 there = key_of(self._plan.step) in self._plan.takes
                 sentence = "This step is recorded: space records it again, s goes on."
-                self._ready(Message(sentence, "recorded_already") if there else None)
+                self._ready(Sentence(sentence, "recorded_already") if there else None)
 
     def back(self) -> None:
         """Go one step back."""
@@ -213,7 +214,7 @@ class Recorder(RecordingMachine):
             self._paused = True
             if self._state == "recording":
                 sentence = "The pause stopped this recording: record it again."
-                self._abandon("pause", Message(sentence, "broken_off_by_pause"))
+                self._abandon("pause", Sentence(sentence, "broken_off_by_pause"))
             else:
                 self._enter("paused")
             self._log("pause")
@@ -242,8 +243,8 @@ class Recorder(RecordingMachine):
             former, self.device = self.device, device
             self._receiver.exchange(device)
             self._log("exchange", device=device.url, former=former.url, row=self._receiver.rows)
-            message_to_all = Message("The session goes on with another toy.", "exchanged")
-            over, self.over = self.over, Message()
+            message_to_all = Sentence("The session goes on with another toy.", "exchanged")
+            over, self.over = self.over, Sentence()
             if self._state == "recording":
                 self._abandon("exchange", message_to_all)
             elif self._state == "stopped":
@@ -265,7 +266,7 @@ class Recorder(RecordingMachine):
                 # At real time, the toy's clock has gone on since its last frame.
                 device_ms = last.device_ms + (at_ms - last.host_ms if self._speed == 1.0 else 0)
             self._log_step("mark", host_ms=at_ms, device_ms=device_ms, row=self._receiver.rows)
-            self._show_message(Message("Marked for the video.", "marked"))
+            self._show_message(Sentence("Marked for the video.", "marked"))
 
     def note(self, text: str) -> None:
         """Log a remark with the time, the current step and the last recording."""
@@ -273,12 +274,12 @@ class Recorder(RecordingMachine):
         with self._notifying():
             if text and (self._closing or self._state == "stopped"):
                 sentence = "The session has ended: this note is not saved."
-                self._show_message(Message(sentence, "note_too_late"))
+                self._show_message(Sentence(sentence, "note_too_late"))
             elif text:
                 self._log_step("note", text=text, file=self._plan.last_file)
-                self._show_message(Message("Note saved.", "note_saved"))
+                self._show_message(Sentence("Note saved.", "note_saved"))
 
-    def show_message(self, message: Message) -> None:
+    def show_message(self, message: Sentence) -> None:
         """Show a message on every display."""
         with self._notifying():
             self._show_message(message)

@@ -18,13 +18,13 @@ from plushsense.core.files import PART
 from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import HOST_MS, Layout
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
+from plushsense.core.sentences import Sentence
 from plushsense.devices.base import now_ms
 from plushsense.recording.plan import Protocol
 from plushsense.recording.session_files import (
     SESSION_HEAD,
     SESSION_LOG,
     SIDECAR,
-    Message,
     SessionEvent,
     SessionHead,
     read_events,
@@ -55,7 +55,7 @@ class SessionProgress:
     rows: int = 0
     host_ms: int = 0
     resumed: bool = False
-    repairs: list[Message] = field(default_factory=list)
+    repairs: list[Sentence] = field(default_factory=list)
 
 
 def check_subject(code: str) -> str:
@@ -285,7 +285,7 @@ def _repair(folder: Path, layout: Layout, log: LogFile) -> SessionProgress:
     if started is not None and started not in progress.takes:
         log.write([new_event("unfinished", gesture=started[0], repetition=started[1])])
         sentence = f"'{started[0]}', {started[1]}, was interrupted: record it again"
-        progress.repairs.append(Message(sentence, "interrupted", gesture=started[0], n=started[1]))
+        progress.repairs.append(Sentence(sentence, "interrupted", gesture=started[0], n=started[1]))
     return progress
 
 
@@ -356,7 +356,7 @@ def _repair_stream(path: Path, layout: Layout, progress: SessionProgress, log: L
             file.truncate(whole)
             os.fsync(file.fileno())
             sentence = f"the incomplete last line of {path.name} was removed ({size - whole} bytes)"
-            progress.repairs.append(Message(sentence, "line_removed", file=path.name))
+            progress.repairs.append(Sentence(sentence, "line_removed", file=path.name))
 
 
 def _host_ms(line: bytes, layout: Layout) -> int:
@@ -381,7 +381,7 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
             os.replace(path, path.with_name(path.name + TORN))
             log.write([new_event("mended", file=path.name, how=f"not whole: renamed to end in {TORN}")])
             sentence = f"'{path.name}' is incomplete: record it again"
-            progress.repairs.append(Message(sentence, "recording_incomplete", file=path.name))
+            progress.repairs.append(Sentence(sentence, "recording_incomplete", file=path.name))
             if key is not None and progress.takes.get(key) == path.name:
                 del progress.takes[key]
             continue
@@ -410,7 +410,7 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
     for key, file in list(progress.takes.items()):
         if not (folder / file).exists():
             log.write([new_event("mended", file=file, how="the recording is gone", gesture=key[0], repetition=key[1])])
-            progress.repairs.append(Message(f"'{file}' is missing: record it again", "recording_missing", file=file))
+            progress.repairs.append(Sentence(f"'{file}' is missing: record it again", "recording_missing", file=file))
             del progress.takes[key]
 
 

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import DatasetError, PlushSenseError
+from plushsense.core.errors import DatasetError
 from plushsense.core.files import write_file
 from plushsense.core.toml import load_table
 
@@ -24,23 +24,6 @@ SESSION_HEAD = "session.json"
 SESSION_LOG = "session.jsonl"
 SIDECAR = ".json"
 FORMAT_VERSION = 1
-
-
-class Message(str):
-    """Sentence for the user in English, with the key and values of its translations, as in `PlushSenseError`."""
-
-    reason: str
-    values: dict[str, object]
-
-    def __new__(cls, text: str = "", reason: str = "", **values: object) -> Message:
-        made = super().__new__(cls, text)
-        made.reason, made.values = reason, values
-        return made
-
-    @classmethod
-    def of(cls, error: PlushSenseError) -> Message:
-        """Return the sentence of an error."""
-        return cls(str(error), error.reason, **error.values)
 
 
 @dataclass(frozen=True)

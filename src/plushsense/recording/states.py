@@ -16,10 +16,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from plushsense.core.errors import DatasetError, PlushSenseError
+from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Counters, Device, Frame, now_ms
 from plushsense.recording.plan import Step
 from plushsense.recording.session import Key, OpenSession, SessionProgress
-from plushsense.recording.session_files import Message, SessionEvent
+from plushsense.recording.session_files import SessionEvent
 from plushsense.recording.takes import AWAY_S, Ended, FrameReceiver, RecordingTake, gap_entry, sidecar
 from plushsense.recording.writer import BackgroundWriter, lacks_descriptor, save_take, to_frames
 
@@ -75,7 +76,7 @@ class RecorderStatus:
     gaps: int
     rows: int
     file: str
-    message: Message
+    message: Sentence
     failed: str
     folder: str
     frames: int = 0
@@ -101,7 +102,7 @@ def store_take(
     saved_ms: int,
     earlier: str,
     **more: Any,
-) -> tuple[str, Message]:
+) -> tuple[str, Sentence]:
     """Write a recording, its sidecar and its log entry; ``earlier`` is the file that it replaces, or "".
 
     Returns:
@@ -120,16 +121,16 @@ def store_take(
     if earlier:
         events.append(SessionEvent("redo", saved_ms, {"file": earlier} | key))
     session.log.write(events)
-    message = Message()
+    message = Sentence()
     if ended == "longest":
         longest_s = session.protocol.longest_s
         sentence = f"Nobody stopped the recording: it ended after {longest_s:g} s; r records it again."
-        message = Message(sentence, "ended_by_itself", s=longest_s)
+        message = Sentence(sentence, "ended_by_itself", s=longest_s)
     elif take.gaps:
         longest = max(gap["missing_ms"] for gap in take.gaps) / 1000.0
         fault = f"has a gap of {longest:.1f} s" if longest >= 0.05 else "has a jump in the toy's clock"
         reason = "kept_with_gap" if longest >= 0.05 else "kept_with_jump"
-        message = Message(f"This recording {fault}; it is kept, r records it again.", reason, s=longest)
+        message = Sentence(f"This recording {fault}; it is kept, r records it again.", reason, s=round(longest, 1))
     return path.name, message
 
 
@@ -268,9 +269,9 @@ class RecordingMachine:
         self._since_ms = 0.0
         self._state: RecorderState = "idle"
         self._paused = False
-        self._message = Message()
-        self.over = Message()
-        self._failed = Message()
+        self._message = Sentence()
+        self.over = Sentence()
+        self._failed = Sentence()
         self._closing = False
         self._received: list[Frame] = []
         self._writer: BackgroundWriter | None = None
@@ -340,18 +341,18 @@ class RecordingMachine:
         step = self._plan.step
         self._log(kind, gesture=step.gesture, repetition=step.repetition, **more)
 
-    def _show_message(self, message: Message) -> None:
+    def _show_message(self, message: Sentence) -> None:
         self._message = message
         self._changes.append("message")
         self._changed.notify_all()
 
-    def _enter(self, state: RecorderState, message: Message | None = None) -> None:
+    def _enter(self, state: RecorderState, message: Sentence | None = None) -> None:
         if self._failed:
             # The stream may have failed while a recording was still being saved.
             state, message = "stopped", self._failed
         self._state = state
         self._since_ms = self._receiver.toy_ms
-        self._message = message or Message()
+        self._message = message or Sentence()
         self._changes.append(state)
         self._changed.notify_all()
 
@@ -362,7 +363,7 @@ class RecordingMachine:
         """Return the seconds since the state was entered, by the toy's clock."""
         return (self._receiver.toy_ms - self._since_ms) / 1000.0
 
-    def _advance(self, message: Message | None = None, from_start: bool = False) -> None:
+    def _advance(self, message: Sentence | None = None, from_start: bool = False) -> None:
         """Go to the next step to record; finish the session if none is left."""
         if self._plan.advance(from_start):
             self._ready(message)
@@ -371,7 +372,7 @@ class RecordingMachine:
             self._paused = False
             self._enter("stopped" if self.over else "finished", message)
 
-    def _ready(self, message: Message | None = None) -> None:
+    def _ready(self, message: Sentence | None = None) -> None:
         if self.over:
             self._enter("stopped", self.over)
         else:
@@ -382,11 +383,11 @@ class RecordingMachine:
         self._log_step("countdown", countdown_s=self.protocol.countdown_s, device_ms=now)
         self._enter("countdown")
 
-    def _cancel(self, message: Message | None = None) -> None:
+    def _cancel(self, message: Sentence | None = None) -> None:
         self._log_step("cancel")
         self._enter("idle", message)
 
-    def _abandon(self, why: str, message: Message | None = None) -> None:
+    def _abandon(self, why: str, message: Sentence | None = None) -> None:
         take = self._take
         assert take is not None
         self._take = None
@@ -410,7 +411,7 @@ class RecordingMachine:
 
     def _read(self) -> None:
         """Process frames as they arrive, in the reader's thread, independently of the display."""
-        over = Message("The toy's data have ended.", "data_ended")
+        over = Sentence("The toy's data have ended.", "data_ended")
         device = self.device
         try:
             while not self._closing:
@@ -432,10 +433,10 @@ class RecordingMachine:
                 if self._writer is not None:
                     self._writer.wait_written()
         except PlushSenseError as cause:
-            over = Message.of(cause)
+            over = Sentence.of(cause)
         except Exception as cause:  # noqa: BLE001, RUF100
             sentence = f"Reading the toy failed ({type(cause).__name__}: {cause}): all frames until then are kept."
-            over = Message(sentence, "reading_failed", why=cause)
+            over = Sentence(sentence, "reading_broke_off", why=cause)
         with self._notifying():
             if self._closing:
                 return
@@ -486,15 +487,15 @@ class RecordingMachine:
         if self._take is not None:
             self._take.gaps.append(gap | {"after_row": len(self._take.frames)})
         if gap["missing_ms"] >= 1000.0 * AWAY_S:
-            away_s = gap["missing_ms"] / 1000.0
+            away_s = round(gap["missing_ms"] / 1000.0, 1)
             sentence = f"The toy was disconnected for {away_s:.1f} s"
             if self._state == "countdown":
-                self._cancel(Message(f"{sentence}: press space again.", "away_in_countdown", s=away_s))
+                self._cancel(Sentence(f"{sentence}: press space again.", "away_in_countdown", s=away_s))
             elif self._state == "recording":
                 sentence += ": this recording has a gap; r records it again."
-                self._show_message(Message(sentence, "away_in_recording", s=away_s))
+                self._show_message(Sentence(sentence, "away_in_recording", s=away_s))
             else:
-                self._show_message(Message(f"{sentence}.", "away", s=away_s))
+                self._show_message(Sentence(f"{sentence}.", "away", s=away_s))
 
     def _save(self, take: RecordingTake, ended: Ended, counters: Counters) -> None:
         """Save a recording and go to the next step; runs in a thread of the background writer."""
@@ -513,7 +514,7 @@ class RecordingMachine:
         with contextlib.suppress(OSError):
             self.session.log.write([SessionEvent("failed", now_ms(), {"why": str(cause)})])
         with self._notifying():
-            self._failed = Message.of(write_error(self.session, len(self._plan.takes), cause))
+            self._failed = Sentence.of(write_error(self.session, len(self._plan.takes), cause))
             self._closing = True
             self._take = None
             self._enter("stopped", self._failed)

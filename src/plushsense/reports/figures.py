@@ -90,7 +90,7 @@ def training_curves(histories: Sequence[Sequence[Mapping[str, Any]]], *, title: 
 
     Args:
         histories: a list of epochs for each fold; an epoch is a mapping with epoch, train_loss, train_accuracy,
-            validation_loss, validation_accuracy (any may be missing or None).
+            validation_loss, and as accuracy of validation ``accuracy`` or validation_accuracy (any may be missing).
         title: written above; may be empty.
         of: plural noun for the histories in the legend.
     """
@@ -101,7 +101,10 @@ def training_curves(histories: Sequence[Sequence[Mapping[str, Any]]], *, title: 
         (right, "accuracy", "Accuracy (share of windows)"),
     ):
         for part, (colour, style, name) in (("train", _TRAIN), ("validation", _VALIDATION)):
-            lines = [line for line in (_curve(history, f"{part}_{measure}") for history in histories) if line[0].size]
+            key = f"{part}_{measure}"
+            if key == "validation_accuracy" and any("accuracy" in row for history in histories for row in history):
+                key = "accuracy"
+            lines = [line for line in (_curve(history, key) for history in histories) if line[0].size]
             for epochs, values in lines if len(lines) > 1 else ():
                 axes.plot(epochs, values, color=colour, linewidth=0.5, alpha=0.3)
             if lines:

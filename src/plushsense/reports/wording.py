@@ -14,6 +14,10 @@ CONTEXT_WORDS: dict[str, str] = _TEXTS["contexts"]
 CONTEXT_SHORT: dict[str, str] = _TEXTS["contexts_short"]
 
 _NO_LEAK = "No training or validation window overlaps a recording that is scored."
+# The two ways to count of `plushsense.evaluation.scores`, where recordings at rest are scored apart.
+REST_APART = "without recordings at rest"
+MEAN = f"mean over people, {REST_APART}"
+POOLED = "Pooled: over all windows at once, with recordings at rest."
 # Splits by person, for evaluations without the key "over".
 _SPLITS_BY_PERSON = ("leave-one-subject-out", "by-subject")
 
@@ -100,11 +104,12 @@ def describe_spread(evaluation: Mapping[str, Any]) -> str:
     """Return sentences on the units of mean, standard deviation and interval, and on the limits of the interval."""
     units = averaged_over(evaluation)
     number = count_of(evaluation, units)
-    pooled = "Pooled: over all windows at once."
+    rest = f", {REST_APART}" if evaluation.get("nobody") else ""
+    pooled = POOLED if evaluation.get("nobody") else "Pooled: over all windows at once."
     if len(evaluation.get(units) or []) == 1:
         return f"Of {number}: there is no spread and no interval. {pooled}"
     sentences = (
-        f"Mean ± standard deviation over {number}; the 95 % interval is of the mean (percentile bootstrap over "
+        f"Mean ± standard deviation over {number}{rest}; the 95 % interval is of the mean (percentile bootstrap over "
         f"{'people' if units == 'subjects' else 'folds'}). {pooled}"
     )
     if units == "folds":

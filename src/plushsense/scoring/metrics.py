@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plushsense.core.errors import BadInput
+from plushsense.core.gestures import NOBODY
 
 Floats = NDArray[np.float64]
 
@@ -163,6 +164,18 @@ def accuracy(counts: Counts) -> float:
     """Return the share of correct predictions; NaN if there are no predictions."""
     total = int(counts.sum())
     return float(np.trace(counts) / total) if total else float("nan")
+
+
+def accuracy_over_people(
+    truth: NDArray[np.int64], predicted: NDArray[np.int64], subject: NDArray[np.str_]
+) -> float | None:
+    """Return the mean over people of the share of their windows (n,) that are predicted correctly; None without people.
+
+    Recordings of `NOBODY` (the toy at rest) do not count: they are easy, and would raise the score of every network.
+    """
+    right = truth == predicted
+    shares = [float(right[subject == person].mean()) for person in sorted(set(subject.tolist()) - {NOBODY})]
+    return float(np.mean(shares)) if shares else None
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,10 @@ def by_subject(subject: NDArray[np.str_], k: int, seed: int = 0) -> list[Fold]:
     dealt = np.random.default_rng([seed, 1]).permutation(people).tolist()
     groups = [tuple(sorted(dealt[i::k])) for i in range(k)]
     if min(len(people) - len(group) for group in groups) < 2:
-        raise BadInput(f"by-subject:{k} leaves one person to train and validate: use leave-one-subject-out.")
+        raise BadInput(
+            f"by-subject:{k} leaves one person to train and validate: use leave-one-subject-out.",
+            reason="one_person_left",
+        )
     return _by_people(subject, groups, people, seed)
 
 
@@ -220,20 +223,27 @@ def _people(subject: NDArray[np.str_], split: str, needed: int) -> list[str]:
     if UNKNOWN in people:
         raise BadInput(
             f"{split} needs to know who made each recording, but {int((subject == UNKNOWN).sum())} lack it: "
-            "import them again with a mapping file (--subjects map.csv), or use by-recording:5."
+            "import them again with a mapping file (--subjects map.csv), or use by-recording:5.",
+            reason="split_needs_people",
+            n=int((subject == UNKNOWN).sum()),
         )
     if len(people) < needed:
         raise BadInput(
             f"{split} needs at least {needed} people (test, validation, training); there are {len(people)} "
             f"({', '.join(people) or 'nobody'}): record more people, or use by-recording:5, which says nothing about "
-            "new people."
+            "new people.",
+            reason="few_people",
+            n=len(people),
+            needed=needed,
         )
     return people
 
 
 def _enough(n: int, needed: int, split: str, units: str) -> None:
     if n < needed:
-        raise BadInput(f"{split} needs at least {needed} {units}; there are {n}.")
+        raise BadInput(
+            f"{split} needs at least {needed} {units}; there are {n}.", reason="few_units", n=n, needed=needed
+        )
 
 
 def _by_people(subject: NDArray[np.str_], groups: list[tuple[str, ...]], people: list[str], seed: int) -> list[Fold]:

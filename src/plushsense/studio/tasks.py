@@ -1,7 +1,7 @@
 """Define the long tasks of the studio and the worker process in which `plushsense.studio.app.jobs` runs each one.
 
 The worker reads one line of JSON, ``{"task": ..., "spec": {...}}``, from standard input. It writes lines of JSON to
-standard output: ``{"progress": {...}}``, ``{"warning": "..."}``, and finally ``{"result": {...}}`` or
+standard output: ``{"progress": {...}}``, ``{"warning": ...}``, and finally ``{"result": {...}}`` or
 ``{"refused": "...", "reason": "...", "values": {...}}`` for an error, see `plushsense.core.errors.PlushSenseError`. A
 process that ends with neither of these was stopped.
 """
@@ -24,7 +24,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import ConfigError, DatasetError, Note, PlushSenseError, ToolError
+from plushsense.core.errors import ConfigError, DatasetError, PlushSenseError, ToolError
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.backup import is_backup, restore
 from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.importers import import_recordings
@@ -38,6 +39,7 @@ from plushsense.deploy.proof.verify import verify
 from plushsense.jobs.progress import JobProgress
 from plushsense.studio.app.jobs import UNFINISHED
 from plushsense.studio.pages.export.exports import folder_digest
+from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import simulate
 from plushsense.workflow.config import from_settings
 from plushsense.workflow.datasets import check_dataset, publish_dataset
@@ -71,12 +73,12 @@ class TaskReporter:
 
     def warn(self, sentence: str) -> None:
         """Report a warning to the user."""
-        self.write(warning=sentence)
+        self.write(warning=_plain(sentence))
 
 
 def _plain(value: Any) -> Any:
-    """Replace every `Note` in a value by a table of its message, reason and values, see `Words.note`."""
-    if isinstance(value, Note):
+    """Replace every `Sentence` in a value by a table of its message, reason and values, see `Words.sentence`."""
+    if isinstance(value, Sentence):
         return {"message": str(value), "reason": value.reason, "values": _plain(value.values)}
     if isinstance(value, dict):
         return {key: _plain(each) for key, each in value.items()}
@@ -200,7 +202,7 @@ def run_inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
             )
         except PlushSenseError as refusal:
             refusals.append(refusal)
-            rejected.append({"file": source.name, "reason": Note.of(refusal)})
+            rejected.append({"file": source.name, "reason": Sentence.of(refusal)})
             continue
         notes += done.notes
         rejected += done.rejected
@@ -287,18 +289,19 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     check_folder(out.parent, "A bundle")
     reporter.progress(stage="reading", share=0.0)
 
-    from plushsense.workflow.api import train, unfinished
+    from plushsense.workflow.api import FIRST_NETWORK, train, unfinished
 
     clock, tuning = Clock(), int(spec.get("quantize_aware", 0))
-    whole = config.training.epochs + tuning
+    hard = config.windows.context == ANYWHERE and config.anywhere.hard_share > 0
+    first = config.training.epochs if hard else 0
+    whole = first + config.training.epochs + tuning
 
     def epoch(at: int, of: int, row: dict[str, Any]) -> None:
-        fine_tuning = "what" in row
-        done = config.training.epochs + at if fine_tuning else at
-        stage = "fine-tuning" if fine_tuning else "training"
-        scores = {k: row.get(k) for k in ("train_loss", "train_accuracy", "validation_loss", "validation_accuracy")}
+        stage = {None: "training", FIRST_NETWORK: "first_network"}.get(row.get("what"), "fine-tuning")
+        done = at + {"training": first, "first_network": 0, "fine-tuning": first + config.training.epochs}[stage]
+        scores = {k: row.get(k) for k in ("train_loss", "train_accuracy", "validation_loss", "accuracy")}
         reporter.progress(stage=stage, epoch=at, epochs=of, **scores, **clock.at(done / whole))
-        if at == of and not fine_tuning and not tuning:
+        if at == of and stage == "training" and not tuning:
             reporter.progress(stage="deciding", epoch=at, epochs=of, share=1.0)
 
     done = train(
@@ -319,6 +322,46 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         "title": done.bundle.arch.title,
         "epochs": len(done.history),
         "fitted": done.bundle.decision.get("fitted") is not None,
+    }
+
+
+def run_make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Train a network and evaluate it on people left out, in about ``minutes``; see `make_network`."""
+    out = Path(spec["out"])
+    reporter.progress(stage="reading", share=0.0)
+
+    from plushsense.trials.budget import TRAINING, BudgetProgress, make_network
+    from plushsense.workflow.reporting import load_evaluation
+
+    clock = Clock()
+
+    def report(at: BudgetProgress) -> None:
+        row = {key: value for key, value in at.row.items() if key != "learning_rate"}
+        stage = "first_network" if at.stage == TRAINING and "what" in row else at.stage
+        reporter.progress(**row | {"stage": stage, "bundle": at.bundle}, **clock.at(at.share))
+
+    settings = spec.get("settings")
+    done = make_network(
+        spec["dataset"],
+        out,
+        budget_s=60.0 * spec["minutes"],
+        config=from_settings(**settings) if settings else None,
+        progress=report,
+        warn=reporter.warn,
+    )
+    return {**_evaluation(load_evaluation(done["evaluation"])), **done, "out": done["evaluation"]}
+
+
+def _evaluation(table: dict[str, Any]) -> dict[str, Any]:
+    """Return the part of a stored evaluation that the card of its job shows."""
+    keys = ("split", "leaky", "context", "simulated", "seeds", "over", "accuracy", "macro_f1")
+    people = [{key: row[key] for key in ("subject", "accuracy")} for row in table["subjects"]]
+    return {
+        **{key: table[key] for key in keys},
+        "units": len(table[table["over"]]),
+        "classes": len(table["per_class"]),
+        "people": people,
+        "nobody": table["nobody"],
     }
 
 
@@ -343,7 +386,7 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
     reporter.progress(stage="reading", share=0.0)
 
     from plushsense.workflow.api import evaluate
-    from plushsense.workflow.reporting import PAGE, name_of, write_report
+    from plushsense.workflow.reporting import PAGE, load_evaluation, name_of, write_report
 
     dataset = open_dataset(spec["dataset"])
     out = dataset.path / "evaluations" / name_of(config, dataset)
@@ -351,26 +394,13 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
 
     def fold(at: JobProgress) -> None:
         row = at.message[2] if at.epoch else {}
-        scores = {k: row.get(k) for k in ("train_loss", "validation_loss", "validation_accuracy")}
         counts = {"done": at.done, "folds": at.total, "resumed": at.resumed, "fold": at.name}
-        reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, **counts, **scores, **clock.at(at.share))
+        loss = {"train_loss": row.get("train_loss")}
+        reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, **counts, **loss, **clock.at(at.share))
 
-    result = evaluate(dataset, config, out=out, int8=bool(spec.get("int8")), progress=fold, warn=reporter.warn)
+    evaluate(dataset, config, out=out, int8=bool(spec.get("int8")), progress=fold, warn=reporter.warn)
     report = write_report(out / PAGE, dataset, [out])
-    table = result.table
-    return {
-        "out": str(out),
-        "report": str(report),
-        "split": result.split.text,
-        "leaky": result.split.leaky,
-        "context": result.context,
-        "simulated": dataset.head.simulated,
-        "seeds": result.seeds,
-        "over": table["over"],
-        "units": len(table[table["over"]]),
-        "accuracy": table["accuracy"],
-        "macro_f1": table["macro_f1"],
-    }
+    return {"out": str(out), "report": str(report), **_evaluation(load_evaluation(out))}
 
 
 def run_sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -392,7 +422,8 @@ def run_sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     done = sweep(spec["dataset"], spec["grid"], progress=training, warn=reporter.warn, **changes)
     s = done.summary
     for lost in s["failed"]:
-        reporter.warn(f"{lost['arch']} with {lost['filters']} was given up: {lost['why']}")
+        network = f"{lost['arch']} {lost['filters']}"
+        reporter.warn(Sentence(f"{network} was given up: {lost['why']}", "network_lost", network=network))
     keys = ("name", "split", "leaky", "context", "simulated", "trials", "done", "trainings_lost", "best", "seconds")
     return {"out": str(done.out), **{key: s[key] for key in keys}}
 
@@ -477,6 +508,7 @@ def run_verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
     "check": run_check,
+    "make": run_make,
     "train": run_train,
     "sweep": run_sweep,
     "search": run_search,

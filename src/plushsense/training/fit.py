@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import DivergedError, TrainingError
 from plushsense.models.arch import Arch
 from plushsense.models.net import Net
+from plushsense.scoring.metrics import accuracy_over_people
 from plushsense.training.augment import Channels, Transform, augmentations
 from plushsense.training.engine import Engine, FitState, Windows, engine, is_fast, slices, torch_threads
 from plushsense.training.spec import TrainSpec
@@ -38,7 +39,8 @@ class FittedNetwork:
     Attributes:
         weights: arrays by name, for `plushsense.models.reference.Network`.
         history: a row for each epoch: epoch (from 1), train_loss and train_accuracy (means over the batches, measured
-            while training), validation_loss and validation_accuracy (None without validation), learning_rate.
+            while training), validation_loss and validation_accuracy (None without validation) over all windows,
+            validation_accuracy_people (see `accuracy_over_people`), learning_rate.
         best_epoch: the epoch of ``weights``.
         kept: weights after each epoch in ``keep``.
         state: state to continue the training from; None with early stopping.
@@ -120,9 +122,7 @@ def fit(
                 for group in adam.param_groups:
                     group["lr"] = spec.learning_rate_at(epoch)
                 row["train_loss"], row["train_accuracy"] = _train(net, adam, x, y, spec, order, augment)
-                row["validation_loss"], row["validation_accuracy"] = (
-                    (None, None) if val_data is None else _measure(net, *val_data)
-                )
+                row |= _measure(net, val_data, validation)
                 row["learning_rate"] = spec.learning_rate_at(epoch)
                 _refuse_not_finite(row, spec)
                 history.append(row)
@@ -262,10 +262,18 @@ def _train(
     return float(sums[0]) / n_windows, float(sums[1]) / n_windows
 
 
-def _measure(net: Engine, x: Windows, y: Tensor) -> tuple[float, float]:
-    """Compute mean loss and accuracy without training."""
+def _measure(net: Engine, data: tuple[Windows, Tensor] | None, windows: WindowSet | None) -> dict[str, float | None]:
+    """Compute loss and accuracies of validation without training, as a part of a row of the history."""
+    if data is None or windows is None:
+        return dict.fromkeys(("validation_loss", "validation_accuracy", "validation_accuracy_people"))
+    x, y = data
     logits = net.logits(x)
-    return float(F.cross_entropy(logits, y)), float((logits.argmax(dim=1) == y).float().mean())
+    predicted = logits.argmax(dim=1)
+    return {
+        "validation_loss": float(F.cross_entropy(logits, y)),
+        "validation_accuracy": float((predicted == y).float().mean()),
+        "validation_accuracy_people": accuracy_over_people(windows.y, predicted.cpu().numpy(), windows.subject),
+    }
 
 
 def _tensors(windows: WindowSet, scaler: Scaler, arch: Arch, device: torch.device) -> tuple[Windows, Tensor]:
@@ -276,7 +284,9 @@ def _tensors(windows: WindowSet, scaler: Scaler, arch: Arch, device: torch.devic
 
 def _check(windows: WindowSet, arch: Arch, purpose: str, some: bool = True) -> None:
     if some and not len(windows):
-        raise TrainingError(f"There are no windows to {purpose}: check the data set, the gestures and the split.")
+        raise TrainingError(
+            f"There are no windows to {purpose}: check the data set, the gestures and the split.", reason="no_windows"
+        )
     _, channels, samples = windows.x.shape
     if channels != arch.channels or len(windows.labels) != arch.classes:
         raise TrainingError(
@@ -295,7 +305,9 @@ def _refuse_not_finite(row: dict[str, Any], spec: TrainSpec) -> None:
         if row[name] is not None and not np.isfinite(row[name]):
             raise DivergedError(
                 f"The {name.replace('_', ' ')} is no longer a number in epoch {row['epoch']} at the learning rate "
-                f"{row['learning_rate']:g}: try a lower one, such as {spec.learning_rate / 10:g}."
+                f"{row['learning_rate']:g}: try a lower one, such as {spec.learning_rate / 10:g}.",
+                reason="diverged",
+                epoch=row["epoch"],
             )
 
 
@@ -312,5 +324,5 @@ def _device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if name == "cuda" and not torch.cuda.is_available():
-        raise TrainingError("There is no CUDA device to train on: use the device 'auto' or 'cpu'.")
+        raise TrainingError("There is no CUDA device to train on: use the device 'auto' or 'cpu'.", reason="no_cuda")
     return torch.device(name)

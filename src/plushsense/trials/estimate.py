@@ -53,7 +53,8 @@ def preview_evaluation(
 
     Returns:
         ``split``, ``leaky``, ``context``, ``simulated``, ``dataset``, ``folds``, ``people``, ``classes``, ``windows``,
-        ``epochs`` (at most), ``parameters``, ``macs`` of all trainings, ``seconds`` (estimated).
+        ``epochs`` (at most), ``parameters``, ``macs`` of all trainings, ``seconds`` (estimated), and
+        ``window_epoch_s``, the measured seconds to train on one window for one epoch.
     """
     dataset, config = network_inputs_of(as_dataset(dataset), config)
     gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)
@@ -99,6 +100,7 @@ def _describe(
         "epochs": config.training.epochs,
         "parameters": network.parameters,
         "macs": macs,
+        "window_epoch_s": rate * PASSES * network.macs_per_window,
         "seconds": macs * rate / max(1, side_by_side),
     }
 

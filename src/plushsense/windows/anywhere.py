@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import Gesture, GestureSet
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.marks import LabelledStretch
 from plushsense.dataset.store import Dataset, Progress, RecordingInfo, StreamInfo
 from plushsense.windows.clock import Segment, resample
@@ -161,7 +162,7 @@ def cut_anywhere(
     for recording in (r for r in used if r.id not in reached):
         instead = from_recording(resample(dataset.read(recording), layout), dataset, reach, layout.samples(spec.step_s))
         if not instead:
-            left_out.append(f"{recording.id}: no valid sample")
+            left_out.append(Sentence(f"{recording.id}: no valid sample", "no_valid_sample", recording=recording.id))
         cuts += [(recording, c) for c in instead]
     gesturing = len(moving) + sum(not gestures.get(r.gesture).idle for r, _ in cuts)
     n_idle = round(gesturing * anywhere.idle_share / (1.0 - anywhere.idle_share))

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
 from plushsense.core.gestures import NOBODY, GestureSet
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, usual_rows
 from plushsense.dataset.store import RECORDINGS, UNKNOWN_SUBJECT, Dataset, Progress, RecordingInfo
 from plushsense.windows.clock import Segment, resample
@@ -96,7 +97,7 @@ class WindowSet:
     rate_hz: float
     inputs: tuple[str, ...]
     vectors: tuple[tuple[int, ...], ...] = ()
-    left_out: tuple[str, ...] = ()
+    left_out: tuple[Sentence, ...] = ()
 
     def __len__(self) -> int:
         return len(self.y)
@@ -222,26 +223,30 @@ def cut_windows(
         if not own:
             own = from_recording(resample(dataset.read(recording), layout), dataset, reach, step)
         if not own:
-            left_out.append(f"{recording.id}: no valid sample")
+            left_out.append(Sentence(f"{recording.id}: no valid sample", "no_valid_sample", recording=recording.id))
         cuts += [(recording, c) for c in own]
         if progress is not None:
             progress(done + 1, len(recordings))
     if not cuts:
         raise DatasetError(
             f"Data set '{dataset.head.name}' gives no window: {len(recordings)} recordings of "
-            f"{len(gestures)} gestures ({', '.join(gestures.labels[:6])}…)."
+            f"{len(gestures)} gestures ({', '.join(gestures.labels[:6])}…).",
+            reason="no_windows",
         )
     return replace(assemble(cuts, gestures, dataset), left_out=tuple(left_out))
 
 
-def drop_long_recordings(recordings: list[RecordingInfo], spec: WindowSpec) -> tuple[list[RecordingInfo], list[str]]:
+def drop_long_recordings(
+    recordings: list[RecordingInfo], spec: WindowSpec
+) -> tuple[list[RecordingInfo], list[Sentence]]:
     """Return the recordings to cut, and a description of each recording that was not stopped in time."""
     usual = usual_rows((r.gesture, r.stop - r.start) for r in recordings)
-    in_time, left_out = [], []
+    in_time, left_out = list[RecordingInfo](), list[Sentence]()
     for r in recordings:
         own_file = r.file.startswith(f"{RECORDINGS}/")
         if spec.longest_factor and own_file and r.stop - r.start > spec.longest_factor * usual[r.gesture]:
-            left_out.append(f"{r.id}: {r.stop - r.start} rows where {r.gesture} usually has {usual[r.gesture]:.0f}")
+            sentence = f"{r.id}: {r.stop - r.start} rows where {r.gesture} usually has {usual[r.gesture]:.0f}"
+            left_out.append(Sentence(sentence, "not_stopped", recording=r.id, gesture=[r.gesture]))
         else:
             in_time.append(r)
     return in_time, left_out

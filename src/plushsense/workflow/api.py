@@ -9,12 +9,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import NOBODY
+from plushsense.core.sentences import Sentence
 from plushsense.core.version import __version__
 from plushsense.dataset.files import CACHE
 from plushsense.dataset.importing.importers import import_recordings
@@ -31,17 +33,18 @@ from plushsense.deploy.quantize import (
 from plushsense.evaluation.crossval import EpochProgress, Evaluation, FoldOutput, windows_fingerprint
 from plushsense.evaluation.crossval import evaluate as crossvalidate
 from plushsense.evaluation.leakage import warn_of_copies
-from plushsense.evaluation.scores import FoldRecord, gather_predictions
+from plushsense.evaluation.scores import FoldRecord, Predictions, gather_predictions, with_accuracy
 from plushsense.evaluation.scores import compute_scores as score_predictions
 from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possible
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
+from plushsense.models.reference import softmax
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.tuning.decisions import fit_decisions as fit_on_people
-from plushsense.windows.cut import ANYWHERE, WindowSet
+from plushsense.windows.cut import ANYWHERE, WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.preparation import (
     WHOLE_PEOPLE,
@@ -68,6 +71,9 @@ if TYPE_CHECKING:
 # Age at which unfinished trainings are deleted: most are never resumed, and they contain data on people.
 _KEPT_S = 30 * 24 * 3600.0
 _SAVE_EVERY_S = 0.5
+# Number of windows that are predicted at once.
+_BATCH = 256
+FIRST_NETWORK = "first network"
 # Training warns if float and 8-bit predictions agree on a smaller share of the validation windows than this.
 _AGREEMENT = 0.95
 
@@ -118,17 +124,25 @@ class TrainAndPredict:
     """The work of one fold of a cross-validation: train a network and predict the test windows.
 
     With ``int8``, the network is also quantized with the value ranges of its training windows and predicts in 8 bits.
+    With ``people``, it is trained on that many of the people, drawn by the seed; a larger number includes a smaller.
     """
 
     arch: Arch
     spec: TrainSpec
     int8: bool = False
+    people: int | None = None
 
     def __call__(
         self, train: WindowSet, validation: WindowSet, test: WindowSet, progress: EpochProgress, /
     ) -> FoldOutput:
         from plushsense.training.fit import fit, predict
 
+        if self.people is not None:
+            names = sorted(set(train.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT})
+            # Folds draw differently, so that the outcome does not depend on a few people.
+            rng = np.random.default_rng([self.spec.seed, crc32(" ".join(names).encode())])
+            left_out = rng.permutation(names)[self.people :]
+            train = train.take(np.flatnonzero(~np.isin(train.subject, left_out)))
         fitted = fit(train, validation, self.arch, self.spec, progress)
         probabilities = predict(self.arch, fitted.weights, fitted.scaler, test, self.spec.device)
         deployed = None
@@ -195,8 +209,9 @@ def train(
             ``config.live`` that differ from the defaults are kept.
         journal: stores the progress of the training (see `unfinished`), so that an interrupted one resumes and gives
             the same bundle. The steps after the training are repeated.
-        progress: called with (epoch, maximum of epochs, the epoch's row), first for the epochs before an interruption;
-            not while the first network trains that finds hard negatives (context "anywhere").
+        progress: called with (epoch, maximum of epochs, the epoch's row), first for the epochs before an interruption.
+            Rows of the first network that finds hard negatives (``hard_share`` of the context "anywhere"), and of the
+            fine-tuning, have ``what``. The others have ``accuracy``, that of validation as ``scores`` counts it.
         warn: called with a sentence for everything that is left out, and if 8-bit arithmetic changes many predictions.
     """
     given = config or from_settings(arch=arch, filters=filters, **settings)
@@ -221,18 +236,19 @@ def train(
     from plushsense.training.fit import fit, predict
 
     train_on, watched = windows.take(train_at), scored.take(division.watch)
+    apart = division.split.apart
+    epoch_done = _reporting(progress, apart)
     if division.kind == WHOLE_PEOPLE:
         train_on = add_hard_negatives(
             train_on, dataset, network, config.windows, config.anywhere, gestures, config.training,
-            division.fold.subjects,
+            division.fold.subjects, _reporting(progress, apart, what=FIRST_NETWORK),
         )  # fmt: skip
     state = None if journal is None else ResumableTraining(journal, network, config.training, train_on, watched)
     start = state.load() if state else None
-    if start is not None and progress is not None:
-        for row in start.history:
-            progress(row["epoch"], config.training.epochs, row)
+    for row in start.history if start is not None else ():
+        epoch_done(row["epoch"], config.training.epochs, row)
     fitted = fit(
-        train_on, watched, network, config.training, progress,
+        train_on, watched, network, config.training, epoch_done,
         start=start, save=state.save if state else None, save_every_s=_SAVE_EVERY_S,
     )  # fmt: skip
     weights, scaler = fitted.weights, fitted.scaler
@@ -240,7 +256,7 @@ def train(
     if quantize_aware:
         from plushsense.training.quantized import fine_tune
 
-        tuned = fine_tune(train_on, network, weights, scaler, kept, config.training, quantize_aware, progress)
+        tuned = fine_tune(train_on, network, weights, scaler, kept, config.training, quantize_aware, epoch_done)
         weights = tuned.weights
     test = scored.take(test_at)
     sizes = (len(train_at), len(division.watch), len(test_at))
@@ -270,7 +286,9 @@ def train(
         scores["int8"] = {**means, "agreement": agreement}
         if agreement < _AGREEMENT:
             advice = "more epochs of --quantize-aware" if quantize_aware else "--quantize-aware 10"
-            warn(f"8 bits change {100 * (1 - agreement):.1f} % of the answers on the validation windows: try {advice}")
+            changed = 100 * (1 - agreement)
+            sentence = f"8 bits change {changed:.1f} % of the answers on the validation windows: try {advice}"
+            warn(Sentence(sentence, "bits_change", percent=changed))
     bundle = Bundle(
         arch=network,
         weights=weights,
@@ -301,13 +319,25 @@ def train(
         state.discard()
     # `forget` cannot find an unsaved bundle: raise an error if a person was removed during the training.
     dataset.generation.check()
-    return Trained(bundle, fitted.history, scores, fitted.seconds + (state.before_s if state else 0.0))
+    history = with_accuracy(fitted.history, apart)
+    return Trained(bundle, history, scores, fitted.seconds + (state.before_s if state else 0.0))
+
+
+def _reporting(progress: EpochProgress | None, apart: bool, **more: str) -> EpochProgress:
+    """Return a callback for the epochs of a training, which adds ``accuracy`` and ``more`` to their rows."""
+
+    def report(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+        if progress is not None:
+            progress(epoch, epochs, with_accuracy([row], apart)[0] | more)
+
+    return report
 
 
 def _with_decisions(bundle: Bundle, dataset: Dataset, given: DecideSpec, warn: Warn) -> Bundle:
     """Return the bundle with decision settings fitted on its validation people; unchanged if it has none."""
     if bundle.provenance["split"] != WHOLE_PEOPLE:
-        warn("decision settings are the defaults: fitting them needs whole people held out for validation")
+        sentence = "decision settings are the defaults: fitting them needs whole people held out for validation"
+        warn(Sentence(sentence, "no_decisions"))
         return bundle
     validated, trained = (
         set(bundle.provenance[key]) - {NOBODY, UNKNOWN_SUBJECT} for key in ("validation_subjects", "subjects")
@@ -336,6 +366,7 @@ def evaluate(
     overwrite: bool = False,
     cluster: str | None = None,
     int8: bool = False,
+    training_people: int | None = None,
     progress: Callable[[JobProgress], None] | None = None,
     warn: Warn = silent,
     **settings: Any,
@@ -352,6 +383,7 @@ def evaluate(
         cluster: address of a Ray cluster that trains the folds.
         int8: also score each fold's network in 8 bits on the same windows, as ``int8`` of the result. Folds that were
             stored without it are trained again.
+        training_people: train each fold on so many of its people only, for a learning curve; not with ``out``.
     """
     given = config or from_settings(arch=arch, filters=filters, **settings)
     dataset, config = network_inputs_of(as_dataset(dataset), given)
@@ -377,13 +409,14 @@ def evaluate(
         fit_on,
         score,
         config.evaluation.split,
-        TrainAndPredict(network, config.training, int8),
+        TrainAndPredict(network, config.training, int8, training_people),
         journal=journal_of(dataset, "folds"),
         key={
             "arch": network.to_dict(),
             "training": resolve_device(config.training).key(),
             "vectors": fit_on.vectors,
             **({"int8": QUANTIZE_VERSION} if int8 else {}),
+            **({"people": training_people} if training_people is not None else {}),
         },
         workers=config.evaluation.processes,
         cluster=cluster,
@@ -396,6 +429,35 @@ def evaluate(
         with dataset.generation.writing():
             save_evaluation(result, dataset, config, network, Path(out))
     return result
+
+
+def validation_predictions(bundle: Bundle, dataset: Dataset | str | os.PathLike[str]) -> Predictions:
+    """Compute what a trained network answers on the recordings of its validation people, as `train` scored it.
+
+    Recordings at rest are left out: which of them were held out is not stored.
+
+    Raises:
+        DatasetError: if the bundle has no validation people, the data set was changed since the training (reason
+            ``data_changed``), or has none of their recordings.
+    """
+    dataset = as_dataset(dataset)
+    people = set(bundle.provenance.get("validation_subjects", ())) - {NOBODY, UNKNOWN_SUBJECT}
+    if bundle.provenance.get("split") != WHOLE_PEOPLE or not people:
+        raise DatasetError("This network has no validation people: evaluate it instead.", reason="no_validation_people")
+    if bundle.provenance.get("dataset_hash") != dataset.hash:
+        raise DatasetError(
+            f"The data set '{dataset.head.name}' was changed since this network was trained: evaluate it instead.",
+            reason="data_changed",
+            name=dataset.head.name,
+        )
+    dataset = dataset.with_inputs(bundle.layout).with_gestures(bundle.gestures)
+    # All recordings are cut, because how long a gesture usually is depends on them.
+    every = windows_for(dataset, bundle.arch, whole_gestures(bundle.windowing), bundle.gestures)
+    windows = every.take(np.flatnonzero(np.isin(every.subject, list(people))))
+    network = bundle.network()
+    parts = [windows.x[at : at + _BATCH] for at in range(0, len(windows), _BATCH)]
+    logits = np.concatenate([network.forward(bundle.scaler.apply(part)) for part in parts])
+    return gather_predictions(windows, [("validation", np.arange(len(windows)))], [softmax(logits).astype(np.float32)])
 
 
 def load(path: str | os.PathLike[str]) -> Bundle:

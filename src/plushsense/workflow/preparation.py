@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet, load_gestures
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.proposals import median_gesture_s
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
 from plushsense.evaluation.crossval import fold_windows
@@ -55,7 +56,7 @@ def choose_classes(dataset: Dataset, choice: str | Sequence[str], warn: Warn = s
         gestures, left_out = shared_gestures(dataset)
         if left_out:
             reasons = "; ".join(f"{label} ({why})" for label, why in left_out.items())
-            warn(f"left out of the shared gestures: {reasons}")
+            warn(Sentence(f"left out of the shared gestures: {reasons}", "gestures_left_out", gestures=list(left_out)))
     elif choice == ALL:
         recorded = {r.gesture for r in dataset.used}
         gestures = dataset.gestures.subset([g for g in dataset.gestures.labels if g in recorded])
@@ -65,7 +66,9 @@ def choose_classes(dataset: Dataset, choice: str | Sequence[str], warn: Warn = s
     if len(gestures) < 2:
         raise DatasetError(
             f"At least 2 gestures are needed, not {len(gestures)} ({', '.join(gestures.labels) or 'none'}): "
-            "choose others with --classes all or --classes LABEL,LABEL."
+            "choose others with --classes all or --classes LABEL,LABEL.",
+            reason="few_gestures",
+            n=len(gestures),
         )
     return gestures
 
@@ -77,7 +80,7 @@ def classes_for(dataset: Dataset, choice: str | Sequence[str], context: str, war
         return gestures
     with_idle = add_idle_gesture(gestures, dataset)
     if added := [g.label for g in with_idle.gestures if g not in gestures.gestures]:
-        warn(f"added a class for what happens between gestures: {added[0]}")
+        warn(Sentence(f"added a class for what happens between gestures: {added[0]}", "idle_added", gesture=added[:1]))
     return with_idle
 
 
@@ -98,7 +101,7 @@ def windows_for(
     else:
         cut = cut_windows(dataset, spec, gestures)
     for line in cut.left_out:
-        warn(f"left out: {line}")
+        warn(Sentence(f"left out: {line}", line.reason, **line.values))
     return cut
 
 
@@ -143,11 +146,12 @@ def warn_of_untrimmed(dataset: Dataset, gestures: GestureSet, warn: Warn) -> Non
     located = [r for r in dataset.used if r.gesture in active and r.stream_row >= 0]
     untrimmed = [r for r in located if not r.start]
     if not dataset.layout.is_labelled and 2 * len(untrimmed) > len(located):
-        warn(
+        sentence = (
             f"{len(untrimmed)} of {len(located)} recordings are not trimmed, so the network learns the time before a "
             "gesture as the gesture and reports it too early and too often: run "
             f"'plushsense trim {dataset.path.name} --accept-above 0.5' first"
         )
+        warn(Sentence(sentence, "untrimmed", n=len(untrimmed), of=len(located)))
 
 
 def warn_of_single_people(windows: WindowSet, warn: Warn) -> None:
@@ -155,10 +159,12 @@ def warn_of_single_people(windows: WindowSet, warn: Warn) -> None:
     for index, label in enumerate(windows.labels):
         people = set(windows.subject[windows.y == index].tolist())
         if len(people) == 1 and not people & {NOBODY, UNKNOWN_SUBJECT}:
-            warn(
-                f"only {people.pop()} made '{label}', so it cannot be learnt when that person is left out: leave it "
+            person = people.pop()
+            sentence = (
+                f"only {person} made '{label}', so it cannot be learnt when that person is left out: leave it "
                 "out with --classes, or record it with more people"
             )
+            warn(Sentence(sentence, "single_person", person=person, gesture=[label]))
 
 
 def warn_of_files_twice(dataset: Dataset, gestures: GestureSet, warn: Warn) -> None:
@@ -171,7 +177,8 @@ def warn_of_files_twice(dataset: Dataset, gestures: GestureSet, warn: Warn) -> N
         for other in others:
             labels = {first.gesture, other.gesture}
             known = "as two gestures" if len(labels) == 2 else f"twice as '{first.gesture}'"
-            warn(f"the same file is in the data set {known}: {first.id} and {other.id}; exclude one of them")
+            sentence = f"the same file is in the data set {known}: {first.id} and {other.id}; exclude one of them"
+            warn(Sentence(sentence, "same_file", first=first.id, second=other.id))
 
 
 def warn_of_long_windows(dataset: Dataset, arch: Arch, window_s: float, gestures: GestureSet, warn: Warn) -> None:
@@ -183,10 +190,11 @@ def warn_of_long_windows(dataset: Dataset, arch: Arch, window_s: float, gestures
             advice = f"shorter kernels (--arch), as the layout has {dataset.layout.rate_hz:g} samples a second"
         else:
             advice = f"[windows] window_s = {max(0.5, round(usual_s, 1)):g} in a --config file"
-        warn(
+        sentence = (
             f"a decision reads {span_s:.1f} s, but half of the recordings last less than {usual_s:.1f} s, so most "
             f"windows begin before their gesture: try {advice}"
         )
+        warn(Sentence(sentence, "long_windows", reads=float(span_s), usual=float(usual_s)))
 
 
 def outside_streams(windows: WindowSet, dataset: Dataset, people: Collection[str]) -> NDArray[np.bool_]:

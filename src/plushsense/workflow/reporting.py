@@ -26,9 +26,11 @@ def check_folder(out: Path, name: str) -> None:
     """Raise ConfigError if results cannot be written to the folder ``out``; ``what`` names them, as in "A sweep"."""
     there = next(p for p in (out.absolute(), *out.absolute().parents) if p.exists())
     if not there.is_dir():
-        raise ConfigError(f"{name} cannot be written to '{out}': '{there}' is a file; give a folder.")
+        message = f"{name} cannot be written to '{out}': '{there}' is a file; give a folder."
+        raise ConfigError(message, reason="folder_is_file", path=there)
     if not os.access(there, os.W_OK | os.X_OK):
-        raise ConfigError(f"{name} cannot be written to '{out}': you may not write in '{there}'.")
+        message = f"{name} cannot be written to '{out}': you may not write in '{there}'."
+        raise ConfigError(message, reason="folder_read_only", path=there)
 
 
 def check_results(out: Path, name: str, summary: str, identity: str | None = None, *, replace: bool = False) -> None:
@@ -80,7 +82,7 @@ def machine(*more: str) -> str:
     return ", ".join((processor, *more, platform.system()))
 
 
-SCORES, PREDICTIONS, PAGE = "evaluation.json", "predictions.parquet", "report.html"
+SCORES, PREDICTIONS, PAGE, LEARNING = "evaluation.json", "predictions.parquet", "report.html", "learning.json"
 
 
 def evaluation_id(config: RunConfig, dataset: Dataset) -> str:
@@ -213,7 +215,7 @@ def write_report(
 
 
 def load_evaluation(source: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a saved evaluation: its folder, or the ``evaluation.json`` in it.
+    """Read a saved evaluation: its folder, or the ``evaluation.json`` in it; ``learning`` is its curve or None.
 
     Raises:
         BadInput: if there is none.
@@ -230,7 +232,16 @@ def load_evaluation(source: str | os.PathLike[str]) -> dict[str, Any]:
         ) from None
     except (OSError, ValueError) as error:
         raise BadInput(f"'{path}' is not an evaluation ({error}): give a folder written by evaluate.") from None
-    return table
+    return table | {"learning": _learning(path.with_name(LEARNING))}
+
+
+def _learning(path: Path) -> dict[str, Any] | None:
+    """Read the learning curve beside an evaluation (`plushsense.trials.budget`); None if there is none."""
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return table if isinstance(table, dict) else None
 
 
 def _evaluation_table(source: Evaluation | Mapping[str, Any] | str | os.PathLike[str]) -> dict[str, Any]:

@@ -15,7 +15,8 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from plushsense.core.errors import ConfigError, DatasetError, Note
+from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.build import DEVICE_NAME
 
 _CHUNK = 1 << 20
@@ -70,25 +71,25 @@ def zip_entry(name: str) -> zipfile.ZipInfo:
     return entry
 
 
-def member_target(name: str) -> PurePosixPath | Note:
+def member_target(name: str) -> PurePosixPath | Sentence:
     """Return the path of a member below the target folder, or the reason why it is refused."""
     plain = name.replace("\\", "/")
     if plain.startswith("/") or re.match(r"^[A-Za-z]:", plain):
-        return Note("its path is absolute: it would be written outside the target", reason="file_outside")
+        return Sentence("its path is absolute: it would be written outside the target", reason="file_outside")
     parts = [p for p in plain.split("/") if p not in ("", ".")]
     if ".." in parts:
-        return Note("its path holds '..': it would be written outside the target", reason="file_outside")
+        return Sentence("its path holds '..': it would be written outside the target", reason="file_outside")
     if not parts or len(parts) > _DEEPEST or len(plain) > _LONGEST_PATH:
-        return Note("its path is empty, too deep or too long", reason="file_name")
+        return Sentence("its path is empty, too deep or too long", reason="file_name")
     for part in parts:
         if _FORBIDDEN.search(part) or part != part.rstrip(" .") or len(part.encode("utf-8", "replace")) > _LONGEST_NAME:
-            return Note("its name is not one that every file system can hold", reason="file_name")
+            return Sentence("its name is not one that every file system can hold", reason="file_name")
         if DEVICE_NAME.match(part):
-            return Note(f"'{part[:20]}' is the name of a device on Windows", reason="file_name")
+            return Sentence(f"'{part[:20]}' is the name of a device on Windows", reason="file_name")
     try:
         plain.encode("utf-8")
     except UnicodeEncodeError:
-        return Note("its name is not UTF-8", reason="file_name")
+        return Sentence("its name is not UTF-8", reason="file_name")
     return PurePosixPath(*parts)
 
 
@@ -96,14 +97,14 @@ def refusal(info: zipfile.ZipInfo, limits: UnpackLimits) -> str:
     """Return the reason to refuse a member by its directory entry; "" if it may be unpacked."""
     kind = stat.S_IFMT(info.external_attr >> 16)
     if kind == stat.S_IFLNK:
-        return Note("a symbolic link is not followed", reason="file_link")
+        return Sentence("a symbolic link is not followed", reason="file_link")
     if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
-        return Note("not a regular file", reason="file_link")
+        return Sentence("not a regular file", reason="file_link")
     if info.flag_bits & 0x41:
         message = "it is encrypted: unpack the archive with its password and import the folder"
-        return Note(message, reason="file_encrypted")
+        return Sentence(message, reason="file_encrypted")
     if info.file_size > _SMALL_BYTES and info.file_size > limits.ratio * max(1, info.compress_size):
-        return Note(
+        return Sentence(
             f"it would swell {info.file_size / max(1, info.compress_size):.0f} times, more than the {limits.ratio:g} "
             "that are allowed",
             reason="file_swells",
@@ -176,16 +177,16 @@ def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list
             key = unicodedata.normalize("NFC", str(target)).casefold()
             if key in seen:
                 refused.append(
-                    (name, Note("another member has the same name, but for case or accents", reason="file_twice"))
+                    (name, Sentence("another member has the same name, but for case or accents", reason="file_twice"))
                 )
                 continue
             seen.add(key)
             try:
                 room -= unpack_member(archive, info, folder / target, room)
             except (FileExistsError, NotADirectoryError, IsADirectoryError):
-                refused.append((name, Note("another member stands where its folder would be", reason="file_twice")))
+                refused.append((name, Sentence("another member stands where its folder would be", reason="file_twice")))
             except DAMAGED as cause:
-                refused.append((name, Note(f"it is damaged: {_message(cause)}", reason="file_damaged")))
+                refused.append((name, Sentence(f"it is damaged: {_message(cause)}", reason="file_damaged")))
     return refused
 
 

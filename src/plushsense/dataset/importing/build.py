@@ -9,10 +9,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import DatasetError, Note
+from plushsense.core.errors import DatasetError
 from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.sources import COMPANIONS, LEFT_OUT, SourceFile, SourceScan
 from plushsense.dataset.importing.truncation import truncation_marks
 from plushsense.dataset.index import DUPLICATE_FOLDER, IndexBuild, apply_marks, build_index, write_index_files
@@ -30,7 +31,7 @@ from plushsense.dataset.store import (
 )
 from plushsense.recording.session_files import SESSION_LOG
 
-TWICE = Note("the same file was already imported", reason="file_twice")
+TWICE = Sentence("the same file was already imported", reason="file_twice")
 # Files to which the recorder only appends.
 APPENDED = (STREAM_NAME, SESSION_LOG)
 _LONGEST = 120
@@ -81,9 +82,9 @@ def refuse_merged(files: Sequence[SourceFile], there: Iterable[str] = ()) -> Non
             )
 
 
-def _orphan(name: str) -> Note:
+def _orphan(name: str) -> Sentence:
     """Return the reason to refuse a companion of the file ``name``, which was not imported."""
-    return Note(f"belongs to '{name}', which was not imported", reason="file_orphan")
+    return Sentence(f"belongs to '{name}', which was not imported", reason="file_orphan")
 
 
 @dataclass
@@ -113,7 +114,7 @@ class Copier:
         try:
             raw = file.source.read_bytes()
         except OSError as cause:
-            return Note(f"cannot be read: {cause.strerror or cause}", reason="file_unreadable")
+            return Sentence(f"cannot be read: {cause.strerror or cause}", reason="file_unreadable")
         content = hashlib.sha256(raw).hexdigest()
         if (existing := self.contents.get((file.kind, content))) is not None:
             self.already[file.source] = existing
@@ -178,10 +179,10 @@ def key_of(path: str, *, companion: bool) -> str:
 
 
 RECORDER = "recorder"
-SIMULATED = Note(
+SIMULATED = Sentence(
     "these recordings are of the virtual toy: scores on them say nothing about a real toy", reason="simulated"
 )
-NO_PEOPLE = Note(
+NO_PEOPLE = Sentence(
     "the folders are gestures, so the people are not known: splits by subject are not possible; "
     "import again with --subjects map.csv (columns file,subject) if a mapping exists",
     reason="people_unknown",
@@ -322,7 +323,7 @@ def merge_people(
             new, old = getattr(info, key), getattr(known, key)
             if new and old and new != old:
                 message = f"the {key.replace('_', ' ')} of '{code}' is kept as '{old}'; a session states '{new}'"
-                notes.append(Note(message, reason="person_kept", person=code, old=old, new=new))
+                notes.append(Sentence(message, reason="person_kept", person=code, old=old, new=new))
         values = {key: getattr(known, key) or getattr(info, key) for key in keys}
         people[code] = replace(known, **values, more=info.more | known.more)
     strangers = [code for code in file if folder_name(code) not in subjects]

@@ -18,11 +18,12 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from plushsense.core.errors import ConfigError, DatasetError, FileFormatError, Note
+from plushsense.core.errors import ConfigError, DatasetError, FileFormatError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.files import CACHE, sha256_of, walk_files
 from plushsense.dataset.importing.archives import UnpackLimits, unpack
 from plushsense.dataset.importing.build import (
@@ -206,7 +207,7 @@ def _returning_people_warning(dest: Path, come: list[str]) -> list[str]:
     days = ", ".join(dict.fromkeys(g.day for g in gone))
     listed = f"{', '.join(come[:5])}{f' and {len(come) - 5} more' if len(come) > 5 else ''}"
     return [
-        Note(
+        Sentence(
             f"people were removed from this data set ({len(gone)}; {days}), and {listed} were added now: remove a "
             f"person again with  plushsense forget {dest} CODE",
             reason="removed_return",
@@ -253,7 +254,7 @@ class ImportOptions:
         if len(found) == 1:
             name = found[0].name
             message = f"the layout is '{name}', as the header of the files has its channels"
-            return found[0], [Note(message, reason="layout_guessed", layout=name)]
+            return found[0], [Sentence(message, reason="layout_guessed", layout=name)]
         fit = f"the header of the files fits {' and '.join(layout.name for layout in found)}. " if found else ""
         raise ConfigError(
             f"--layout is needed: {fit}Accepted are {', '.join(layout_names())}, or a TOML file of your own, which "
@@ -310,7 +311,7 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
         try:
             _add_xdf(file, name, person, options, search)
         except FileFormatError as cause:
-            search.found.append(SourceFile(file, "", origin=name, reason=Note.of(cause)))
+            search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
     if mapping is not None:
         present = {name for f in rest for name in (f.name, f.relative_to(source).as_posix())}
         if missing := [name for name in mapping if name not in present]:

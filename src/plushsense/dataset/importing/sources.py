@@ -13,10 +13,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from plushsense.core.errors import BadInput, DatasetError, Note
+from plushsense.core.errors import BadInput, DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet, plain_label
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, STREAM_NAME, parse_name
+from plushsense.core.sentences import Sentence
 from plushsense.core.toml import read_toml
 from plushsense.dataset.importing.truncation import Choice
 from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT, PersonInfo, read_csv_rows
@@ -131,17 +132,17 @@ def split_regular_files(files: Iterable[Path]) -> tuple[list[Path], list[SourceF
 def _refusal(path: Path) -> str:
     """Return the reason to refuse a file by its kind or name; "" if there is none."""
     if path.is_symlink():
-        return Note("a symbolic link is not followed", reason="file_link")
+        return Sentence("a symbolic link is not followed", reason="file_link")
     if not path.is_file():
-        return Note("not a regular file", reason="file_link")
+        return Sentence("not a regular file", reason="file_link")
     if path.name.startswith("._"):
-        return Note("metadata of macOS, no recording", reason="file_of_system")
+        return Sentence("metadata of macOS, no recording", reason="file_of_system")
     try:
         path.name.encode("utf-8")
     except UnicodeEncodeError:
-        return Note("its name is not UTF-8: rename it", reason="file_name")
+        return Sentence("its name is not UTF-8: rename it", reason="file_name")
     if any(c < " " or c == "\x7f" for c in path.name):
-        return Note("its name holds a control character: rename it", reason="file_name")
+        return Sentence("its name holds a control character: rename it", reason="file_name")
     return ""
 
 
@@ -232,15 +233,15 @@ def classify_gesture_recorder(
             subject = _folder_person(path, source, person)
         if path.name.casefold() == STREAM_NAME.casefold():
             if (by_label and not person) or subject is None:
-                note = Note("a session stream whose person is not known", reason="person_unknown")
+                note = Sentence("a session stream whose person is not known", reason="person_unknown")
                 yield SourceFile(path, "", reason=note)
             else:
                 yield SourceFile(path, STREAMS, subject)
         elif parse_name(path.name) is None:
-            note = Note("not a recording: its name is not <label>_<epoch ms>_<rows>.csv", reason="file_no_recording")
+            note = Sentence("not a recording: its name is not <label>_<epoch ms>_<rows>.csv", "file_no_recording")
             yield SourceFile(path, "", reason=note)
         elif subject is None:
-            yield SourceFile(path, "", reason=Note(f"not {_where(subjects)}", reason="person_unknown"))
+            yield SourceFile(path, "", reason=Sentence(f"not {_where(subjects)}", reason="person_unknown"))
         else:
             yield SourceFile(path, RECORDINGS, subject)
 
@@ -260,9 +261,9 @@ def classify_labelled_rows(
         else:
             subject = _folder_person(path, source, person) if one_person or path.parent != source else person or None
         if path.suffix.lower() != ".csv":
-            yield SourceFile(path, "", reason=Note("not a CSV file", reason="file_no_recording"))
+            yield SourceFile(path, "", reason=Sentence("not a CSV file", reason="file_no_recording"))
         elif subject is None:
-            yield SourceFile(path, "", reason=Note(f"not {_where(subjects)}", reason="person_unknown"))
+            yield SourceFile(path, "", reason=Sentence(f"not {_where(subjects)}", reason="person_unknown"))
         else:
             yield SourceFile(path, STREAMS, subject)
 
@@ -318,16 +319,16 @@ def read_mapping(path: Path) -> dict[str, str]:
 
 
 # Suffixes of files that the recorder leaves behind if it is killed, or is still running.
-_UNFINISHED = Note(
+_UNFINISHED = Sentence(
     "not finished when the recorder stopped; its rows are in the session's stream", reason="file_unfinished"
 )
 LEFT_OVER = {
     ".part": _UNFINISHED,
     ".new": _UNFINISHED,
-    ".torn": Note(
+    ".torn": Sentence(
         "damaged by a crash and renamed by the recorder; its rows are in the session's stream", reason="file_unfinished"
     ),
-    ".lock": Note("a lock of the recorder", reason="file_lock"),
+    ".lock": Sentence("a lock of the recorder", reason="file_lock"),
 }
 
 Sessions = dict[Path, SessionHead | str]
@@ -345,10 +346,10 @@ def read_sessions(files: Iterable[Path]) -> Sessions:
                 Layout.from_dict(head.layout, "layout")
         except (BadInput, RecursionError) as cause:
             message = f"its {SESSION_HEAD} cannot be used: {cause}"
-            sessions[path.parent] = Note(message, reason="session_unusable", file=SESSION_HEAD)
+            sessions[path.parent] = Sentence(message, reason="session_unusable", file=SESSION_HEAD)
             continue
         if head is not None:
-            nobody = Note(f"its {SESSION_HEAD} names no subject", reason="person_unknown")
+            nobody = Sentence(f"its {SESSION_HEAD} names no subject", reason="person_unknown")
             sessions[path.parent] = head if head.subject.strip() else nobody
     return sessions
 
@@ -408,7 +409,7 @@ def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceF
         discarded = discarded_recordings(place)
     except (BadInput, OverflowError, RecursionError) as cause:
         # Without the log it is unknown which recordings were discarded.
-        note = Note(f"its {SESSION_LOG} cannot be used: {cause}", reason="session_unusable", file=SESSION_LOG)
+        note = Sentence(f"its {SESSION_LOG} cannot be used: {cause}", reason="session_unusable", file=SESSION_LOG)
         yield from (SourceFile(path, "", reason=note) for path in files)
         return
     stream = place / STREAM_NAME
@@ -427,12 +428,12 @@ def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceF
         elif name.endswith(SIDECAR):
             main = mains.get(path.with_suffix("").as_posix())
             if main is None:
-                note = Note("the sidecar of a recording that is missing", reason="file_orphan")
+                note = Sentence("the sidecar of a recording that is missing", reason="file_orphan")
                 yield of_session(LEFT_OUT, reason=note)
             else:
                 yield of_session(COMPANIONS, beside=main)
         else:
-            note = Note(
+            note = Sentence(
                 "no file of a session: expected are recordings, sidecars, stream and log", reason="file_no_recording"
             )
             yield of_session("", reason=note)
@@ -454,7 +455,7 @@ def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:
                     "the latest is kept"
                 )
                 values_of = {"person": head.subject, "old": earlier, "new": value}
-                notes.append(Note(message, reason="person_changed", **values_of))
+                notes.append(Sentence(message, reason="person_changed", **values_of))
             values[key] = value or earlier
         people[head.subject] = PersonInfo(head.subject, values["age_group"], values["gender"], values["consent"])
     return list(people.values()), notes

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError, FileFormatError, Note, nearest, need
+from plushsense.core.errors import ConfigError, FileFormatError, nearest, need
 from plushsense.core.gestures import plain_label
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, Layout
 from plushsense.core.recorder_csv import (
@@ -32,6 +32,7 @@ from plushsense.core.recorder_csv import (
     recording_filename,
     write_recording,
 )
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.files import sha256_of
 from plushsense.dataset.importing.sources import COMPANIONS, SourceFile
 from plushsense.dataset.store import RECORDINGS, STREAMS
@@ -76,7 +77,7 @@ def whole_steps(values: NDArray[np.float64], layout: Layout) -> tuple[NDArray[np
         between = np.mean(np.abs(scaled - rounded) > _BETWEEN, axis=0) > 0.1
         coarse = between & (np.std(scaled, axis=0) < _FEW_STEPS)
         if names := ", ".join(f"'{n}'" for n, is_coarse in zip(layout.names, coarse, strict=True) if is_coarse):
-            warning = Note(
+            warning = Sentence(
                 f"{names}: the values are small fractions of the step of layout '{layout.name}' and were rounded to "
                 "it: give a layout with a smaller step",
                 reason="values_rounded",
@@ -136,7 +137,7 @@ def write_session(
             at_ms += 1
         written_paths.add(path)
         if len(path.name.encode("utf-8")) > LONGEST_LABEL:
-            note = Note("its label is too long for a file name", reason="label_too_long")
+            note = Sentence("its label is too long for a file name", reason="label_too_long")
             yield SourceFile(path, "", origin=name, reason=note)
             continue
         write_recording(path, frames.slice(cut.start, cut.stop), layout)
@@ -317,16 +318,16 @@ def milliseconds(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple
     steps = np.diff(times[:100_000])
     forward = steps[np.isfinite(steps) & (steps > 0)]
     if not len(forward):
-        return 1.0, Note(f"column '{name}' is read as milliseconds", reason="time_unit", column=name, unit="ms")
+        return 1.0, Sentence(f"column '{name}' is read as milliseconds", reason="time_unit", column=name, unit="ms")
     step = float(np.median(forward))
     unit = min(_UNITS, key=lambda u: abs(np.log(step * _UNITS[u] * rate_hz / 1000.0)))
     message = f"column '{name}' is read as {unit}, as the rate of {rate_hz:g} Hz suggests"
-    return _UNITS[unit], Note(message, reason="time_unit", column=name, unit=unit)
+    return _UNITS[unit], Sentence(message, reason="time_unit", column=name, unit=unit)
 
 
-def _about(name: str, note: str) -> Note:
+def _about(name: str, note: str) -> Sentence:
     """Return a note about the file ``name``."""
-    return Note(f"{name}: {note}", reason="about_file", file=name, note=note)
+    return Sentence(f"{name}: {note}", reason="about_file", file=name, note=note)
 
 
 def _codes(texts: Iterable[str]) -> tuple[NDArray[np.int64], list[str]]:
@@ -376,7 +377,7 @@ def read_table(
     ):
         if count:
             message = f"{count} row{'s' if count > 1 else ''} {reason} left out"
-            yield _about(display_name, Note(message, reason="rows_left_out", n=count))
+            yield _about(display_name, Sentence(message, reason="rows_left_out", n=count))
     good &= known
     if not good.any():
         raise FileFormatError(

@@ -20,10 +20,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import FileFormatError, Note, need
+from plushsense.core.errors import FileFormatError, need
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import Layout, StreamColumns
 from plushsense.core.recorder_csv import LONGEST_LABEL, Frames
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.sources import LEFT_OUT, SourceFile
 from plushsense.dataset.importing.tables import (
     ConvertedSource,
@@ -235,7 +236,7 @@ def read_xdf(
     streams = _load(path, good)
     if good < size:
         message = f"{display_name}: cut off or damaged from byte {good} of {size} on; the bytes before are used"
-        yield Note(message, reason="xdf_cut", file=display_name)
+        yield Sentence(message, reason="xdf_cut", file=display_name)
     texts = [s for s in streams if _text(s, "channel_format") == "string"]
     fitting, others = [], []
     for stream in streams:

@@ -170,14 +170,20 @@ def zeroed(w: DatasetSummary) -> Iterator[Issue]:
     often = (zeros.sum(axis=0) > np.maximum(near.sum(axis=0), _ZEROS * rows)) & (highest > lowest)
     affected = np.array([c for c in axes if reaches and often[c] and lowest[c] >= limit], dtype=np.int64)
     if len(affected):
-        share = 100 * zeros[:, affected].any(axis=1).mean()
-        yield Issue(
-            f"{_channels(w.dataset.layout.names, affected)} {'reads' if len(affected) == 1 else 'read'} exactly 0 in "
-            f"{100 * zeros[:, affected].sum(axis=0).max() / rows:.1f} % of the rows (in {share:.0f} % of the "
-            f"recordings) and never less than {limit}: the authors' recorder writes 0 for every value under {limit}, "
-            "so that magnitude and direction are wrong there",
-            channels=tuple(affected.tolist()),
+        share = round(100 * float(zeros[:, affected].any(axis=1).mean()))
+        percent = round(100 * float(zeros[:, affected].sum(axis=0).max()) / rows, 1)
+        named = _channels(w.dataset.layout.names, affected)
+        message = Sentence(
+            f"{named} {'reads' if len(affected) == 1 else 'read'} exactly 0 in {percent:.1f} % of the rows (in "
+            f"{share} % of the recordings) and never less than {limit}: the authors' recorder writes 0 for every value "
+            f"under {limit}, so that magnitude and direction are wrong there",
+            "zeroed",
+            channels=named,
+            percent=percent,
+            share=share,
+            limit=limit,
         )
+        yield Issue(message, channels=tuple(affected.tolist()))
 
 
 def stuck(w: DatasetSummary) -> Iterator[Issue]:

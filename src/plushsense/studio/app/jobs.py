@@ -41,6 +41,7 @@ class StudioJob:
         spec: the argument of the task, as JSON values.
         state: `RUNNING`, `DONE`, `REFUSED` (``message`` says why; ``reason`` and ``values`` are those of the error) or
             `STOPPED` (by a person, or because the process or the studio ended).
+        warnings: arguments of `plushsense.studio.app.words.Words.sentence`.
         progress: the newest report of the task, as JSON values; ``reports`` has earlier ones too, thinned out if many.
         result: the value that the task returned.
         begun_s, ended_s: seconds since 1970.
@@ -53,7 +54,7 @@ class StudioJob:
     state: str = RUNNING
     progress: dict[str, Any] = field(default_factory=dict)
     reports: list[dict[str, Any]] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[str | dict[str, Any]] = field(default_factory=list)
     result: dict[str, Any] = field(default_factory=dict)
     message: str = ""
     reason: str = ""
@@ -224,7 +225,7 @@ class Jobs:
                     del job.reports[::2]
                 job.reports.append(job.progress)
             elif "warning" in message:
-                job.warnings.append(str(message["warning"]))
+                job.warnings.append(message["warning"])
             else:
                 outcome = message
             self.changed.notify()

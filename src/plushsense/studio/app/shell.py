@@ -157,7 +157,7 @@ class Page:
             self.say(self.words.error(refusal), "error")
         except OSError as cause:
             where = f" ('{cause.filename}')" if cause.filename else ""
-            self.say(self.words("errors.system", where=where, why=cause.strerror or str(cause)), "error")
+            self.say(self.words("sentences.system", where=where, why=cause.strerror or str(cause)), "error")
 
 
 def visitor() -> tuple[Words, bool | None]:

@@ -12,7 +12,7 @@ from importlib import import_module, resources
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import Note, PlushSenseError
+from plushsense.core.errors import PlushSenseError
 from plushsense.core.sentences import Sentence
 
 LANGUAGES = {"en": "English", "lv": "Latviešu"}
@@ -47,6 +47,29 @@ class Words:
         """Return the name of a gesture in this language, or ``label`` itself if it has none."""
         return self._texts.get(f"gestures.{label}", label)
 
+    def sentence(self, sentence: str | Mapping[str, Any]) -> str:
+        """Return a `Sentence` of the library, or the table of its `to_dict`, in this language.
+
+        Any other text is quoted, with a remark that it is in English.
+        """
+        if isinstance(sentence, Sentence):
+            sentence = sentence.to_dict()
+        elif isinstance(sentence, str):
+            sentence = {"message": sentence}
+        text = self._texts.get(f"sentences.{sentence.get('reason')}")
+        if not text:
+            return self._texts["sentences.note"].format(message=sentence["message"])
+        return text.format(**{key: self._value(key, value) for key, value in sentence["values"].items()})
+
+    def _value(self, key: str, value: object) -> str:
+        if isinstance(value, list | tuple):
+            return ", ".join(self._value(key, each) for each in value)
+        if isinstance(value, Sentence | Mapping):
+            return self.sentence(value)
+        if isinstance(value, float):
+            return f"{value:.10g}".replace(".", self._texts["shell.decimal_point"])
+        return self.gesture(str(value)) if key in ("gesture", "gestures") else str(value)
+
     def error(self, error: PlushSenseError) -> str:
         """Return the sentence of an error in this language, see `explain`."""
         return self.explain(str(error), error.reason, error.values)
@@ -58,43 +81,9 @@ class Words:
             message: the sentence in English, as the command line prints it.
             reason, values: those of the `PlushSenseError`. Without a text for ``reason``, ``message`` is quoted.
         """
-        if f"errors.{reason}" in self._texts:
-            return self.note({"message": message, "reason": reason, "values": values or {}})
-        return self._texts["errors.other"].format(message=message) if message else ""
-
-    def sentence(self, sentence: str) -> str:
-        """Return a `Sentence` of the library in this language; one without a text is quoted in English."""
-        if not isinstance(sentence, Sentence):
-            return sentence
-        text = self._texts.get(f"sentences.{sentence.reason}")
-        if text is None:
-            return self._texts["errors.other"].format(message=str(sentence))
-        return text.format(**{key: self._value(key, value) for key, value in sentence.values.items()})
-
-    def _value(self, key: str, value: object) -> str:
-        if isinstance(value, list | tuple):
-            return ", ".join(self._value(key, each) for each in value)
-        if isinstance(value, float):
-            return f"{value:.10g}".replace(".", self._texts["shell.decimal_point"])
-        return (
-            self.gesture(str(value))
-            if key == "gesture"
-            else self.sentence(value)
-            if isinstance(value, str)
-            else str(value)
-        )
-
-    def note(self, note: str | Mapping[str, Any]) -> str:
-        """Return the sentence of a `Note`, or of the table that `plushsense.studio.tasks` makes of it.
-
-        A text without a reason is quoted, with a remark that it is in English.
-        """
-        table = note if isinstance(note, Mapping) else {"message": str(note), **getattr(note, "__dict__", {})}
-        text = self._texts.get(f"errors.{table.get('reason')}", "")
-        if text:
-            values = {key: self.note(v) if isinstance(v, (Note, Mapping)) else v for key, v in table["values"].items()}
-            return text.format(**values)
-        return self._texts["errors.note"].format(message=table["message"])
+        if f"sentences.{reason}" in self._texts:
+            return self.sentence({"message": message, "reason": reason, "values": values or {}})
+        return self._texts["sentences.other"].format(message=message) if message else ""
 
     def unit(self, unit: str) -> str:
         """Return the name of a unit in this language, or ``unit`` itself if it has none."""

@@ -103,7 +103,7 @@ def show_facts(page: Page, export: ExportFacts, made: StudioJob | None) -> None:
         if card.get("simulated"):
             notice(words("shell.simulation"))
         for warning in made.warnings if made else ():
-            notice(warning)
+            notice(words.sentence(warning))
         facts(
             [
                 (words("export.network"), str(card["title"])),

@@ -15,11 +15,12 @@ from nicegui import context, run, ui
 from nicegui.elements.upload import Upload
 from nicegui.elements.upload_files import FileUpload
 
-from plushsense.core.errors import BundleError, ConfigError, Note, PlushSenseError
+from plushsense.core.errors import BundleError, ConfigError, PlushSenseError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import layout_names, load_layout
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.archives import UnpackLimits, member_target
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead
 from plushsense.models.bundle import Bundle
@@ -50,7 +51,7 @@ class Incoming:
         self._workspace = workspace
         self.folder = workspace.folder / WORK / INCOMING / uuid.uuid4().hex
         self.dataset = self.folder / "dataset"
-        self.refused: list[Note] = []
+        self.refused: list[Sentence] = []
         self.bundles: list[str] = []
         """Names of the networks that were added."""
         self._names: list[str] = []
@@ -75,8 +76,8 @@ class Incoming:
             OSError: for errors of the disk.
         """
         target = member_target(unquote(file.name))
-        if isinstance(target, Note):
-            self.refused.append(Note(file.name, reason="about_file", file=unquote(file.name), note=target))
+        if isinstance(target, Sentence):
+            self.refused.append(Sentence(file.name, reason="about_file", file=unquote(file.name), note=target))
             return
         if target.name in _OF_DESKTOPS:
             return
@@ -109,10 +110,10 @@ class Incoming:
             stored.rename(place)
             self.bundles.append(name)
         except BundleError:
-            note = Note("it is no network of PlushSense, or a damaged one", reason="bundle_damaged")
-            self.refused.append(Note(stored.name, reason="about_file", file=stored.name, note=note))
+            note = Sentence("it is no network of PlushSense, or a damaged one", reason="bundle_damaged")
+            self.refused.append(Sentence(stored.name, reason="about_file", file=stored.name, note=note))
         except ConfigError as refusal:
-            self.refused.append(Note(stored.name, reason="about_file", file=stored.name, note=Note.of(refusal)))
+            self.refused.append(Sentence(stored.name, reason="about_file", file=stored.name, note=Sentence.of(refusal)))
         finally:
             stored.unlink(missing_ok=True)
 
@@ -208,7 +209,7 @@ class IncomingSection:
         problem, self._problem = self._problem, None
         refused, incoming.refused = incoming.refused, []
         refused += [
-            Note(path, reason="about_file", file=path, note=Note("too large", reason="file_too_large", mb=_MB))
+            Sentence(path, reason="about_file", file=path, note=Sentence("too large", reason="file_too_large", mb=_MB))
             for path in end["large"]
         ]
         if end["cancelled"] or not end["ok"]:
@@ -223,7 +224,7 @@ class IncomingSection:
             page.say(words("home.bundle_came", name="”, “".join(added)), "good")
             await self._refresh()
         if refused:
-            page.say(" ".join(words.note(note) for note in refused[:_MAX_LINES]), "error")
+            page.say(" ".join(words.sentence(note) for note in refused[:_MAX_LINES]), "error")
         if incoming.sources:
             self._inspect()
 
@@ -297,12 +298,14 @@ class IncomingSection:
         facts(rows)
         gestures = [f"{words.gesture(label)}: {n}" for label, n in sorted(result["gestures"].items())]
         self._lines("preview_gestures", gestures)
-        notes = [words.note(note) for note in result["notes"] if note["reason"] not in ("simulated", "layout_guessed")]
+        notes = [
+            words.sentence(note) for note in result["notes"] if note["reason"] not in ("simulated", "layout_guessed")
+        ]
         if result["flagged"]:
             notes.append(words("home.flagged", n=result["flagged"]))
         for note in notes:
             ui.label(note).classes("ps-note ps-break")
-        self._lines("rejected", [f"{r['file']}: {words.note(r['reason'])}" for r in result["rejected"]])
+        self._lines("rejected", [f"{r['file']}: {words.sentence(r['reason'])}" for r in result["rejected"]])
 
     def _lines(self, key: str, lines: list[str]) -> None:
         if not lines:
@@ -334,14 +337,14 @@ class IncomingSection:
         tag(layout.classes("w-full"), "layout").on_value_change(lambda e: on_page(change_layout)(str(e.value)))
         layout.props(f'hint="{words("home.layout_guessed")}"' if current and not self._layout else "")
         if reason == "layout_unknown":
-            layout.error = words("errors.layout_unknown")
+            layout.error = words("sentences.layout_unknown")
         if unknown_person or self._person:
             with ui.row().classes("items-start ps-small-gap w-full"):
                 person = tag(ui.input(words("home.whose"), value=self._person).classes("ps-wide"), "person-of-files")
                 person.on("keydown.enter", on_page(change_person))
                 button("person-use", words("home.whose_use"), on_page(change_person))
             if unknown_person:
-                person.error = words("errors.person_unknown")
+                person.error = words("sentences.person_unknown")
 
     def _keep_row(self, result: dict[str, Any]) -> None:
         words, workspace = self._words, self._page.workspace

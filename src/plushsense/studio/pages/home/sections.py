@@ -363,8 +363,8 @@ class JobList:
             if job.spec.get("add"):
                 facts.append(words("home.new", n=result["added"]["recordings"]))
             ui.label(" · ".join(facts))
-        warnings = [words.note(w) for w in (*job.warnings, *result.get("warnings", ()))]
-        rejected = [f"{r['file']}: {words.note(r['reason'])}" for r in result.get("rejected", ())]
+        warnings = [words.sentence(w) for w in (*job.warnings, *result.get("warnings", ()))]
+        rejected = [f"{r['file']}: {words.sentence(r['reason'])}" for r in result.get("rejected", ())]
         for key, lines in (("warnings", warnings), ("rejected", rejected)):
             if lines:
                 with ui.expansion(words(f"home.{key}", n=len(lines))).classes("w-full").props("dense"):

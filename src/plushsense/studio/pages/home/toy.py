@@ -126,5 +126,5 @@ class ToySection:
             if toys.searched and not listed:
                 ui.label(words("home.none_found")).classes("ps-dim")
             for note in toys.listing.notes:
-                ui.label(words.note(note)).classes("ps-dim ps-note ps-break")
+                ui.label(words.sentence(note)).classes("ps-dim ps-note ps-break")
             button("look", words("home.look_again" if toys.searched else "home.look"), toys.search, SMALL)

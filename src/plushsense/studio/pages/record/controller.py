@@ -9,6 +9,7 @@ from pathlib import Path
 
 from plushsense.core.errors import ConfigError, DatasetError, LayoutError
 from plushsense.core.layouts import Layout, layout_names
+from plushsense.core.sentences import Sentence
 from plushsense.core.toml import builtin_names
 from plushsense.core.version import __version__
 from plushsense.devices.opening import parse_url
@@ -37,7 +38,7 @@ from plushsense.recording.session import (
     list_sessions,
     mark_finished,
 )
-from plushsense.recording.session_files import SESSION_HEAD, Message, SessionHead
+from plushsense.recording.session_files import SESSION_HEAD, SessionHead
 from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import PROTOCOLS, VIRTUAL, ChangeSignal, Workspace
 
@@ -64,7 +65,7 @@ class ActiveSession:
     device: TappedDevice
     request: SessionRequest
     notices: tuple[str, ...] = ()
-    repairs: tuple[Message, ...] = ()
+    repairs: tuple[Sentence, ...] = ()
     mark_first: bool = False
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
@@ -305,7 +306,7 @@ class RecordController:
             raise ConfigError(message, reason="protocol_unknown")
         if request.layout and request.layout not in self.layouts():
             message = f"'{request.layout}' is not a layout of this studio: choose one from the list."
-            raise ConfigError(message, reason="layout_unknown")
+            raise ConfigError(message, reason="layout_gone")
         self._check_toy(request.device, known_device)
 
     def _check_toy(self, url: str, *known: str) -> None:

@@ -121,7 +121,7 @@ class _SessionLists:
         words, name, controller = self._page.words, session.name, self._controller
         with tag(ui.row().classes("w-full items-center"), f"unfinished-{name}"):
             if session.head is None or session.protocol is None:
-                ui.label(words("errors.session_damaged", name=name)).classes("flex-grow")
+                ui.label(words("sentences.session_damaged", name=name)).classes("flex-grow")
                 return
             self._describe(session)
             toys = list(dict.fromkeys([session.head.device, *controller.toys()]))

@@ -10,7 +10,7 @@ from nicegui import run, ui
 from nicegui.element import Element
 
 from plushsense.core.errors import DatasetError, PlushSenseError
-from plushsense.recording.session_files import Message, SessionHead
+from plushsense.recording.session_files import SessionHead
 from plushsense.recording.states import RecorderStatus
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import Keys, Page, address, button, focus, html, named, on_change, on_click, tag
@@ -74,15 +74,6 @@ class Sounds(Element, component="sounds.js"):
         if self._props["beat"] != beat:
             self._props["beat"] = beat
             self.update()
-
-
-def message_text(words: Words, message: Message) -> str:
-    """Return a message of the recorder in the language of the page."""
-    values = {k: words.number(v, 1) if isinstance(v, float) else v for k, v in message.values.items()}
-    if "gesture" in values:
-        values["gesture"] = words.gesture(str(values["gesture"]))
-    text = words.get(f"recorder.{message.reason}")
-    return text.format(**values) if text and message else words.explain(message, message.reason, values)
 
 
 def show_session(page: Page, controller: RecordController, session: ActiveSession) -> None:
@@ -156,7 +147,7 @@ class _View:
     def _notices(self) -> None:
         words = self._page.words
         notices = [words(f"record.{key}") for key in self._session.notices]
-        notices += [words("record.mended", what=message_text(words, repair)) for repair in self._session.repairs]
+        notices += [words("record.mended", what=words.sentence(repair)) for repair in self._session.repairs]
         for text in notices:
             box = ui.row().classes("ps-message ps-message-warning w-full").props('role="status"')
             with tag(box, "notice"):
@@ -391,7 +382,7 @@ class _View:
             number = words("record.seconds", s=words.number(s.elapsed_s, 1))
         self._number.text, self._state.text = number, text
         self._number.set_visibility(bool(number))
-        if self._message.text != (message := message_text(words, s.message)):
+        if self._message.text != (message := words.sentence(s.message)):
             self._message.text = message
         self._alert.prepare(self._lost_text(s))
         self._box.style(f"background: {colour}")

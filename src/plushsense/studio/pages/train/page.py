@@ -2,36 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from nicegui import context, run, ui
 
-from plushsense.core.errors import PlushSenseError
+from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, NORMS, PADDINGS, VECTOR_FILTERS, VECTOR_SYMBOL
 from plushsense.scoring.splits import parse_split
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs, StudioJob
-from plushsense.studio.app.shell import Page, button, html, on_change, query_path, section, tag
-from plushsense.studio.pages.train.jobs import (
+from plushsense.studio.app.shell import Page, button, focus, html, on_change, query_path, section, tag
+from plushsense.studio.app.words import Words
+from plushsense.studio.pages.train.jobs import JobsSection, warning_texts
+from plushsense.studio.pages.train.requests import (
     EVALUATE,
     KINDS,
+    MAKE,
     PAPER,
     SEARCH,
     SPLITS,
     SWEEP,
     TRAIN,
     JobRequest,
-    JobsSection,
     free_name,
     grids,
     job_request,
 )
-from plushsense.studio.pages.train.results import StoredResults, duration_text, score_labels
+from plushsense.studio.pages.train.results import StoredResults, counted, duration_text, score_labels, whole
 from plushsense.studio.pages.train.results_section import ResultsSection
+from plushsense.studio.pages.train.verdict import FEW_PEOPLE
+from plushsense.studio.widgets.elements import scroll_to
 from plushsense.training.spec import DEVICES, PRESETS
 from plushsense.windows.cut import ANYWHERE, TRAIN_CONTEXTS
 
+# Budget of *Make a network*, if nothing else is given.
+_MINUTES = 10
+# Fields are as wide as their longest choice, or as the page on a phone.
+_FIELD = "ps-train-field"
 _ADVANCED: dict[str, tuple[str, ...]] = {
     TRAIN: ("arch", "filters", "padding", "norm", "batch", "classes", "device", "quantize_aware", "fit_decisions"),
     EVALUATE: ("arch", "filters", "padding", "norm", "batch", "classes", "device", "train_context", "int8"),
@@ -60,7 +69,10 @@ _NUMBERS = (
 
 
 class TrainingForm:
-    """Form for a new job; it keeps entered values when another kind of job is chosen."""
+    """Form for a new job: one button for the usual one, and all others with their settings folded away.
+
+    It keeps entered values when another kind of job is chosen.
+    """
 
     def __init__(self, page: Page, jobs: Jobs, results: StoredResults) -> None:
         self._page, self._jobs, self._results, self._words = page, jobs, results, page.words
@@ -76,24 +88,35 @@ class TrainingForm:
         self._estimate_job: StudioJob | None = None
         self._estimate_request: JobRequest | None = None
         self._estimated = ""
+        # The fields by name; those of ``_usual`` stay when the others are built again.
+        self._boxes: dict[str, Any] = {}
+        self._usual: dict[str, Any] = {}
+        self._minutes: Any = _MINUTES
         w = self._words
         with section(w("train.new")):
             if not self._datasets:
                 ui.label(w("train.no_data"))
                 return
-            with ui.row().classes("w-full items-center"):
-                box = ui.select(
-                    self._datasets, label=w("train.data"), value=self._dataset, on_change=self._choose_dataset
-                )
-                tag(box.classes("w-80"), "dataset")
-                self._facts = tag(ui.row().classes("items-center"), "facts")
-            kinds = {kind: w(f"train.kinds.{kind}") for kind in KINDS}
-            radio = ui.radio(kinds, value=self._kind, on_change=self._choose_kind).props("inline")
-            tag(radio, "kind").props(f'aria-label="{w("train.kind")}"')
-            self._kind_about = tag(ui.label().classes("ps-dim"), "kind-about")
-            self._fields = ui.column().classes("w-full ps-small-gap")
-            self._buttons()
+            self._usual_fields()
+            with tag(ui.expansion(w("train.more"), icon="tune").classes("w-full"), "more") as self._more:
+                kinds = {kind: w(f"train.kinds.{kind}") for kind in KINDS}
+                radio = ui.radio(kinds, value=self._kind, on_change=self._choose_kind).props("inline")
+                tag(radio, "kind").props(f'aria-label="{w("train.kind")}"')
+                self._kind_about = tag(ui.label().classes("ps-dim"), "kind-about")
+                self._fields = ui.column().classes("w-full ps-small-gap")
+                self._buttons()
         self._build()
+
+    def _usual_fields(self) -> None:
+        w = self._words
+        ui.label(w("train.make_about"))
+        with ui.row().classes("w-full items-start"):
+            box = ui.select(self._datasets, label=w("train.data"), value=self._dataset, on_change=self._choose_dataset)
+            self._usual["dataset"] = tag(box.classes(_FIELD), "dataset")
+            minutes = ui.input(w("train.minutes"), value=str(_MINUTES), on_change=self._choose_minutes)
+            self._usual["minutes"] = tag(minutes.props('inputmode="numeric"').classes("w-36"), "minutes")
+            button("make", w("train.make"), self._make, "unelevated", icon="auto_awesome")
+        self._facts = tag(ui.row().classes("items-center"), "facts")
 
     def _buttons(self) -> None:
         w = self._words
@@ -115,12 +138,13 @@ class TrainingForm:
                 return
             w = self._words
             with self._facts:
-                ui.label(
-                    w("train.facts", people=facts.people, recordings=facts.recordings, gestures=len(facts.gestures))
-                )
+                counts = {"people": facts.people, "recordings": facts.recordings, "gestures": len(facts.gestures)}
+                ui.label(", ".join(counted(w, kind, n) for kind, n in counts.items()))
                 if facts.simulated:
                     html(score_labels(w, False, True))
                     ui.label(w("shell.simulation")).classes("ps-dim")
+                if 0 < facts.people < FEW_PEOPLE:
+                    ui.label(w("train.few_people")).classes("ps-dim")
             if not facts.streams and self._values[TRAIN]["context"] == ANYWHERE:
                 self._values[TRAIN]["context"] = "loop"
                 self._build()
@@ -131,8 +155,13 @@ class TrainingForm:
         self._dataset = str(event.value)
         self._values[TRAIN].pop("name", None)
         self._page.say("")
+        event.sender.error = None
         self._build()
         await self.read()
+
+    def _choose_minutes(self, event: Any) -> None:
+        self._minutes = _integer(event.value)
+        event.sender.error = None
 
     def _choose_kind(self, event: Any) -> None:
         self._kind = str(event.value)
@@ -145,10 +174,11 @@ class TrainingForm:
         """Build the fields for the chosen kind of job."""
         self._kind_about.set_text(self._words(f"train.kind_about.{self._kind}"))
         self._fields.clear()
+        self._boxes = dict(self._usual)
         with self._fields:
             {TRAIN: self._of_train, EVALUATE: self._of_evaluate}.get(self._kind, self._of_grid)()
-            with ui.expansion(self._words("train.advanced"), icon="tune").classes("w-full") as more:
-                tag(more, "advanced")
+            with ui.expansion(self._words("train.advanced"), icon="tune").classes("w-full") as self._advanced:
+                tag(self._advanced, "advanced")
                 with ui.row().classes("w-full"):
                     for key in _ADVANCED[self._kind]:
                         self._field(key)
@@ -158,7 +188,7 @@ class TrainingForm:
         title = self._datasets[self._dataset]
         self._values[TRAIN].setdefault("name", free_name(self._page.workspace, self._jobs, title))
         with ui.row().classes("w-full"):
-            self._field("name", wide=True)
+            self._field("name")
             self._select("context", self._texts("contexts", ("", *TRAIN_CONTEXTS)))
             self._select("preset", self._texts("presets", PRESETS))
             self._field("epochs")
@@ -212,7 +242,7 @@ class TrainingForm:
             elif split.startswith("by-recording"):
                 ui.label(self._words("train.known_about"))
 
-    def _field(self, text: str, *, key: str = "", wide: bool = False) -> None:
+    def _field(self, text: str, *, key: str = "") -> None:
         """Build the field of a setting: a selection, a number, a checkbox or a text.
 
         Args:
@@ -230,14 +260,14 @@ class TrainingForm:
             number = text in _NUMBERS
             box = ui.input(label, value="" if value is None else str(value), placeholder=_PLACEHOLDERS.get(text))
             box.on_value_change(self._store(name, _integer if number else _text))
-            box.props('inputmode="numeric"' if number else "").classes("w-80" if wide else "w-64")
-            tag(box, name)
+            self._boxes[name] = tag(box.props('inputmode="numeric"' if number else "").classes(_FIELD), name)
 
     def _select(self, key: str, options: Mapping[str, str]) -> None:
         stored = self._values[self._kind].get(key, "")
         value = stored if stored in options else next(iter(options))
         label = self._words(f"train.{key}")
-        tag(ui.select(dict(options), label=label, value=value, on_change=self._store(key)).classes("w-96"), key)
+        box = ui.select(dict(options), label=label, value=value, on_change=self._store(key))
+        self._boxes[key] = tag(box.classes(_FIELD), key)
 
     def _store(self, key: str, read: Callable[[Any], Any] | None = None) -> Callable[[Any], None]:
         """Return an event handler that stores the value of a field, converted by ``read`` if given."""
@@ -245,6 +275,8 @@ class TrainingForm:
 
         def store(event: Any) -> None:
             self._values[kind][key] = read(event.value) if read else event.value
+            if key in self._boxes:
+                self._boxes[key].error = None
             if key in ("split", "grid") and kind != TRAIN:
                 self._describe_split()
             self._changed()
@@ -271,10 +303,38 @@ class TrainingForm:
 
     # Estimates and starts -------------------------------------------------------------------------------------
 
+    @contextmanager
+    def _show_errors(self) -> Iterator[None]:
+        """Show an error beside the field that it belongs to, and any other at the top of the page."""
+        with self._page.show_errors():
+            try:
+                yield
+            except ConfigError as error:
+                name = str(error.values.get("field"))
+                if name not in self._boxes:
+                    raise
+                self._boxes[name].error = self._words.error(error)
+                if name not in self._usual:
+                    self._more.open()
+                    if name in _ADVANCED[self._kind]:
+                        self._advanced.open()
+                focus(self._boxes[name])
+
+    def _make(self) -> None:
+        self._page.say("")
+        with self._show_errors():
+            form = {"kind": MAKE, "dataset": self._dataset, "minutes": self._minutes}
+            self._begin(job_request(self._page.workspace, self._jobs, form))
+
+    def _begin(self, request: JobRequest) -> None:
+        self._jobs.start(request.task, request.spec, request.title)
+        self._page.say(self._words("train.begun"), "good")
+        scroll_to("job")
+
     def _estimate(self) -> None:
         self._page.say("")
         self.close()
-        with self._page.show_errors():
+        with self._show_errors():
             request = self._estimate_request = self._request()
             self._estimate_job = self._jobs.start(request.task, request.dry, request.title)
             self._plan.clear()
@@ -284,12 +344,12 @@ class TrainingForm:
 
     def _start(self) -> None:
         self._page.say("")
-        with self._page.show_errors():
+        with self._show_errors():
             request = self._request()
             if request.task in (SWEEP, SEARCH) and self._estimated != request.key:
                 self._page.say(self._words("train.changed" if self._estimated else "train.look_first"), "warning")
                 return
-            self._jobs.start(request.task, request.spec, request.title)
+            self._begin(request)
             self._estimated = ""
             self._plan.clear()
             self._values[TRAIN].pop("name", None)
@@ -309,7 +369,8 @@ class TrainingForm:
         self._estimate_job = None
         self._plan.clear()
         if job.state != DONE:
-            self._page.say(job.message, "error" if job.message else "info")
+            message = self._words.explain(job.message, job.reason, job.values)
+            self._page.say(message, "error" if message else "info")
             return
         try:
             same = self._request().key == request.key
@@ -317,7 +378,7 @@ class TrainingForm:
             same = False
         with self._plan:
             self._show_plan(job.result, request.task)
-            for sentence in job.warnings:
+            for sentence in warning_texts(self._words, job):
                 ui.label(f"• {sentence}").classes("ps-dim")
             if not same:
                 ui.label(self._words("train.changed"))
@@ -330,15 +391,22 @@ class TrainingForm:
             with ui.element("div").classes("ps-message ps-message-error w-full").props('role="alert"'):
                 ui.label(w("train.problems"))
                 for problem in plan["problems"]:
-                    ui.label(f"• {problem}")
+                    ui.label(f"• {w.explain(problem)}")
             return
         html(score_labels(w, plan["leaky"], plan["simulated"]))
         if task in (TRAIN, EVALUATE):
-            counts = {key: plan[key] for key in ("people", "classes", "windows", "folds", "epochs") if key in plan}
-            text = w("train.plan_one", **counts, parameters=f"{plan['parameters']:,}", macs=_power(plan["macs"]))
+            text = w(
+                "train.plan_one",
+                people=counted(w, "people", plan["people"]),
+                gestures=counted(w, "gestures", plan["classes"]),
+                trainings=counted(w, "networks", plan["folds"]),
+                epochs=counted(w, "epochs", plan["epochs"]),
+                **{key: whole(w, plan[key]) for key in ("windows", "parameters")},
+                macs=_power(w, plan["macs"]),
+            )
         elif task == SWEEP:
             counts = {key: plan[key] for key in ("trials", "trainings", "folds", "seeds", "held", "split")}
-            text = w("train.plan_grid", **counts, macs=_power(plan["macs"]))
+            text = w("train.plan_grid", **counts, macs=_power(w, plan["macs"]))
         else:
             text = w(
                 "train.plan_search",
@@ -347,16 +415,18 @@ class TrainingForm:
                 left_out=len(plan["left_out"]),
                 split=plan["split"],
                 share=round(100 * plan["bound_share"]),
-                macs=_power(plan["bound_macs"]),
+                macs=_power(w, plan["bound_macs"]),
             )
         tag(ui.label(text), "plan-text")
         tag(ui.label(w("train.about", time=duration_text(w, plan["seconds"]))), "plan-time")
 
 
-def _power(value: float) -> str:
+def _power(words: Words, value: float) -> str:
     """Format a number in scientific notation, as in ``2.3·10¹²``."""
     digits, power = f"{value:.1e}".split("e")
-    return f"{digits}·10{str(int(power)).translate(str.maketrans('0123456789-', '⁰¹²³⁴⁵⁶⁷⁸⁹⁻'))}"
+    return (
+        f"{words.number(float(digits), 1)}·10{str(int(power)).translate(str.maketrans('0123456789-', '⁰¹²³⁴⁵⁶⁷⁸⁹⁻'))}"
+    )
 
 
 def _integer(text: Any) -> Any:
@@ -381,7 +451,7 @@ async def show(page: Page) -> None:
     ui.label(page.words("train.intro")).classes("ps-dim")
     rows = await run.io_bound(results.rows)
     form = TrainingForm(page, jobs, results)
-    job_list = JobsSection(page, jobs, lambda identity: table.open(identity))
+    job_list = JobsSection(page, jobs, results, lambda identity: table.open(identity))
     table = ResultsSection(page, results, rows or [])
     context.client.on_delete(form.close)
 

@@ -11,7 +11,17 @@ from nicegui import run, ui
 
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import UNKNOWN_SUBJECT
-from plushsense.studio.app.shell import AFFECT_SIGNS, Page, address, heading, html, icon_button, scroll_region, tag
+from plushsense.studio.app.shell import (
+    AFFECT_SIGNS,
+    Page,
+    address,
+    button,
+    heading,
+    html,
+    icon_button,
+    scroll_region,
+    tag,
+)
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.review.review import Reviews
 from plushsense.studio.pages.train.results import (
@@ -24,10 +34,12 @@ from plushsense.studio.pages.train.results import (
     ResultRow,
     StoredResults,
     averaged_over,
+    counted,
     figure,
     score_labels,
     score_text,
 )
+from plushsense.studio.pages.train.verdict import figures, headline, limits
 from plushsense.studio.widgets.elements import table_html
 
 _CLICKS = '(e) => { const b = e.target.closest("[data-cell]"); if (b) emit(b.dataset.cell); }'
@@ -69,24 +81,42 @@ class ResultDetailsView:
                 icon_button("close", w("train.close"), self._close, color=None)
             if row.leaky:
                 ui.label(w("train.leaky_about"))
+            tag(ui.label(headline(w, row)).classes("text-bold"), "details-verdict")
+            for sentence in limits(w, row):
+                ui.label(sentence)
+            tag(ui.label(figures(w, row)).classes("ps-dim"), "details-figures")
             if row.kind == TRAINING:
                 self._training(d)
-            if d.by_gesture is None:
-                ui.label(w("train.confusion_none")).classes("ps-dim")
-            else:
+            if d.by_gesture is not None:
                 self._confusions(d)
+            elif d.later:
+                button("show-confusions", w("train.confusion_later"), self._compute, icon="grid_on")
+            else:
+                ui.label(w("train.confusion_none")).classes("ps-dim")
             if d.people:
                 self._people(d)
+
+    async def _compute(self) -> None:
+        """Compute the confusions of a training from the recordings of its validation people."""
+        d = self._details
+        if d is None:
+            return
+        self._page.say(self._words("train.confusion_computing"))
+        with self._page.show_errors():
+            found = await run.io_bound(self._results.with_predictions, d)
+            self._page.say("")
+            if found is not None and self._details is d:
+                self._details = found
+                self._draw()
 
     def _training(self, d: ResultDetails) -> None:
         w, facts = self._words, d.facts
         checked = sorted(set(facts.get("validation_subjects", [])) - {NOBODY, UNKNOWN_SUBJECT})
         text = w(
             "train.facts_training" if d.row.spread == HELD_BACK else "train.facts_same",
-            trained=len(set(facts.get("subjects", [])) - {NOBODY, UNKNOWN_SUBJECT}),
-            checked=len(checked),
+            trained=counted(w, "with_people", len(set(facts.get("subjects", [])) - {NOBODY, UNKNOWN_SUBJECT})),
+            checked=counted(w, "with_people", len(checked)),
             names=", ".join(checked) or "–",
-            message=facts.get("scores", {}).get("said", ""),
         )
         ui.label(text)
         with ui.row():
@@ -99,10 +129,14 @@ class ResultDetailsView:
         w = self._words
         heading(w("train.confusion"), 4)
         ui.label(w("train.confusion_about" if d.clickable else "train.confusion_kept")).classes("ps-dim")
+        if d.pooled is not None and d.row.rest is not None:
+            tag(ui.label(w("train.confusion_pooled", pooled=figure(w, d.pooled))).classes("ps-dim"), "pooled")
         choices = {"gesture": w("train.by_gesture"), "affect": w("train.by_affect")}
         radio = ui.radio(choices, value=self._by, on_change=self._group).props("inline")
         tag(radio, "by").props(f'aria-label="{w("train.confusion")}"')
-        box = tag(scroll_region(w("train.confusion")), "confusion")
+        self._worst = html().on("click", self._clicked, js_handler=_CLICKS)
+        tag(self._worst, "worst")
+        box = tag(scroll_region(w("train.confusion")).classes("ps-desk"), "confusion")
         with box.on("click", self._clicked, js_handler=_CLICKS):
             self._table = html()
         self._cell = tag(ui.column().classes("w-full").props('aria-live="polite"'), "cell")
@@ -123,7 +157,9 @@ class ResultDetailsView:
     def _tabulate(self) -> None:
         d, confusion = self._details, self._confusion()
         if d is not None and confusion is not None:
-            self._table.set_content(confusion_table(self._words, confusion, self._by == "affect", d.clickable))
+            affect = self._by == "affect"
+            self._table.set_content(confusion_table(self._words, confusion, affect, d.clickable))
+            self._worst.set_content(worst_table(self._words, confusion, affect, d.clickable))
 
     async def _clicked(self, event: Any) -> None:
         d, confusion = self._details, self._confusion()
@@ -181,27 +217,23 @@ class ResultDetailsView:
         if row.kind == EVALUATION and scores:
             text = w(
                 "train.spread",
-                accuracy=score_text(row.accuracy, row.accuracy_sd),
-                macro_f1=score_text(row.macro_f1, row.macro_f1_sd),
+                accuracy=score_text(w, row.accuracy, row.accuracy_sd),
+                macro_f1=score_text(w, row.macro_f1, row.macro_f1_sd),
                 over=averaged_over(w, row.spread, row.units),
-                low=figure(min(scores)),
-                high=figure(max(scores)),
+                low=figure(w, min(scores)),
+                high=figure(w, max(scores)),
             )
             tag(ui.label(text), "spread")
         head = [w(f"train.{k}") for k in ("person", "recordings", "windows", "accuracy", "macro_f1", "by_recording")]
         keys = ("accuracy", "macro_f1", "by_recording_accuracy")
-        cells = [(p["subject"], p["recordings"], p["windows"], *(figure(p[key]) for key in keys)) for p in d.people]
+        cells = [(p["subject"], p["recordings"], p["windows"], *(figure(w, p[key]) for key in keys)) for p in d.people]
         with scroll_region(w("train.people")):
             tag(html(table_html(head, cells, numbers=range(1, 6), row_heads=True)), "people")
 
 
 def confusion_table(w: Words, confusion: Confusion, by_affect: bool, clickable: bool) -> Markup:
     """Render a confusion matrix as a table of counts and of percentages of each row."""
-
-    def name(label: str) -> str:
-        return f"{AFFECT_SIGNS[label]} {w.affect(label)}" if by_affect else w.gesture(label)
-
-    names = [name(label) for label in confusion.labels]
+    names = _names(w, confusion, by_affect)
     column = Markup('<th scope="col" class="{}">{}</th>')
     head = Markup("").join(column.format("" if by_affect else "c", n) for n in names)
     rows = []
@@ -226,6 +258,34 @@ def confusion_table(w: Words, confusion: Confusion, by_affect: bool, clickable: 
         '<table class="ps-table ps-confusion"><thead><tr><th scope="col">{}</th>{}</tr></thead>'
         "<tbody>{}</tbody></table>"
     ).format(corner, head, Markup("").join(rows))
+
+
+# Number of confusions that are listed before the matrix, which a phone does not show.
+_WORST = 6
+
+
+def worst_table(w: Words, confusion: Confusion, by_affect: bool, clickable: bool) -> Markup:
+    """Render the most frequent confusions, those with the largest share of their gesture first."""
+    names = _names(w, confusion, by_affect)
+    found = []
+    for i, counts in enumerate(confusion.counts):
+        found += [(n / sum(counts), n, i, j) for j, n in enumerate(counts) if n and i != j]
+    rows = []
+    for share, n, i, j in sorted(found, key=lambda one: (-one[0], one[2:]))[:_WORST]:
+        text = w("train.worst", truth=names[i], predicted=names[j])
+        if clickable:
+            button = Markup('<button data-cell="{},{}">{}</button>')
+            text = button.format(i, j, text)
+        rows.append((text, f"{n}", f"{100 * share:.0f} %"))
+    head = [w("train.worst_title"), w("train.windows"), w("train.worst_share")]
+    return table_html(head, rows, numbers=(1, 2)) if rows else Markup("")
+
+
+def _names(w: Words, confusion: Confusion, by_affect: bool) -> list[str]:
+    """Return the texts of the labels of a confusion matrix."""
+    if by_affect:
+        return [f"{AFFECT_SIGNS[label]} {w.affect(label)}" for label in confusion.labels]
+    return [w.gesture(label) for label in confusion.labels]
 
 
 def _recordings(w: Words, dataset: str, rows: Sequence[MisreadRecording]) -> Markup:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -26,17 +26,28 @@ from plushsense.trials.tables import SUMMARY as SWEEP
 from plushsense.trials.tables import TRIALS_CSV
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.preparation import WHOLE_PEOPLE
-from plushsense.workflow.reporting import PREDICTIONS, SCORES
+from plushsense.workflow.reporting import LEARNING, PREDICTIONS, SCORES, load_evaluation
 
 
-def figure(value: float | None) -> str:
+def figure(words: Words, value: float | None) -> str:
     """Format a score with three decimal places, or as a dash if it is None."""
-    return "–" if value is None else f"{value:z.3f}"
+    return "–" if value is None else words.number(value, 3)
 
 
-def score_text(mean: float | None, sd: float | None) -> str:
+def score_text(words: Words, mean: float | None, sd: float | None) -> str:
     """Format a mean and standard deviation, as in ``0.573 ± 0.120``."""
-    return figure(mean) if mean is None or sd is None else f"{mean:z.3f} ± {sd:.3f}"
+    return figure(words, mean) + ("" if mean is None or sd is None else f" ± {figure(words, sd)}")
+
+
+def whole(words: Words, n: int) -> str:
+    """Format a whole number with groups of three digits."""
+    return f"{n:,}" if words("shell.decimal_point") == "." else f"{n:,}".replace(",", "\u00a0")
+
+
+def counted(words: Words, kind: str, n: int) -> str:
+    """Return a number with its noun in the right form, such as 5 folds, or 21 cilvēks."""
+    one = n % 10 == 1 and n % 100 != 11 if words.language == "lv" else n == 1
+    return words(f"train.count.{kind}{'_one' if one else ''}", n=n)
 
 
 def duration_text(words: Words, seconds: float) -> str:
@@ -58,11 +69,12 @@ def score_labels(words: Words, leaky: bool, simulated: bool) -> Markup:
 
 def averaged_over(words: Words, kind: str, units: int) -> str:
     """Describe over what a mean was computed, such as 5 folds."""
-    return words(f"train.over.{kind}{'_one' if units == 1 else ''}", n=units)
+    return words(f"train.over.{kind}", n=counted(words, _UNITS[kind], units))
 
 
 EVALUATION, TRIAL, TRAINING = "evaluation", "trial", "training"
 SUBJECTS, FOLDS, TRAININGS, HELD_BACK = "subjects", "folds", "trainings", "held_back"
+_UNITS = {SUBJECTS: "people", FOLDS: "folds", TRAININGS: "trainings", HELD_BACK: "people"}
 _HASH = 6
 
 
@@ -79,6 +91,10 @@ class ResultRow:
             (folds times seeds), or for a single training the people `HELD_BACK`.
         macs: number of multiply-accumulate operations per decision, every 50 ms.
         when_s: time of the result, in seconds since 1970.
+        classes: number of gestures that the network tells apart.
+        interval: 95 % interval of the mean accuracy.
+        people: accuracy of each person of an evaluation; ``rest`` is that of recordings at rest, scored apart.
+        learning: see `plushsense.trials.budget.learning_curve`.
         apart: further values that are equal in comparable results: hash of the data set, classes, held-back people.
     """
 
@@ -105,11 +121,16 @@ class ResultRow:
     macs: int
     when_s: float
     apart: tuple[str, ...] = ()
+    classes: int = 0
+    interval: tuple[float, float] | None = None
+    people: tuple[tuple[str, float | None], ...] = ()
+    rest: float | None = None
+    learning: dict[str, Any] | None = None
 
 
 def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
     """Read the result in the scores file ``path`` of an evaluation, as a list of one row."""
-    table = read_json(path)
+    table = load_evaluation(path)
     model, config = table["model"], table["config"]
     training = config["training"]
     context = table["context"]
@@ -141,6 +162,11 @@ def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
             model["macs_per_step"],
             path.stat().st_mtime,
             (str(table["dataset"]["hash"])[:_HASH], *(str(one["label"]) for one in table["per_class"])),
+            len(table["per_class"]),
+            None if table["accuracy"]["ci95"] is None else tuple(table["accuracy"]["ci95"]),
+            tuple((one["subject"], one["accuracy"]) for one in table["subjects"]),
+            (table["nobody"] or {}).get("accuracy"),
+            table["learning"],
         )
     ]
 
@@ -181,6 +207,7 @@ def of_trials(path: Path, dataset: Any) -> list[ResultRow]:
                     int(trial["macs_per_step"]),
                     when,
                     apart,
+                    len(table["labels"]),
                 )
             )
     return rows
@@ -224,6 +251,8 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
             arch.macs_per_step,
             path.stat().st_mtime,
             (str(origin.get("dataset_hash", ""))[:_HASH], *bundle.gestures.labels, *held_back),
+            len(bundle.gestures),
+            rest=(scores.get("nobody") or {}).get("accuracy"),
         )
     ]
 
@@ -239,7 +268,8 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as cause:
-        raise BadInput(f"'{path}' cannot be read ({cause}): compute this result again.") from None
+        message = f"'{path}' cannot be read ({cause}): compute this result again."
+        raise BadInput(message, reason="result_unreadable", name=path.parent.name) from None
 
 
 def _number(text: str) -> float | None:
@@ -258,7 +288,11 @@ class Confusion(NamedTuple):
 
 @dataclass(frozen=True)
 class ResultDetails:
-    """Details of a result. ``clickable`` is true if the prediction for each window is stored."""
+    """Details of a result.
+
+    ``clickable`` is true if the prediction for each window is known, so that the recordings of a cell can be listed;
+    ``later`` if it can be computed from the recordings (see `StoredResults.with_predictions`).
+    """
 
     row: ResultRow
     by_gesture: Confusion | None = None
@@ -266,6 +300,8 @@ class ResultDetails:
     affects: dict[str, str | None] = field(default_factory=dict)
     people: tuple[dict[str, Any], ...] = ()
     clickable: bool = False
+    later: bool = False
+    pooled: float | None = None
     facts: dict[str, Any] = field(default_factory=dict)
 
 
@@ -316,10 +352,15 @@ class StoredResults:
 
     def row(self, identity: str) -> ResultRow:
         """Return the result with this id; raise BadInput if there is none."""
-        for row in self._rows():
-            if row.id == identity:
-                return row
-        raise BadInput("This result does not exist any more: its folder was moved or deleted.")
+        found = self.find(identity)
+        if found is not None:
+            return found
+        message = "This result does not exist any more: its folder was moved or deleted."
+        raise BadInput(message, reason="result_gone")
+
+    def find(self, identity: str) -> ResultRow | None:
+        """Return the result with this id, or None."""
+        return next((row for row in self._rows() if row.id == identity), None)
 
     def details(self, row: ResultRow) -> ResultDetails:
         """Read the details of a result; raise PlushSenseError if its files cannot be read."""
@@ -333,7 +374,8 @@ class StoredResults:
                 affects,
                 tuple(table["subjects"]),
                 (row.path / PREDICTIONS).is_file(),
-                {"code_version": table["code_version"], "hash": table["dataset"]["hash"]},
+                facts={"code_version": table["code_version"], "hash": table["dataset"]["hash"]},
+                pooled=table["pooled"]["accuracy"],
             )
         if row.kind == TRIAL:
             table = read_json(row.path / SWEEP)
@@ -342,10 +384,40 @@ class StoredResults:
             if counts is None:
                 return ResultDetails(row, affects=affects)
             by_gesture = _confusion({"labels": table["labels"], "counts": counts})
-            return ResultDetails(row, by_gesture, sum_by_affect(by_gesture, affects), affects)
+            stored = table.get("predicted") == row.trial and (row.path / PREDICTIONS).is_file()
+            return ResultDetails(row, by_gesture, sum_by_affect(by_gesture, affects), affects, clickable=stored)
         bundle = Bundle.load(row.path)
         affects = {g.label: g.affect for g in bundle.gestures.gestures}
-        return ResultDetails(row, affects=affects, facts={**bundle.provenance, "fitted": bundle.decision.get("fitted")})
+        facts = {**bundle.provenance, "fitted": bundle.decision.get("fitted")}
+        later = bool(row.dataset) and row.spread == HELD_BACK
+        return ResultDetails(row, affects=affects, facts=facts, later=later)
+
+    def with_predictions(self, details: ResultDetails) -> ResultDetails:
+        """Return the details of a training with the confusions of its validation people.
+
+        Raises:
+            PlushSenseError: as `plushsense.workflow.api.validation_predictions`.
+        """
+        predictions = self._predictions(details.row)
+        counts = metrics.confusion(predictions.truth, predictions.predicted, len(predictions.labels))
+        by_gesture = _confusion({"labels": predictions.labels, "counts": counts.tolist()})
+        by_affect = sum_by_affect(by_gesture, details.affects)
+        return replace(details, by_gesture=by_gesture, by_affect=by_affect, clickable=True, later=False)
+
+    def _predictions(self, row: ResultRow) -> Predictions:
+        if row.kind == TRAINING:
+            dataset = Path(row.dataset)
+            key, stamp = ("validation", row.path), file_stamps(row.path, dataset / HEAD, dataset / "recordings.csv")
+            cached = self._read.get(key)
+            if cached is None or cached[0] != stamp:
+                from plushsense.workflow.api import validation_predictions
+
+                cached = self._read[key] = (stamp, validation_predictions(Bundle.load(row.path), dataset))
+            predictions: Predictions = cached[1]
+            return predictions
+        stored = self._once(row.path / PREDICTIONS, lambda path, _: read_predictions(path), None, refuse=True)
+        assert stored is not None
+        return stored
 
     def misread(self, row: ResultRow, truth: Sequence[str], predicted: Sequence[str]) -> list[MisreadRecording]:
         """Return the recordings with windows of ``truth`` classified as ``predicted``, most windows first.
@@ -353,9 +425,7 @@ class StoredResults:
         Raises:
             MissingExtraError: if polars is not installed. BadInput: if the predictions are missing.
         """
-        predictions = self._once(row.path / PREDICTIONS, lambda path, _: read_predictions(path), None, refuse=True)
-        assert predictions is not None
-        return recordings_of_cell(predictions, truth, predicted)
+        return recordings_of_cell(self._predictions(row), truth, predicted)
 
     def facts(self, dataset: Path) -> DatasetCounts:
         """Return the counts of a data set, cached until its files change.
@@ -382,7 +452,8 @@ class StoredResults:
 
     def _once(self, path: Path, read: Callable[[Path, Any], T], more: Any, refuse: bool = False) -> T | None:
         """Return ``read(path, more)``, cached until the file changes; return None on errors unless ``refuse``."""
-        key, stamp = (read.__name__, path), (file_stamps(path), repr(more))
+        # A learning curve is written after its evaluation.
+        key, stamp = (read.__name__, path), (file_stamps(path, path.with_name(LEARNING)), repr(more))
         cached = self._read.get(key)
         if cached is None or cached[0] != stamp:
             try:

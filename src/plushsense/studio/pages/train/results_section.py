@@ -25,6 +25,7 @@ from plushsense.studio.pages.train.results import (
     averaged_over,
     score_labels,
     score_text,
+    whole,
 )
 from plushsense.studio.widgets.elements import table_html
 
@@ -146,7 +147,8 @@ class ResultsSection:
         if len(rows) > _MAX_ROWS and not self._all:
             more = Markup('<p><button data-do="all">{}</button></p>').format(w("train.all_rows", n=len(rows)))
         return Markup(
-            '<table class="ps-table"><caption>{}</caption><thead><tr>{}</tr></thead><tbody>{}</tbody></table>{}'
+            '<table class="ps-table ps-stacked"><caption>{}</caption><thead><tr>{}</tr></thead>'
+            "<tbody>{}</tbody></table>{}"
         ).format(w("train.table"), Markup("").join(head), body, more)
 
     def _as_row(self, row: ResultRow) -> Markup:
@@ -160,15 +162,17 @@ class ResultsSection:
             "context": row.context,
             "seeds": row.seeds,
             "over": averaged_over(w, row.spread, row.units),
-            "accuracy": score_text(row.accuracy, row.accuracy_sd),
-            "macro_f1": score_text(row.macro_f1, row.macro_f1_sd),
-            "parameters": f"{row.parameters:,}",
-            "macs": f"{row.macs:,}",
+            "accuracy": score_text(w, row.accuracy, row.accuracy_sd),
+            "macro_f1": score_text(w, row.macro_f1, row.macro_f1_sd),
+            "parameters": whole(w, row.parameters),
+            "macs": whole(w, row.macs),
             "when": Markup(time.strftime('<span class="ps-nowrap">%Y-%m-%d</span> %H:%M', time.localtime(row.when_s))),
         }
         name = row.path.stem if row.kind == TRAINING else row.network
         columns = Markup("").join(
-            Markup('<td class="{}" data-column="{}">{}</td>').format("ps-number" if key in _NUMBERS else "", key, text)
+            Markup('<td class="{}" data-column="{}" data-label="{}">{}</td>').format(
+                "ps-number" if key in _NUMBERS else "", key, w(f"train.columns.{key}"), text
+            )
             for key, text in cells.items()
         )
         chosen = ' aria-selected="true"' if row.id == self._open else ""
@@ -210,9 +214,7 @@ class ResultsSection:
             labels.set_content(score_labels(w, group[0].leaky, group[0].simulated))
             named(plot, w("train.pareto_drawn", n=len(group)))
             plot.options.clear()
-            plot.options.update(
-                pareto_options(group, x=w("train.pareto_x"), y=w("train.pareto_y"), leaky=w("train.leaky"))
-            )
+            plot.options.update(pareto_options(w, group))
             plot.update()
             table.set_content(pareto_table(w, group))
 
@@ -269,14 +271,13 @@ def pareto_rows(rows: Sequence[ResultRow]) -> list[ResultRow]:
     return sorted((row for row, best in zip(scored, on_front, strict=True) if best), key=lambda row: row.parameters)
 
 
-def pareto_options(rows: Sequence[ResultRow], *, x: str, y: str, leaky: str) -> dict[str, Any]:
+def pareto_options(w: Words, rows: Sequence[ResultRow]) -> dict[str, Any]:
     """Return the options of an ECharts plot of macro-F1 against parameters, for the SVG renderer.
+
+    Leaky results are drawn as hollow diamonds and have the word in their labels.
 
     Args:
         rows: results that have a macro-F1.
-        x: title of the logarithmic axis of parameters.
-        y: title of the axis of macro-F1.
-        leaky: word added to the labels of leaky results, which are drawn as hollow diamonds.
     """
     front = pareto_rows(rows)
     ids = {row.id for row in front}
@@ -286,7 +287,7 @@ def pareto_options(rows: Sequence[ResultRow], *, x: str, y: str, leaky: str) -> 
         if row.macro_f1_sd is not None:
             score = row.macro_f1 or 0.0
             bars += [[row.parameters, score - row.macro_f1_sd], [row.parameters, score + row.macro_f1_sd], [None, None]]
-    points = [_point(row, row.id in ids, leaky, math.sqrt(low_x * high_x)) for row in rows]
+    points = [_point(w, row, row.id in ids, math.sqrt(low_x * high_x)) for row in rows]
     line = {"type": "line", "showSymbol": False, "silent": True, "emphasis": {"disabled": True}}
     return {
         "animation": False,
@@ -299,13 +300,16 @@ def pareto_options(rows: Sequence[ResultRow], *, x: str, y: str, leaky: str) -> 
             "max": high_x,
             "axisLabel": {"customValues": _ticks(low_x, high_x), ":formatter": _SHORT, "color": _INK},
             "axisTick": {"customValues": _ticks(low_x, high_x)},
-            **_axis(x, 32),
+            **_axis(w("train.pareto_x"), 32),
         },
         "yAxis": {
             "type": "value",
             "scale": True,
-            "axisLabel": {":formatter": "(v) => v.toFixed(2)", "color": _INK},
-            **_axis(y, 48),
+            "axisLabel": {
+                ":formatter": f"(v) => v.toFixed(2).replace('.', '{w('shell.decimal_point')}')",
+                "color": _INK,
+            },
+            **_axis(w("train.pareto_y"), 48),
         },
         "series": [
             {**line, "data": bars, "lineStyle": {"color": _DIM, "width": 1.5}},
@@ -328,8 +332,8 @@ def pareto_table(w: Words, rows: Sequence[ResultRow]) -> Markup:
         (
             row.network,
             f"{row.schedule} ({w('train.leaky')})" if row.leaky else row.schedule,
-            f"{row.parameters:,}",
-            score_text(row.macro_f1, row.macro_f1_sd),
+            whole(w, row.parameters),
+            score_text(w, row.macro_f1, row.macro_f1_sd),
             "✓" if row.id in ids else "–",
         )
         for row in sorted(rows, key=lambda row: row.parameters)
@@ -337,14 +341,15 @@ def pareto_table(w: Words, rows: Sequence[ResultRow]) -> Markup:
     return table_html([*head, w("train.pareto_front")], cells, numbers=(2, 3))
 
 
+_SCORE = "(v) => v.toFixed(2).replace('.', '%s')"
 _SHORT = "(v) => v >= 1000 ? `${v / 1000}k` : `${v}`"
 
 
-def _point(row: ResultRow, front: bool, leaky: str, middle: float) -> dict[str, Any]:
+def _point(w: Words, row: ResultRow, front: bool, middle: float) -> dict[str, Any]:
     name = f"{row.network.rpartition(' ')[0]}, {row.schedule.partition(', ')[2]}"
     if row.leaky:
-        name = f"{name} ({leaky})"
-    text = f"{name}: {row.parameters:,}, {score_text(row.macro_f1, row.macro_f1_sd)}"
+        name = f"{name} ({w('train.leaky')})"
+    text = f"{name}: {whole(w, row.parameters)}, {score_text(w, row.macro_f1, row.macro_f1_sd)}"
     hollow = {"color": _BACKGROUND, "borderColor": _FRONT, "borderWidth": 2.5}
     return {
         "name": name,

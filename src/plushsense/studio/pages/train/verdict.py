@@ -1,0 +1,106 @@
+"""Say in plain words how good a result is: touches of ten, beside guessing, with its uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from markupsafe import Markup
+
+from plushsense.studio.app.words import Words
+from plushsense.studio.pages.train.results import (
+    EVALUATION,
+    HELD_BACK,
+    SUBJECTS,
+    TRAINING,
+    TRIAL,
+    ResultRow,
+    averaged_over,
+    counted,
+    figure,
+    score_text,
+)
+from plushsense.studio.widgets.elements import table_html
+
+FEW_PEOPLE = 10
+"""With fewer people than this, a score may be far from that of others."""
+
+
+def of_ten(w: Words, share: float) -> str:
+    """Format a share as a number of ten: whole from 1 on, with one decimal place below."""
+    return w.number(10 * share, 0 if 10 * share >= 0.95 else 1)
+
+
+def headline(w: Words, row: ResultRow) -> str:
+    """Return the main sentence on a result."""
+    if row.accuracy is None or not row.classes:
+        return w("train.verdict.none")
+    kind = "leaky" if row.leaky else "new" if _is_apart(row) else "known"
+    return w(f"train.verdict.{kind}", right=of_ten(w, row.accuracy), chance=of_ten(w, 1 / row.classes))
+
+
+def limits(w: Words, row: ResultRow) -> list[str]:
+    """Return the sentences on how sure the main sentence is."""
+    found: list[str] = []
+    if row.leaky or row.accuracy is None:
+        return found
+    people = row.units if row.spread in (SUBJECTS, HELD_BACK) else 0
+    if row.interval is not None and row.spread == SUBJECTS:
+        low, high = (w.number(10 * max(0.0, edge), 1) for edge in row.interval)
+        found.append(w("train.verdict.interval", people=counted(w, "people", people), low=low, high=high))
+    if 0 < people < FEW_PEOPLE:
+        found.append(w("train.verdict.few", people=counted(w, "people", people)))
+    if row.kind == TRIAL:
+        found.append(w("train.verdict.chosen"))
+    if row.kind == TRAINING:
+        found.append(w("train.verdict.training"))
+    if row.kind == EVALUATION and _is_apart(row):
+        found.append(_more_people(w, row.learning))
+    return found
+
+
+def _is_apart(row: ResultRow) -> bool:
+    """Return whether nobody in the test was trained on."""
+    return row.split.startswith(("leave-one-subject-out", "by-subject", "validation-subjects"))
+
+
+def _more_people(w: Words, learning: Mapping[str, Any] | None) -> str:
+    """Return what more people to train on would add, with its uncertainty, or that it was not measured."""
+    if learning is None or learning.get("ci95") is None:
+        return w("train.verdict.not_measured")
+    low, high = learning["ci95"]
+    values = {
+        "people": counted(w, "more_people", learning["more"]),
+        "low": w.number(10 * low, 1),
+        "high": w.number(10 * high, 1),
+    }
+    if low <= 0:
+        return w("train.verdict.more_unsure", **values)
+    return w("train.verdict.more", gain=w.number(10 * learning["gain"], 1), **values)
+
+
+def figures(w: Words, row: ResultRow) -> str:
+    """Return the exact figures of a result, and how they are counted."""
+    text = w(
+        "train.figures",
+        accuracy=score_text(w, row.accuracy, row.accuracy_sd),
+        macro_f1=score_text(w, row.macro_f1, row.macro_f1_sd),
+        over=averaged_over(w, row.spread, row.units),
+    )
+    if row.rest is not None:
+        text += " " + w("train.at_rest", accuracy=figure(w, row.rest))
+    return text
+
+
+def people_table(w: Words, row: ResultRow) -> Markup:
+    """Render the accuracy of each person with a bar, and the mean, which is the accuracy of the result."""
+    bar = Markup('<span class="ps-share" aria-hidden="true"><i style="width: {:.0f}%"></i></span>')
+
+    def line(name: str, value: float | None) -> tuple[Any, ...]:
+        return (name, figure(w, value), bar.format(100 * (value or 0.0)))
+
+    rows = [line(name, value) for name, value in row.people]
+    if row.spread == SUBJECTS:
+        rows.append(line(w("train.mean"), row.accuracy))
+    rows.append(line(w("train.guessing"), 1 / row.classes if row.classes else None))
+    return table_html([w("train.person"), w("train.accuracy"), ""], rows, numbers=(1,), row_heads=True)

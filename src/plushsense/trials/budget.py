@@ -1,0 +1,359 @@
+"""Train a network for live use and evaluate it on people left out, in about a given time.
+
+The speed of the computer is measured first; from it follow the number of epochs, the number of groups in which people
+are left out, and whether a learning curve is measured: how the score grows with the number of people to train on. What
+does not fit into the time is cut, and the result names it. The network is saved before it is evaluated, and finished
+folds are stored, so that an interrupted run can be resumed.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from plushsense.core.errors import PlushSenseError
+from plushsense.core.files import write_file
+from plushsense.core.gestures import NOBODY
+from plushsense.dataset.index import as_dataset
+from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
+from plushsense.jobs.journal import job_id
+from plushsense.jobs.progress import JobProgress
+from plushsense.models.bundle import Bundle
+from plushsense.scoring.metrics import summary
+from plushsense.trials.estimate import preview_evaluation
+from plushsense.windows.cut import ANYWHERE
+from plushsense.workflow.api import evaluate, train, unfinished
+from plushsense.workflow.config import RunConfig, from_settings
+from plushsense.workflow.preparation import Warn, silent
+from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, evaluation_id, journal_of, name_of, write_report
+
+TRAINING, EVALUATING, LEARNING_CURVE = "training", "evaluating", "learning"
+MORE_PEOPLE = 2
+_KNOWN_PEOPLE = "by-recording:5"
+_FEWEST_FOLDS, _FOLDS = 3, (10, 5)
+_FEWEST_EPOCHS = 10
+# One to test, one to validate, one to train on.
+_PEOPLE_FOR_SPLIT = 3
+_PEOPLE_FOR_CURVE = 4
+_CURVE_SHARES = (1 / 3, 2 / 3)
+# Share of the time that a plan may use, because the computer may be busier later.
+_USED = 0.85
+
+
+@dataclass(frozen=True)
+class TrainingCost:
+    """What trainings cost on this computer.
+
+    Attributes:
+        window_epoch_s: seconds to train on one window for one epoch.
+        windows: number of windows of all people.
+        side_by_side: number of folds that are trained at the same time.
+        networks: 2 if a first network finds hard negatives for the final one, else 1.
+    """
+
+    window_epoch_s: float
+    windows: int
+    side_by_side: int = 1
+    networks: int = 1
+
+    def training_s(self, epochs: int) -> float:
+        """Return the seconds to train the final network."""
+        return self.window_epoch_s * self.windows * epochs * self.networks
+
+    def evaluation_s(self, epochs: int, folds: int, share: float = 1.0) -> float:
+        """Return the seconds to train on a ``share`` of the people in each of ``folds``."""
+        part = self.windows * (1 - 1 / folds) * share
+        return self.window_epoch_s * part * epochs * math.ceil(folds / min(self.side_by_side, folds))
+
+
+@dataclass(frozen=True)
+class BudgetPlan:
+    """What is done: ``epochs`` of ``usual_epochs``, the ``split`` into ``folds``, and the sizes of the learning curve.
+
+    ``sizes`` are numbers of people to train on, without that of the evaluation itself; none if nothing is measured.
+    """
+
+    epochs: int
+    usual_epochs: int
+    split: str
+    folds: int
+    people: int
+    sizes: tuple[int, ...] = ()
+
+    @property
+    def trained_people(self) -> int:
+        """Number of people that a fold of the evaluation is trained on; the smallest of all folds."""
+        return self.people - math.ceil(self.people / self.folds)
+
+
+def choose_plan(cost: TrainingCost, people: int, usual_epochs: int, seconds: float) -> BudgetPlan:
+    """Choose the most informative plan that takes at most ``seconds``.
+
+    Preferred are more folds, each person alone first, but a learning curve comes before more than 5 folds. If not even
+    3 folds fit, the trainings are shortened to 10 epochs or more, which may still take longer than ``seconds``.
+    """
+    if people < _PEOPLE_FOR_SPLIT:
+        return _shortened(cost, BudgetPlan(usual_epochs, usual_epochs, _KNOWN_PEOPLE, 5, people), seconds)
+    folds = [people, *(k for k in _FOLDS if k < people)]
+    plans = [_of_folds(usual_epochs, people, k) for k in folds]
+    plans = [replace(p, sizes=curve_sizes(p.trained_people)) for p in plans]
+    least = _of_folds(usual_epochs, people, min(_FEWEST_FOLDS, people))
+    for plan in (*plans, replace(plans[-1], sizes=()), least):
+        if plan_s(cost, plan) <= seconds:
+            return plan
+    return _shortened(cost, least, seconds)
+
+
+def _of_folds(epochs: int, people: int, folds: int) -> BudgetPlan:
+    split = "leave-one-subject-out" if folds == people else f"by-subject:{folds}"
+    return BudgetPlan(epochs, epochs, split, folds, people)
+
+
+def _shortened(cost: TrainingCost, plan: BudgetPlan, seconds: float) -> BudgetPlan:
+    epochs = int(plan.usual_epochs * seconds / plan_s(cost, plan))
+    return replace(plan, epochs=min(plan.usual_epochs, max(_FEWEST_EPOCHS, epochs)))
+
+
+def curve_sizes(people: int) -> tuple[int, ...]:
+    """Return the numbers of training people at which the learning curve of a fold with ``people`` is measured."""
+    if people < _PEOPLE_FOR_CURVE - 1:
+        return ()
+    return tuple(sorted({max(1, round(share * people)) for share in _CURVE_SHARES} - {people}))
+
+
+def plan_s(cost: TrainingCost, plan: BudgetPlan) -> float:
+    """Estimate the seconds that a plan takes."""
+    shares = [1.0, *(size / plan.trained_people for size in plan.sizes)]
+    return cost.training_s(plan.epochs) + sum(cost.evaluation_s(plan.epochs, plan.folds, s) for s in shares)
+
+
+def learning_curve(points: Mapping[int, Mapping[str, float | None]], more: int = MORE_PEOPLE) -> dict[str, Any] | None:
+    """Estimate from a learning curve what ``more`` people to train on would add to the accuracy.
+
+    For each person, a line is fitted to the accuracy over the logarithm of the number of training people. The gain is
+    the mean slope, times the step of the logarithm; its 95 % interval is a bootstrap over the people.
+
+    Args:
+        points: accuracy of each person, by the number of people that were trained on.
+
+    Returns:
+        ``points`` (people, accuracy: mean), ``more``, ``gain`` and ``ci95``; None with fewer than two sizes or three
+        people, from which no uncertainty follows.
+    """
+    sizes = sorted(points)
+    people = [p for p in points[sizes[-1]] if all(points[m].get(p) is not None for m in sizes)] if sizes else []
+    if len(sizes) < 2 or len(people) < 3:
+        return None
+    x = np.log(np.array(sizes, dtype=np.float64))
+    table = np.array([[points[m][p] for m in sizes] for p in people], dtype=np.float64)
+    slopes = (table - table.mean(axis=1, keepdims=True)) @ (x - x.mean()) / ((x - x.mean()) ** 2).sum()
+    step = math.log((sizes[-1] + more) / sizes[-1])
+    gain = summary(slopes * step)
+    return {
+        "points": [{"people": m, "accuracy": float(table[:, k].mean())} for k, m in enumerate(sizes)],
+        "more": more,
+        "gain": gain["mean"],
+        "ci95": gain["ci95"],
+    }
+
+
+@dataclass(frozen=True)
+class BudgetProgress:
+    """Progress of `make_network`.
+
+    Attributes:
+        stage: `TRAINING`, `EVALUATING` or `LEARNING_CURVE`.
+        share: share of the planned work that is done.
+        row: epoch, epochs and figures of the epoch while training; done and folds afterwards.
+        bundle: path of the saved network; "" before it is saved.
+    """
+
+    stage: str
+    share: float
+    row: dict[str, Any]
+    bundle: str = ""
+
+
+Reporter = Callable[[BudgetProgress], None]
+
+
+def make_network(
+    dataset: Dataset | str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    budget_s: float,
+    config: RunConfig | None = None,
+    progress: Reporter = lambda at: None,
+    warn: Warn = silent,
+) -> dict[str, Any]:
+    """Train a network, save it as the bundle ``out``, and evaluate it on people left out, in about ``budget_s``.
+
+    By default it is trained for live use (context "anywhere") if the data set has sessions, and with the defaults of
+    the preset "people" otherwise. With fewer than three people, recordings are left out instead.
+
+    Returns:
+        ``bundle``; ``evaluation``, its folder; ``report``; ``plan``; ``learning`` (see `learning_curve`) or None;
+        ``cut``, a list of what did not fit into the budget (``epochs``, ``folds``, ``learning``, ``longer``);
+        ``seconds``.
+    """
+    began = time.monotonic()
+    dataset, out = as_dataset(dataset), Path(out)
+    check_folder(out.parent, "A bundle")
+    if config is None:
+        streams = any(recording.stream_row >= 0 for recording in dataset.used)
+        config = from_settings(context=ANYWHERE) if streams else from_settings()
+    networks = 2 if config.anywhere.hard_share and config.windows.context == ANYWHERE else 1
+    # A resumed run must not choose other folds because the computer is faster or slower than before.
+    journal = journal_of(dataset, "budgets")
+    key = job_id({"evaluation": evaluation_id(config, dataset), "out": out.name, "seconds": budget_s})
+    stored = journal.find(key)
+    cost = None
+    if stored is None:
+        cost = _measured(dataset, config, networks)
+        plan = choose_plan(cost, _count_people(dataset), config.training.epochs, _USED * budget_s)
+        journal.save(key, {"plan": asdict(plan), "bundle": ""})
+    else:
+        plan = BudgetPlan(**{**stored["plan"], "sizes": tuple(stored["plan"]["sizes"])})
+    config = _planned(config, plan)
+    whole = sum(_work(plan, networks))
+    bundle = out if stored is not None and _is_saved(stored["bundle"], out) else None
+    if bundle is None:
+        bundle, training_s = _train(dataset, config, out, whole, networks, progress, warn)
+        if cost is not None:
+            plan = _adjusted(plan, cost, training_s, _USED * budget_s - (time.monotonic() - began))
+            config, whole = _planned(config, plan), sum(_work(plan, networks))
+        journal.save(key, {"plan": asdict(plan), "bundle": bundle.name})
+    evaluation = dataset.path / "evaluations" / name_of(config, dataset)
+    before = float(networks)
+    started = time.monotonic()
+    result = evaluate(
+        dataset,
+        config,
+        out=evaluation,
+        progress=_folds(EVALUATING, before, plan, 1.0, whole, bundle, progress),
+        warn=warn,
+    )
+    evaluation_s = time.monotonic() - started
+    before += plan.folds - 1
+    points = {plan.trained_people: _accuracies(result.table)}
+    for size in plan.sizes:
+        share = size / plan.trained_people
+        left_s = budget_s - (time.monotonic() - began)
+        if stored is None and share * evaluation_s > left_s:
+            break
+        reported = _folds(LEARNING_CURVE, before, plan, share, whole, bundle, progress)
+        points[size] = _accuracies(evaluate(dataset, config, training_people=size, progress=reported).table)
+        before += (plan.folds - 1) * share
+    learning = learning_curve(points)
+    if learning is not None:
+        with dataset.generation.writing():
+            write_file(evaluation / LEARNING, json.dumps(learning))
+    report = write_report(evaluation / PAGE, dataset, [evaluation])
+    journal.discard(key)
+    seconds = time.monotonic() - began
+    return {
+        "bundle": str(bundle),
+        "evaluation": str(evaluation),
+        "report": str(report),
+        "plan": asdict(plan),
+        "learning": learning,
+        "cut": _cut(plan, learning, seconds, budget_s),
+        "seconds": round(seconds, 1),
+    }
+
+
+def _count_people(dataset: Dataset) -> int:
+    return len({r.subject for r in dataset.used} - {NOBODY, UNKNOWN_SUBJECT})
+
+
+def _measured(dataset: Dataset, config: RunConfig, networks: int) -> TrainingCost:
+    split = "leave-one-subject-out" if _count_people(dataset) >= _PEOPLE_FOR_SPLIT else _KNOWN_PEOPLE
+    seen = preview_evaluation(dataset, _with_split(config, split))
+    return TrainingCost(seen["window_epoch_s"], seen["windows"], config.evaluation.processes, networks)
+
+
+def _with_split(config: RunConfig, split: str) -> RunConfig:
+    return replace(config, evaluation=replace(config.evaluation, split=split))
+
+
+def _planned(config: RunConfig, plan: BudgetPlan) -> RunConfig:
+    """Return the settings with the split and the epochs of the plan; the learning rate falls in the same proportion."""
+    training = config.training
+    if plan.epochs < plan.usual_epochs:
+        every = training.halve_every
+        shorter = None if every is None else max(1, round(every * plan.epochs / plan.usual_epochs))
+        training = replace(training, epochs=plan.epochs, halve_every=shorter)
+    return _with_split(replace(config, training=training), plan.split)
+
+
+def _adjusted(plan: BudgetPlan, cost: TrainingCost, training_s: float, left_s: float) -> BudgetPlan:
+    """Return the plan with fewer folds if the training took longer than estimated, and ``left_s`` is not enough."""
+    cost = replace(cost, window_epoch_s=max(cost.window_epoch_s, training_s / (cost.windows * plan.epochs)))
+    trained_s = cost.training_s(plan.epochs)
+    if plan_s(cost, plan) - trained_s <= left_s:
+        return plan
+    other = choose_plan(cost, plan.people, plan.epochs, left_s + trained_s)
+    return replace(other, epochs=plan.epochs, usual_epochs=plan.usual_epochs)
+
+
+def _is_saved(name: str, out: Path) -> bool:
+    if not name or not out.is_file():
+        return False
+    try:
+        Bundle.load(out)
+    except PlushSenseError:
+        return False
+    return True
+
+
+def _work(plan: BudgetPlan, networks: int) -> list[float]:
+    """Return the work of each step, in trainings on all people."""
+    evaluation = float(plan.folds - 1)
+    return [float(networks), evaluation, *(evaluation * size / plan.trained_people for size in plan.sizes)]
+
+
+def _train(
+    dataset: Dataset, config: RunConfig, out: Path, whole: float, networks: int, progress: Reporter, warn: Warn
+) -> tuple[Path, float]:
+    def epoch_done(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+        done = epoch / epochs + (networks - 1 if "what" not in row else 0)
+        progress(BudgetProgress(TRAINING, done / whole, row | {"epoch": epoch, "epochs": epochs}))
+
+    done = train(dataset, config, journal=unfinished(dataset), progress=epoch_done, warn=warn)
+    return done.save(out), done.seconds
+
+
+def _folds(
+    stage: str, before: float, plan: BudgetPlan, share: float, whole: float, bundle: Path, progress: Reporter
+) -> Callable[[JobProgress], None]:
+    def fold_done(at: JobProgress) -> None:
+        done = before + at.share * (plan.folds - 1) * share
+        progress(BudgetProgress(stage, done / whole, {"done": at.done, "folds": at.total}, str(bundle)))
+
+    return fold_done
+
+
+def _accuracies(table: Mapping[str, Any]) -> dict[str, float | None]:
+    return {row["subject"]: row["accuracy"] for row in table["subjects"]}
+
+
+def _cut(plan: BudgetPlan, learning: object, seconds: float, budget_s: float) -> list[dict[str, Any]]:
+    """Return what did not fit into the budget, as dictionaries with a ``kind``."""
+    cut: list[dict[str, Any]] = []
+    if plan.epochs < plan.usual_epochs:
+        cut.append({"kind": "epochs", "epochs": plan.epochs, "usual": plan.usual_epochs})
+    if plan.people != plan.folds and plan.people >= _PEOPLE_FOR_SPLIT:
+        cut.append({"kind": "folds", "folds": plan.folds, "people": plan.people})
+    if learning is None and plan.people >= _PEOPLE_FOR_CURVE:
+        cut.append({"kind": "learning"})
+    if seconds > budget_s:
+        cut.append({"kind": "longer", "minutes": math.ceil(seconds / 60), "budget": round(budget_s / 60)})
+    return cut
