@@ -50,7 +50,7 @@ class Words:
     def sentence(self, sentence: str | Mapping[str, Any]) -> str:
         """Return a `Sentence` of the library, or the table of its `to_dict`, in this language.
 
-        Any other text is quoted, with a remark that it is in English.
+        Any other text is quoted, with a remark that it is in English; "" stays "".
         """
         if isinstance(sentence, Sentence):
             sentence = sentence.to_dict()
@@ -58,7 +58,7 @@ class Words:
             sentence = {"message": sentence}
         text = self._texts.get(f"sentences.{sentence.get('reason')}")
         if not text:
-            return self._texts["sentences.note"].format(message=sentence["message"])
+            return self._texts["sentences.note"].format(message=sentence["message"]) if sentence["message"] else ""
         return text.format(**{key: self._value(key, value) for key, value in sentence["values"].items()})
 
     def _value(self, key: str, value: object) -> str:
