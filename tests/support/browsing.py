@@ -7,6 +7,7 @@ import functools
 import json
 import multiprocessing
 import os
+import re
 import shutil
 import signal
 import socket
@@ -220,6 +221,19 @@ def axe(page: Page) -> list[str]:
         if v["impact"] in ("serious", "critical")
         for node in v["nodes"]
     ]
+
+
+# Words that no Latvian sentence has.
+_ENGLISH = re.compile(r"\b(the|of|and|with|this|are|has|have|was|were|from|your|which|cannot|does|not|is|or)\b", re.I)
+
+
+def english(page: Page) -> list[str]:
+    """Return the lines of a page, and its labels for screen readers, that read as English."""
+    texts: list[str] = page.evaluate(
+        "() => [...document.body.innerText.split('\\n'), ...[...document.querySelectorAll('[aria-label], [placeholder], "
+        "[title]')].flatMap(e => ['aria-label', 'placeholder', 'title'].map(k => e.getAttribute(k) || ''))]"
+    )
+    return sorted({text for text in texts if _ENGLISH.search(text)})
 
 
 def marked(page: Page, name: str) -> Any:
