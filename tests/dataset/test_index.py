@@ -19,7 +19,7 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import change_head, open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.publishing.package import missing_statements
-from plushsense.dataset.store import Dataset, DatasetHead
+from plushsense.dataset.store import Dataset, DatasetHead, RecordingInfo, read_index
 from plushsense.recording.simulate import simulate
 
 ACCEL = load_layout("accel-3")
@@ -59,6 +59,16 @@ def test_a_new_a_changed_and_a_removed_raw_file_are_noticed(folder: Path) -> Non
         open_dataset(folder)
     (folder / "index.json").unlink()
     assert len(open_dataset(folder).recordings) == 2
+
+
+def test_an_index_without_the_recorded_gestures_is_of_an_earlier_version(folder: Path) -> None:
+    before = open_dataset(folder).recordings
+    path = folder / "recordings.csv"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    assert lines[0].endswith(",recorded")
+    path.write_text("\n".join(line.rpartition(",")[0] for line in lines) + "\n", encoding="utf-8")
+    assert read_index(path, RecordingInfo) == before
+    assert open_dataset(folder).recordings == before
 
 
 def test_an_emptied_index_is_made_anew(folder: Path) -> None:

@@ -20,7 +20,7 @@ import io
 import json
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -119,7 +119,8 @@ class _Row:
     @classmethod
     def from_text(cls, row: dict[str, str], where: str) -> Self:
         try:
-            return cls(**{f.name: _PARSERS[str(f.type)](row[f.name]) for f in fields(cls)})
+            known = (f for f in fields(cls) if f.name in row or f.default is MISSING)
+            return cls(**{f.name: _PARSERS[str(f.type)](row[f.name]) for f in known})
         except (KeyError, ValueError, TypeError) as cause:
             raise DatasetError(
                 f"The index '{where}' is damaged ({cause}): delete it, it is rebuilt from the recordings."
@@ -174,6 +175,11 @@ class RecordingInfo(_Row):
     flags: tuple[str, ...]
     sha256: str
     recorded: str = ""
+
+    def __post_init__(self) -> None:
+        # An index of an earlier version has no such column.
+        if not self.recorded:
+            object.__setattr__(self, "recorded", self.gesture)
 
 
 @dataclass(frozen=True)
