@@ -56,6 +56,15 @@ def test_pages_open_without_complaint(empty: str, look: Fixture, shots: Fixture)
         assert len(set(fonts)) <= 2, fonts
 
 
+def test_every_icon_is_drawn() -> None:
+    folder = Path(shell.__file__).parent
+    drawn = set(re.findall(r"(?m)^  ([a-z_]+): \[", (folder / "icons.js").read_text(encoding="utf-8")))
+    source = "\n".join(path.read_text(encoding="utf-8") for path in folder.parent.rglob("*.py"))
+    named = set(re.findall(r'(?:icon=|ui\.icon\(|icon_button\(\s*)"([a-z_]+)"', source))
+    assert len(named) > 20
+    assert named - drawn == set()
+
+
 def test_a_first_page_is_small(empty: str, look: Fixture) -> None:
     browser = look(own=True)
     page = browser.context.new_page()
