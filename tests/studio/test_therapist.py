@@ -1,0 +1,138 @@
+"""A therapist who sees the studio for the first time, in Latvian, finds the whole way by what the pages say: two virtual
+children are recorded (the studio is killed once, the page closed once), reviewed, read by a network of her own, watched
+live, and handed over as a package. No page shows English, or anything that axe-core objects to."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from zipfile import ZipFile
+
+from plushsense.devices.virtual.session import GESTURES
+from plushsense.studio.app.words import Words
+from support.browsing import axe, connected, english, marked
+from support.recording_pages import heard, showing
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+Fixture = Callable[..., Any]
+W = Words("lv")
+SPEED = 20
+NAME = "Viss pa reizei"
+KILLED, CLOSED = 5, 9
+
+
+class Therapist:
+    """What she does on a page: read, press what is written there, fill in fields."""
+
+    def __init__(self, page: Page, shots: Callable[[Page, str], None]) -> None:
+        self.page, self.shots, self.times = page, shots, dict[str, float]()
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Time a step, and look at the page at its end."""
+        began = time.monotonic()
+        yield
+        self.times[name] = round(time.monotonic() - began, 1)
+        self.look(name)
+
+    def look(self, name: str) -> None:
+        """Check that the page is in Latvian, has no finding of axe-core and does not scroll sideways."""
+        connected(self.page)
+        assert english(self.page) == [], name
+        assert axe(self.page) == [], name
+        assert self.page.evaluate("document.documentElement.scrollWidth <= innerWidth"), name
+        self.shots(self.page, f"therapist-{name}")
+
+    def press(self, text: str, exact: bool = True) -> None:
+        """Press the button, link or menu item with this text."""
+        name = re.compile(f"^{re.escape(text)}" + ("(:|$)" if exact else ""))
+        button = self.page.get_by_role("button", name=name)
+        (button.or_(self.page.get_by_role("link", name=name))).first.click()
+
+    def fill(self, label: str, text: str) -> None:
+        """Fill in the field with this label."""
+        self.page.get_by_label(label, exact=True).first.fill(text)
+
+    def choose(self, field: str, text: str) -> None:
+        """Choose in the list with this mark."""
+        marked(self.page, field).click()
+        self.page.get_by_role("option").filter(has_text=text).first.click()
+
+
+def record(t: Therapist, first: int, last: int) -> None:
+    """Record the steps from ``first`` to ``last`` with the space bar."""
+    heard(t.page)
+    for number in range(first, last):
+        showing(t.page, f"idle.{number}.")
+        t.page.keyboard.press("Space")
+        showing(t.page, f"recording.{number}.")
+        # About five seconds of the toy's time.
+        t.page.wait_for_timeout(250)
+        t.page.keyboard.press("Space")
+        showing(t.page, f"idle.{number + 1}.", "finished.")
+
+
+def test_a_therapist_can_do_it_alone(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:
+    server = studio("--speed", f"{SPEED}")
+    browser = look(language="lv", own=True)
+    t = Therapist(browser.open(server.url), shots)
+
+    with t.step("first child"):
+        t.press(W("home.next_record_button"))
+        t.page.wait_for_url("**/record")
+        connected(t.page)
+        t.page.get_by_text(W("record.own_protocol")).click()
+        for gesture in GESTURES:
+            t.page.get_by_role("checkbox", name=W.gesture(gesture), exact=True).click()
+        t.fill(W("record.own_repetitions"), "1")
+        t.fill(W("record.own_name"), NAME)
+        t.press(W("record.own_save"))
+        marked(t.page, "discard-protocol").wait_for()
+        t.fill(W("record.code"), "S01")
+        t.press(W("record.begin"))
+        marked(t.page, "state-box").wait_for()
+        record(t, 0, KILLED)
+        t.page.keyboard.press("Space")
+        showing(t.page, f"recording.{KILLED}.")
+        server.kill()
+        marked(t.page, "connection-lost").get_by_text(W("record.lost")[:20]).wait_for()
+        server.start()
+        t.page.get_by_role("button", name=re.compile(W("record.go_on"))).first.click()
+        marked(t.page, "state-box").wait_for()
+        connected(t.page)
+        record(t, KILLED, len(GESTURES))
+
+    with t.step("look at the recordings"):
+        t.press(W("record.collect"))
+        t.page.wait_for_url("**/review?dataset=**", timeout=120_000)
+        marked(t.page, "accept-sure").wait_for()
+
+    with t.step("second child"):
+        t.press(W("pages.home"))
+        t.choose("person", W("home.person", n=12))
+        t.press(W("home.choose_virtual"))
+        marked(t.page, "chosen").wait_for()
+        t.press(W("pages.record"))
+        connected(t.page)
+        t.fill(W("record.code"), "S02")
+        t.choose("protocol", NAME)
+        t.press(W("record.begin"))
+        marked(t.page, "state-box").wait_for()
+        record(t, 0, CLOSED)
+        t.page.close()
+        t.page = browser.open(server.url)
+        t.press(W("home.next_recording_button"))
+        marked(t.page, "state-box").wait_for()
+        connected(t.page)
+        record(t, CLOSED, len(GESTURES))
+        t.press(W("record.collect"))
+        t.page.wait_for_url("**/review?dataset=**", timeout=120_000)
+
+    print(json.dumps(t.times))
