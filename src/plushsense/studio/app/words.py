@@ -47,6 +47,10 @@ class Words:
         """Return the name of a gesture in this language, or ``label`` itself if it has none."""
         return self._texts.get(f"gestures.{label}", label)
 
+    def channel(self, name: str) -> str:
+        """Return the name of a sensor channel in this language, or ``name`` itself if it has none."""
+        return self._texts.get(f"channels.{name}", name)
+
     def sentence(self, sentence: str | Mapping[str, Any]) -> str:
         """Return a `Sentence` of the library, or the table of its `to_dict`, in this language.
 

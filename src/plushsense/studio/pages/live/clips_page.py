@@ -159,7 +159,7 @@ class _ClipEditor:
         words = page.words
         html(words("live.clip_title", clip=clip.key), "h2")
         ui.label(words("live.clip_about")).classes("ps-dim")
-        names = clip.layout.names
+        names = [words.channel(name) for name in clip.layout.names]
         series = [{"label": name, "stroke": LINES[i % len(LINES)]} for i, name in enumerate(names)]
         self._plot = Plot(
             words("live.clip_plot", clip=clip.key),

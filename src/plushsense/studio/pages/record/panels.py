@@ -66,7 +66,7 @@ class SignalPanel:
         with ui.row().classes("w-full items-start").style("gap: 8px"):
             for kind, indices in kinds.items():
                 title = words.get(f"record.kind_{kind}", kind)
-                names = [channels[n].name for n in indices]
+                names = [words.channel(channels[n].name) for n in indices]
                 label = words("record.live_label", s=f"{_WINDOW_S * speed:g}", channels=", ".join(names))
                 series = [{"label": name, "stroke": LINES[i % len(LINES)]} for i, name in enumerate(names)]
                 flex = "2 1 420px" if len(indices) > 5 else "1 1 260px"

@@ -135,7 +135,7 @@ class RecordingView:
             self.heading.set_text(words("review.none_fit"))
             return
         plotted = desk.review.signals(identity).curves(self.group, low, high)
-        series = curve_styles([self._kind(n) if n == ACTIVITY else n for n in plotted["names"]])
+        series = curve_styles([self._kind(n) if n == ACTIVITY else words.channel(n) for n in plotted["names"]])
         y_title = words("review.y_axis", unit=words.unit(plotted["unit"])) if plotted["unit"] else ""
         lanes = [(at, self._kind(kind)) for at, kind in plotted["lanes"]]
         self.plot.show(

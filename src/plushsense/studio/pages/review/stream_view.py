@@ -89,7 +89,7 @@ class StreamView:
                 self._about(signals),
                 plotted["x"],
                 plotted["curves"],
-                curve_styles(plotted["names"]),
+                curve_styles([words.channel(n) for n in plotted["names"]]),
                 x_title=words("review.stream_axis"),
                 y_title=words("review.y_axis", unit=words.unit(plotted["unit"])) if plotted["unit"] else "",
                 lanes=lanes,
