@@ -332,6 +332,7 @@ def test_a_tablet_comes_in_by_its_address_once(studio: Fixture, look: Fixture) -
     page = tablet.open(at)
     marked(page, "invite-new").click()
     address = marked(page, "invitation").input_value()
+    assert marked(page, "invitation-code").locator("svg path").count() > 0
     guest = second.open(f"{at}/?{urlsplit(address).query}")
     assert marked(guest, "title").inner_text() == "Home"
 

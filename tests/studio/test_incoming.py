@@ -166,5 +166,15 @@ def test_files_are_dropped_and_what_is_missing_is_asked_in_latvian(
     marked(page, "import").click()
     marked(page, "dataset").get_by_text("virtual toy", exact=True).wait_for()
     assert sorted(p.name for p in (tmp_path / "home" / DATASETS).iterdir())[1:] == ["virtual toy"]
+    # A large upload shows its progress, and can be cancelled.
+    session = page.context.new_cdp_session(page)
+    session.send("Network.enable")
+    slow = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": 100_000}
+    session.send("Network.emulateNetworkConditions", slow)
+    (tmp_path / "slow.zip").write_bytes(bytes(8_000_000))
+    drop(page, tmp_path / "slow.zip")
+    marked(page, "uploading").get_by_text("%").wait_for()
+    marked(page, "uploading").get_by_role("button").click()
+    marked(page, "message").get_by_text("Augšupielāde atcelta").wait_for()
     assert "(Angliski:)" not in page.locator("body").inner_text()
     assert browser.complaints == []

@@ -100,8 +100,8 @@ class DivergedError(TrainingError):
 class ToolError(PlushSenseError):
     """A compiler or emulator that is missing or fails."""
 
-    def __init__(self, message: str, output: str = "") -> None:
-        super().__init__(message)
+    def __init__(self, message: str, output: str = "", *, reason: str = "", **values: object) -> None:
+        super().__init__(message, reason=reason, **values)
         self.output = output
         """The tool's complete output."""
 
@@ -150,7 +150,6 @@ def need(module: str, extra: str) -> ModuleType:
             raise
         raise MissingExtraError(
             f"This needs the package '{top}', which is not installed: run  pip install 'plushsense[{extra}]'",
-            reason="not_installed",
+            reason="missing_package",
             package=top,
-            extra=extra,
         ) from error

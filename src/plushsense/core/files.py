@@ -109,7 +109,8 @@ def new_folder(dest: Path, error: type[BadInput], last: str = "") -> Iterator[Pa
             raise error(f"'{dest}' is a broken link: give a new or empty folder.")
         real = dest.resolve()
         if real.exists() and (not real.is_dir() or any(real.iterdir())):
-            raise error(f"'{dest}' already holds something: give a new or empty folder, nothing is overwritten.")
+            message = f"'{dest}' already holds something: give a new or empty folder, nothing is overwritten."
+            raise error(message, reason="name_exists", name=dest.name)
         real.parent.mkdir(parents=True, exist_ok=True)
         scratch = Path(tempfile.mkdtemp(prefix=unfinished(real), dir=real.parent))
         work = scratch / (real.name or "folder")

@@ -88,11 +88,14 @@ def read_facts(folder: str | Path) -> dict[str, Any]:
         needed = {"title", "channels", "classes", "memory_bytes", "model_bytes"} - set(facts)
     except (FileNotFoundError, NotADirectoryError):
         problem = f"'{folder}' is no export" if Path(folder).exists() else f"There is no export '{folder}'"
-        raise BadInput(f"{problem}: make one with plushsense export BUNDLE OUT.") from None
+        message = f"{problem}: make one with plushsense export BUNDLE OUT."
+        raise BadInput(message, reason="export_gone", name=Path(folder).name) from None
     except (OSError, ValueError, TypeError) as cause:
-        raise BadInput(f"'{path}' cannot be read ({cause}): export the model again.") from None
+        message = f"'{path}' cannot be read ({cause}): export the model again."
+        raise BadInput(message, reason="export_damaged", name=Path(folder).name) from None
     if needed:
-        raise BadInput(f"'{path}' lacks {', '.join(sorted(needed))}: export the model again.")
+        message = f"'{path}' lacks {', '.join(sorted(needed))}: export the model again."
+        raise BadInput(message, reason="export_damaged", name=Path(folder).name)
     return dict(facts)
 
 

@@ -435,7 +435,9 @@ def profile(
         packages = " ".join(dict.fromkeys(p for lacks in missing.values() for p in lacks))
         raise ToolError(
             "No emulator to count on is installed here: install Debian's "
-            f"{packages} (or some of them), or give --target host for sizes on this computer only."
+            f"{packages} (or some of them), or give --target host for sizes on this computer only.",
+            reason="no_emulator",
+            packages=packages,
         )
     costs = {}
     with tempfile.TemporaryDirectory(prefix="plushsense-profile-") as work:

@@ -123,12 +123,15 @@ def refuse_undeployable(arch: Arch) -> None:
     if arch.padding != "stream":
         raise ArchError(
             f"{arch.title} has the padding '{arch.padding}', with which a decision cannot be made sample by sample: "
-            f"train {arch.symbol} with --padding stream."
+            f"train {arch.symbol} with --padding stream.",
+            reason="arch_padding",
+            padding=arch.padding,
         )
     if arch.norm == "layer":
         raise ArchError(
             f"{arch.title} has {arch.norm} normalisation, which cannot be folded into a convolution: "
-            f"train {arch.symbol} with --norm batch or none."
+            f"train {arch.symbol} with --norm batch or none.",
+            reason="arch_norm",
         )
 
 

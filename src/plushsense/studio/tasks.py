@@ -25,13 +25,16 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import ConfigError, DatasetError, PlushSenseError, ToolError
+from plushsense.core.files import write_file
 from plushsense.core.sentences import Sentence
-from plushsense.dataset.backup import is_backup, restore
+from plushsense.dataset.backup import backup, is_backup, restore
 from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
+from plushsense.dataset.privacy.forget import forget
 from plushsense.dataset.privacy.pseudonymise import pseudonymise
 from plushsense.dataset.publishing.checking import validate_package
+from plushsense.dataset.store import HEAD
 from plushsense.deploy.package import changed_copies
 from plushsense.deploy.profile import profile
 from plushsense.deploy.proof.vectors import Export
@@ -141,7 +144,8 @@ def run_import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         "subjects": done.subjects,
         "added": done.added,
         "already_there": done.already_there,
-        "warnings": done.notes + done.warnings,
+        "warnings": done.notes,
+        "flagged": len(done.warnings),
         "left_out": done.left_out,
         "rejected": done.rejected,
         "seconds": round(done.seconds, 2),
@@ -248,7 +252,8 @@ def run_pseudonymise(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, 
         ConfigError: if ``words`` is missing, as in a job resumed after a restart, because words are never stored.
     """
     if "words" not in spec:
-        raise ConfigError("The words to remove are not stored: enter them again on the publish page.")
+        message = "The words to remove are not stored: enter them again on the publish page."
+        raise ConfigError(message, reason="words_not_stored")
     done = pseudonymise(
         spec["dataset"],
         spec["place"],
@@ -258,6 +263,34 @@ def run_pseudonymise(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, 
         progress=partial(reporter.stage, "rewriting"),
     )
     return done.to_dict()
+
+
+def run_backup(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Write the data set ``dataset`` into the new backup ``place``."""
+    return {**backup(spec["dataset"], spec["place"], progress=reporter.count).to_dict(), "dataset": spec["dataset"]}
+
+
+def run_restore(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Restore the backup ``file`` as the new data set ``dest`` with the name ``name``."""
+    dataset = restore(spec["file"], spec["dest"], progress=reporter.count)
+    write_file(dataset.path / HEAD, replace(dataset.head, name=spec["name"]).to_toml())
+    return {
+        "dataset": str(spec["dest"]),
+        "recordings": len(dataset.recordings),
+        "people": len(dataset.subjects),
+    }
+
+
+def run_forget(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
+    """Remove ``person`` from ``dataset``; the result does not name the person.
+
+    Raises:
+        ConfigError: if ``person`` is missing, as in a job resumed after a restart, because it is never stored.
+    """
+    if "person" not in spec:
+        message = "The person's code is not stored: choose the person in the menu of the data set again."
+        raise ConfigError(message, reason="person_not_stored")
+    return {"dataset": spec["dataset"], "files": len(forget(spec["dataset"], spec["person"]).files)}
 
 
 def run_publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -464,7 +497,7 @@ def _profile(folder: Path, reporter: TaskReporter) -> dict[str, Any]:
         return {"digest": digest, **profile(folder, progress=partial(reporter.stage, "profile")).to_dict()}
     except ToolError as refusal:
         # Not an error: an export without a profile is valid.
-        return {"digest": digest, "refused": str(refusal)}
+        return {"digest": digest, "refused": Sentence.of(refusal)}
 
 
 def run_export(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -522,6 +555,9 @@ TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
     "profile": run_profile,
     "validate": run_validate,
     "pseudonymise": run_pseudonymise,
+    "backup": run_backup,
+    "restore": run_restore,
+    "forget": run_forget,
 }
 """Functions of the tasks by name. Specs and results contain only JSON values."""
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BadInput, BundleError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.convert import CONVERTERS, check_format, convert
@@ -37,7 +38,7 @@ def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], war
     """
     refuse_undeployable(bundle.arch)
     if bundle.calibration and bundle.provenance.get("quantize_aware"):
-        warn("the bundle was fine-tuned for its own calibration, which is kept")
+        warn(Sentence("the bundle was fine-tuned for its own calibration, which is kept", reason="calibration_kept"))
         return bundle
     return calibrated(bundle, training_windows(bundle, dataset, warn))
 
@@ -60,22 +61,27 @@ def training_windows(
     if isinstance(origin.get("subjects"), int):
         raise BundleError(
             "The bundle belongs to an export and does not name its training people, which calibration needs: give the "
-            "bundle that plushsense train wrote."
+            "bundle that plushsense train wrote.",
+            reason="calibration_people",
         )
     # Windows of `NOBODY` are used both for training and for validation.
     people = {str(s) for s in origin.get("subjects", ())} - {NOBODY}
     if origin.get("split") != WHOLE_PEOPLE or not people:
         raise BundleError(
             "The bundle does not name the people of its training windows "
-            f"(split '{origin.get('split', 'unknown')}'), which calibration needs: train it again."
+            f"(split '{origin.get('split', 'unknown')}'), which calibration needs: train it again.",
+            reason="calibration_people",
         )
     if dataset.layout.inputs != bundle.layout.inputs or dataset.layout.period_us != bundle.layout.period_us:
         raise BundleError(
             f"The data set '{dataset.head.name}' has the layout '{dataset.layout.name}', the bundle "
-            f"'{bundle.layout.name}': give the data set that it was trained on."
+            f"'{bundle.layout.name}': give the data set that it was trained on.",
+            reason="calibration_layout",
+            name=dataset.head.name,
         )
     if origin.get("dataset_hash") != dataset.hash:
-        warn(f"'{dataset.head.name}' has changed since the training of the bundle: its present content is used")
+        message = f"'{dataset.head.name}' has changed since the training of the bundle: its present content is used"
+        warn(Sentence(message, reason="dataset_changed", name=dataset.head.name))
     known = {field.name for field in fields(WindowSpec)}
     spec = WindowSpec(**{k: v for k, v in bundle.windowing.items() if k in known})
     anywhere = AnywhereSpec(**bundle.windowing.get("anywhere", {}))
@@ -84,11 +90,14 @@ def training_windows(
     if not len(at):
         raise BundleError(
             f"The data set '{dataset.head.name}' has no window of the {len(people)} people the bundle was trained "
-            "on: give the data set that it was trained on."
+            "on: give the data set that it was trained on.",
+            reason="calibration_other",
+            name=dataset.head.name,
         )
     missing = sorted(people - set(windows.subject[at].tolist()))
     if missing:
-        warn(f"no longer in '{dataset.head.name}': {', '.join(missing)}")
+        message = f"no longer in '{dataset.head.name}': {', '.join(missing)}"
+        warn(Sentence(message, reason="people_gone", name=dataset.head.name, people=", ".join(missing)))
     return windows.x[at]
 
 

@@ -325,7 +325,7 @@ def milliseconds(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple
     return _UNITS[unit], Sentence(message, reason="time_unit", column=name, unit=unit)
 
 
-def _about(name: str, note: str) -> Sentence:
+def about_file(name: str, note: str) -> Sentence:
     """Return a note about the file ``name``."""
     return Sentence(f"{name}: {note}", reason="about_file", file=name, note=note)
 
@@ -369,7 +369,7 @@ def read_table(
     known = np.array([bool(c) for c in codes], dtype=bool)[people] if rows else np.empty(0, bool)
     good = usable_rows(raw, device, host)
     if note:
-        yield _about(display_name, note)
+        yield about_file(display_name, note)
     for count, reason in (
         (columns.malformed, "of another width than the header"),
         (int(np.sum(~good)), "without a number in every column"),
@@ -377,7 +377,7 @@ def read_table(
     ):
         if count:
             message = f"{count} row{'s' if count > 1 else ''} {reason} left out"
-            yield _about(display_name, Sentence(message, reason="rows_left_out", n=count))
+            yield about_file(display_name, Sentence(message, reason="rows_left_out", n=count))
     good &= known
     if not good.any():
         raise FileFormatError(
@@ -387,7 +387,7 @@ def read_table(
         )
     values, note = whole_steps(raw[good], layout)
     if note:
-        yield _about(display_name, note)
+        yield about_file(display_name, note)
     device_ms, host_ms = (np.round(clock[good]).astype(np.int64) for clock in (device, host))
     people, sessions, labels, takes = people[good], sessions[good], labels[good], takes[good]
     named = np.array([bool(plain_label(n)) and len(n) <= LONGEST_LABEL for n in label_names], dtype=bool)

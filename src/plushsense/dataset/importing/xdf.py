@@ -29,6 +29,7 @@ from plushsense.dataset.importing.sources import LEFT_OUT, SourceFile
 from plushsense.dataset.importing.tables import (
     ConvertedSource,
     LabelledSegment,
+    about_file,
     usable_rows,
     whole_steps,
     write_session,
@@ -207,7 +208,10 @@ def _frames(
     times = np.asarray(stream["time_stamps"], dtype=np.float64)
     device = times * 1000.0 if columns.clock is None else series[:, columns.clock]
     good = usable_rows(series[:, columns.channels], times * 1000.0, device)
-    notes = [] if good.all() else [f"{int(np.sum(~good))} samples without a number in every channel left out"]
+    notes: list[str] = []
+    if lost := int(np.sum(~good)):
+        message = f"{lost} samples without a number in every channel left out"
+        notes.append(Sentence(message, reason="rows_left_out", n=lost))
     values, warning = whole_steps(series[good][:, columns.channels], layout)
     host_ms = np.round(times[good] * 1000.0).astype(np.int64)
     device_ms = np.round(device[good]).astype(np.int64)
@@ -272,12 +276,14 @@ def read_xdf(
     cuts, unknown = segments_of(markers, times, gestures) if len(times) else ([], [])
     if unknown:
         listed = ", ".join(f"'{u[:40]}'" for u in dict.fromkeys(unknown[:20]))
-        notes.append(f"{len(unknown)} markers name no gesture and begin no recording: {listed}")
+        message = f"{len(unknown)} markers name no gesture and begin no recording: {listed}"
+        notes.append(Sentence(message, reason="xdf_markers", n=len(unknown), markers=listed))
     if not cuts:
-        notes.append("no marker names a gesture: only the stream is imported")
-    yield from (f"{display_name}: {note}" for note in notes)
+        notes.append(Sentence("no marker names a gesture: only the stream is imported", reason="xdf_no_gesture"))
+    yield from (about_file(display_name, note) for note in notes)
     if not len(frames):
-        raise FileFormatError(f"the stream '{name}' has no sample with a number in every channel")
+        message = f"the stream '{name}' has no sample with a number in every channel"
+        raise FileFormatError(message, reason="rows_unusable", n=layout.n_channels)
     about = {"stream": name, "type": _text(stream, "type"), "nominal_rate_hz": _text(stream, "nominal_srate")}
     yield from write_session(
         folder, subject, session, frames, cuts, layout, ConvertedSource(path, display_name, about), with_stream=True

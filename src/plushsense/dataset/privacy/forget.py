@@ -113,6 +113,11 @@ def read_removals(folder: Path) -> list[RemovalRecord]:
     return records
 
 
+def people_of_dataset(folder: Path) -> list[str]:
+    """Return the codes of all people of whom a data set has files or a line in the people's table."""
+    return sorted({*person_folders(folder), *read_people(folder)} - {NOBODY, UNKNOWN_SUBJECT})
+
+
 def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
     """Return what `forget` would remove, without changing anything.
 
@@ -145,7 +150,7 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
     marked = any(_parsed(line) is not None for line in about)
     absent = not own and not marked and subject not in table and intent is None
     if absent:
-        known = sorted({*person_folders(folder), *table} - {NOBODY, UNKNOWN_SUBJECT})
+        known = people_of_dataset(folder)
         # Codes of removed people are not stored, so an unknown code may be one of them, but not another spelling.
         if not _record_lines(folder) or match_code(subject, known):
             raise DatasetError(

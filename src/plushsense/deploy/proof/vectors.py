@@ -42,7 +42,9 @@ def recorded_frames(dataset: Dataset, layout: Layout, *, subjects: Sequence[str]
         raise ConfigError(
             f"The data set '{dataset.head.name}' holds layout '{dataset.layout.name}' "
             f"({', '.join(dataset.layout.names)}), but the model reads '{layout.name}' ({', '.join(layout.names)}), "
-            "with its own units and valid ranges: give recordings of the model's layout."
+            "with its own units and valid ranges: give recordings of the model's layout.",
+            reason="vectors_layout",
+            name=dataset.head.name,
         )
     known = sorted({r.subject for r in dataset.recordings} | {s.subject for s in dataset.streams})
     for subject in subjects:
@@ -160,13 +162,16 @@ class Export:
             if comparison.first:
                 raise BadInput(
                     f"The golden vectors in '{self.folder / GOLDEN}' are not those of {BUNDLE}: they are damaged, or "
-                    f"of another model ({comparison.first}); export the model again."
+                    f"of another model ({comparison.first}); export the model again.",
+                    reason="export_damaged",
+                    name=self.folder.name,
                 )
 
     def _require_file(self, name: str) -> Path:
         path = self.folder / name
         if not path.is_file():
-            raise BadInput(f"The export '{self.folder}' lacks {name}: export the model again.")
+            message = f"The export '{self.folder}' lacks {name}: export the model again."
+            raise BadInput(message, reason="export_damaged", name=self.folder.name)
         return path
 
     def require_unchanged(self) -> None:
@@ -176,7 +181,9 @@ class Export:
             raise BadInput(
                 f"{', '.join(self.changed)} in '{self.folder}' {'is' if one else 'are'} not what this PlushSense "
                 f"writes for {BUNDLE}, and nothing was compiled: export the model again, or give --trust to compile "
-                f"and run {'it' if one else 'them'} on this computer all the same."
+                f"and run {'it' if one else 'them'} on this computer all the same.",
+                reason="export_changed",
+                files=", ".join(self.changed),
             )
 
     def code(self, room: Path) -> Path:
@@ -249,7 +256,8 @@ class Export:
                 break
             rows += max(samples - n_samples, rows // 4)
         if not len(frames):
-            raise ConfigError(f"The data set '{dataset.head.name}' holds nothing to stream: give another one.")
+            message = f"The data set '{dataset.head.name}' holds nothing to stream: give another one."
+            raise ConfigError(message, reason="vectors_empty", name=dataset.head.name)
         name = "simulated recordings" if dataset.head.simulated else "recordings"
         return [self.answered(name, part) for part in in_parts(frames)]
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from plushsense.core.errors import BuildError, ProgramError, ToolError
+from plushsense.core.sentences import Sentence
 from plushsense.deploy.emit import IMAGE, LIBRARY, MODEL
 from plushsense.deploy.proof.mutants import RULES, Mutant, mutants_of
 from plushsense.deploy.proof.vectors import Counts, Export, RowComparison, Vectors, compare, counted
@@ -267,13 +268,14 @@ def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[li
             require(name)
         runnable += here
         if not here:
-            not_run.append((name, next(iter(lacks.values()), "no setting was selected")))
+            not_run.append((name, next(iter(lacks.values()), Sentence("no setting was selected", reason="no_setting"))))
         else:
             not_run += [(f"{name}, {s.compiler} {s.options}", why) for s, why in lacks.items() if why]
     if not runnable:
         raise ToolError(
             "Nothing can be checked here, because no compiler is installed: install one "
-            f"({'; '.join(f'{name}: {why}' for name, why in not_run)})."
+            f"({'; '.join(f'{name}: {why}' for name, why in not_run)}).",
+            reason="no_compiler",
         )
     return runnable, not_run
 
@@ -284,7 +286,8 @@ def _lacks(setting: Setting) -> str:
     if setting.cpp and shutil.which("g++") is None:
         missing.append("g++")
     if missing:
-        return f"not installed: Debian's {' '.join(missing)}"
+        packages = " ".join(missing)
+        return Sentence(f"not installed: Debian's {packages}", reason="not_installed", packages=packages)
     return _no_sanitizers(setting) if SANITIZERS[0] in setting.flags else ""
 
 
@@ -297,7 +300,8 @@ def _no_sanitizers(setting: Setting) -> str:
             build(setting.target, [source], Path(work), cc=setting.cc, flags=setting.flags).run()
         except ToolError:
             also = " (Debian's libclang-rt-dev)" if setting.compiler == "clang" else ""
-            return f"{setting.compiler} makes no program with sanitizers here{also}"
+            message = f"{setting.compiler} makes no program with sanitizers here{also}"
+            return Sentence(message, reason="no_sanitizers", compiler=setting.compiler)
     return ""
 
 

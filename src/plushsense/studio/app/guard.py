@@ -22,12 +22,13 @@ from urllib.parse import parse_qs, quote, urlsplit
 
 from fastapi import APIRouter
 from fastapi.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.requests import ClientDisconnect
 
 from plushsense.core.errors import ConfigError
 from plushsense.dataset.importing.archives import zip_entry
 from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.deploy.emit import FACTS
-from plushsense.studio.app.workspace import EXPORTS, PACKAGES, Workspace
+from plushsense.studio.app.workspace import BACKUPS, EXPORTS, PACKAGES, Workspace
 
 Scope = dict[str, Any]
 Receive = Callable[[], Awaitable[dict[str, Any]]]
@@ -198,7 +199,8 @@ async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers
         await app(scope, receiving, sending)
     except Exception as cause:
         # NiceGUI treats the end of the body as a disconnect; a browser that has disconnected needs no response.
-        if not too_large and not (disconnected and _UNANSWERED in str(cause)):
+        left = isinstance(cause, ClientDisconnect) or _UNANSWERED in str(cause)
+        if not too_large and not (disconnected and left):
             raise
     if too_large and not started:
         await _refuse(scope, send, 413, refusal)
@@ -387,7 +389,7 @@ _MAX_NAME = 255
 
 
 def download_address(kind: str, name: str) -> str:
-    """Return the download address of an export or package; ``kind`` is `EXPORTS` or `PACKAGES`."""
+    """Return the download address of an export, package or backup; ``kind`` is `EXPORTS`, `PACKAGES` or `BACKUPS`."""
     return f"/download/{kind}/{quote(name, safe='')}.zip"
 
 
@@ -397,7 +399,7 @@ def router(workspace: Workspace) -> APIRouter:
 
     @routes.get("/download/{kind}/{name}.zip", include_in_schema=False)
     def download(kind: str, name: str) -> Response:
-        if kind not in (EXPORTS, PACKAGES):
+        if kind not in (EXPORTS, PACKAGES, BACKUPS):
             return PlainTextResponse("Not found\n", 404)
         try:
             path = path_in(workspace, kind, name if kind == EXPORTS else f"{name}.zip")
@@ -406,7 +408,7 @@ def router(workspace: Workspace) -> APIRouter:
         if kind == EXPORTS and (path / FACTS).is_file():
             headers = {"content-disposition": f"attachment; filename*=UTF-8''{quote(path.name, safe='')}.zip"}
             return StreamingResponse(zip_chunks(path), media_type="application/zip", headers=headers)
-        if kind == PACKAGES and path.is_file():
+        if kind != EXPORTS and path.is_file():
             return FileResponse(path, media_type="application/zip", filename=path.name)
         return PlainTextResponse(f"There is no {kind.removesuffix('s')} '{name}' in this studio.\n", 404)
 

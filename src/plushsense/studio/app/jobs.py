@@ -26,8 +26,8 @@ INCOMING = "incoming"
 """Folder in the work folder for uploaded files that are not imported yet; it is removed when the studio starts."""
 RUNNING, DONE, REFUSED, STOPPED = "running", "done", "refused", "stopped"
 _MAX_REPORTS = 2000
-# Keys of a spec that are never stored, because they may contain names of people.
-_SECRET_KEYS = ("words",)
+# Keys of a spec that are never stored, because they identify people.
+_SECRET_KEYS = ("words", "person")
 _STOP_S = 10.0
 
 
@@ -54,7 +54,7 @@ class StudioJob:
     state: str = RUNNING
     progress: dict[str, Any] = field(default_factory=dict)
     reports: list[dict[str, Any]] = field(default_factory=list)
-    warnings: list[str | dict[str, Any]] = field(default_factory=list)
+    warnings: list[Any] = field(default_factory=list)
     result: dict[str, Any] = field(default_factory=dict)
     message: str = ""
     reason: str = ""
@@ -134,7 +134,8 @@ class Jobs:
             "work": str(self._folder),
             "dest": str(dest),
         }
-        return self.start("import", spec | ({"add": True} if dest.exists() else {"name": dest.name}), title)
+        named = {"name": self._workspace.title(dest), **({"add": True} if dest.exists() else {})}
+        return self.start("import", spec | named, title)
 
     def resume(self, identity: str) -> StudioJob:
         """Restart a job that has ended, with the same spec; the task continues from what it has stored."""

@@ -35,6 +35,14 @@ class Words:
         text = f"{value:.{digits}f}"
         return text.replace(".", self._texts["shell.decimal_point"])
 
+    def significant(self, value: float, digits: int) -> str:
+        """Format a number with so many significant digits and the decimal separator of this language."""
+        return f"{value:.{digits}g}".replace(".", self._texts["shell.decimal_point"])
+
+    def count(self, value: int) -> str:
+        """Format a whole number with the thousands separator of this language."""
+        return f"{value:,}".replace(",", self._texts["shell.thousand"][1:-3])
+
     def table(self, name: str) -> dict[str, str]:
         """Return all texts of the table ``name``; the keys do not include that name."""
         return {key.removeprefix(f"{name}."): text for key, text in self._texts.items() if key.startswith(f"{name}.")}

@@ -20,9 +20,9 @@ from plushsense.dataset.store import DatasetHead
 from plushsense.recording.session_files import SESSION_HEAD
 
 RECORDINGS, DATASETS, BUNDLES, EXPORTS, PACKAGES = "recordings", "datasets", "bundles", "exports", "packages"
+WORK, DISCARDED, BACKUPS = "work", "discarded", "backups"
 PROTOCOLS = "protocols"
 """Folder of the user's own recording protocols."""
-WORK, DISCARDED = "work", "discarded"
 VIRTUAL = "virtual://?person=7"
 _HEAD, _INDEX = "dataset.toml", "recordings.csv"
 _BUNDLE = "*.plush"
@@ -52,8 +52,8 @@ class Workspace:
     Pages may read and write only inside ``folder`` and the data sets given at start.
 
     Attributes:
-        folder: contains `RECORDINGS`, `DATASETS`, `BUNDLES`, `EXPORTS`, `PACKAGES`, `WORK` and `DISCARDED`, created
-            when needed.
+        folder: contains `RECORDINGS`, `DATASETS`, `BUNDLES`, `EXPORTS`, `PACKAGES`, `BACKUPS`, `WORK` and `DISCARDED`,
+            created when needed.
         given: data sets given at start, in any folder.
         devices: URLs of the toys given at start; the first is chosen.
         models: bundles (model files) given at start.
@@ -200,8 +200,8 @@ class Workspace:
         return place
 
     def discarded(self) -> list[Path]:
-        """Return the discarded sessions, data sets, bundles and protocols."""
-        patterns = (f"{RECORDINGS}/*/*", f"{DATASETS}/*", f"{BUNDLES}/*", f"{PROTOCOLS}/*")
+        """Return the discarded sessions, data sets, bundles, backups and protocols."""
+        patterns = (f"{RECORDINGS}/*/*", *(f"{kind}/*" for kind in (DATASETS, BUNDLES, BACKUPS, PROTOCOLS)))
         return [path for pattern in patterns for path in sorted((self.folder / DISCARDED).glob(pattern))]
 
     def restore(self, path: Path) -> Path:
@@ -260,12 +260,13 @@ class Workspace:
             )
         return plain
 
-    def dataset_for(self, layout: str, simulated: bool) -> Path:
+    def dataset_for(self, layout: str, simulated: bool, name: str = RECORDINGS) -> Path:
         """Return the folder of the data set to which recordings can be added, the last changed one of several.
 
         Args:
             layout: name of the layout of the recordings.
             simulated: whether the toy was a virtual one; real and simulated recordings are never mixed.
+            name: the name of a new data set.
 
         Returns:
             The path of a new data set if none fits.
@@ -276,7 +277,7 @@ class Workspace:
                 head = DatasetHead.read(path)
                 if (head.layout.name, head.simulated) == (layout, simulated):
                     fitting.append(((path / _INDEX).stat().st_mtime, path))
-        return max(fitting)[1] if fitting else self.folder / DATASETS / self.free_name(DATASETS, "recordings")
+        return max(fitting)[1] if fitting else self.folder / DATASETS / self.free_name(DATASETS, name)
 
     def free_name(self, kind: str, name: str, *suffixes: str, separator: str = "-", taken: Collection[str] = ()) -> str:
         """Return ``name``, numbered if it is in ``taken`` or exists in ``folder / kind`` with one of ``suffixes``."""

@@ -37,6 +37,12 @@ from plushsense.studio.app.workspace import Workspace
 _CSS = Path(__file__).with_name("elements.css")
 _RECENT_S = 900.0
 _TITLES = {
+    "simulate": "home.try_title",
+    "import": "home.import_title",
+    "check": "home.check_title",
+    "backup": "home.backup_title",
+    "restore": "home.restore_title",
+    "forget": "home.forget_title",
     "export": "export.doing",
     "profile": "export.counting",
     "verify": "export.verifying",
@@ -203,17 +209,21 @@ def link(message: str, to: str) -> Markup:
     return Markup('<a class="ps-link" href="{}">{}</a>').format(to, message)
 
 
-def size(count: int) -> str:
+def size(count: int, words: Words | None = None) -> str:
     """Format a number of bytes with a decimal unit."""
     for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= factor:
-            return f"{count / factor:.1f} {unit}"
+            return f"{words.number(count / factor, 1) if words else format(count / factor, '.1f')} {unit}"
     return f"{count} B"
 
 
 def title_of(words: Words, job: StudioJob) -> str:
     """Return the title of a job in this visitor's language; ``job.title`` is in that of the person who started it."""
-    return words(_TITLES[job.task], name=Path(job.spec["place"]).name)
+    spec = job.spec
+    if job.task not in _TITLES:
+        return f"{words(f'train.kinds.{job.task}')}: {job.title}"
+    name = spec.get("name") or Path(spec.get("place") or spec.get("dest") or spec["dataset"]).name
+    return words(_TITLES[job.task], name=name)
 
 
 async def titles(workspace: Workspace) -> dict[str, str]:

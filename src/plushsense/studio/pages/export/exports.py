@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import PlushSenseError
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.files import sha256_of
 from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.deploy.convert import CONVERTERS
@@ -27,14 +28,19 @@ _NEEDS = {
 """The extra and the modules that an export format needs, by the first word of the format's name."""
 
 
+def _note(error: PlushSenseError, reason: str, path: Path) -> Sentence:
+    """Return the message of an error as a note; ``reason`` is that of an error without one."""
+    return Sentence.of(error) if error.reason else Sentence(str(error), reason=reason, name=path.stem)
+
+
 @dataclass(frozen=True)
 class BundleFacts:
-    """A bundle, with error messages ``problem`` if it cannot be read, and ``cannot`` if it cannot be exported."""
+    """A bundle, with the reasons ``problem`` if it cannot be read, and ``cannot`` if it cannot be exported."""
 
     path: Path
     bundle: Bundle | None = None
-    problem: str = ""
-    cannot: str = ""
+    problem: Sentence | None = None
+    cannot: Sentence | None = None
     bytes: int = 0
 
     @classmethod
@@ -43,12 +49,12 @@ class BundleFacts:
         try:
             bundle = Bundle.load(path)
         except PlushSenseError as refusal:
-            return cls(path, problem=str(refusal))
+            return cls(path, problem=_note(refusal, "bundle_unreadable", path))
+        cannot = None
         try:
             integer_model(bundle)
-            cannot = ""
         except PlushSenseError as refusal:
-            cannot = str(refusal)
+            cannot = _note(refusal, "bundle_undeployable", path)
         return cls(path, bundle, cannot=cannot, bytes=path.stat().st_size)
 
     @property
@@ -62,13 +68,13 @@ class ExportFacts:
     """Facts of an export folder.
 
     Attributes:
-        problem: error message if the folder cannot be read, or "".
+        problem: the reason if the folder cannot be read.
         files: size of each file in bytes.
         digest: hash of all files, see `folder_digest`.
     """
 
     folder: Path
-    problem: str = ""
+    problem: Sentence | None = None
     facts: dict[str, Any] = field(default_factory=dict)
     files: dict[str, int] = field(default_factory=dict)
     digest: str = ""
@@ -94,9 +100,9 @@ class ExportFacts:
         try:
             facts = read_facts(folder)
             files = {p.relative_to(folder).as_posix(): p.stat().st_size for p in list_package_files(folder)}
-            return cls(folder, "", facts, files, folder_digest(folder), (folder / FACTS).stat().st_mtime)
+            return cls(folder, None, facts, files, folder_digest(folder), (folder / FACTS).stat().st_mtime)
         except PlushSenseError as refusal:
-            return cls(folder, problem=str(refusal))
+            return cls(folder, problem=_note(refusal, "export_damaged", folder))
 
 
 def exports_of(workspace: Workspace) -> list[Path]:

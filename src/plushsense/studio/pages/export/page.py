@@ -23,12 +23,14 @@ from plushsense.studio.app.workspace import EXPORTS, plain_name
 from plushsense.studio.pages.export.exports import BundleFacts, ExportFacts, exports_of, formats, newest_job, targets
 from plushsense.studio.widgets.elements import (
     WorkPanel,
+    errors_beside,
     facts,
     link,
     notice,
     scroll_to,
     size,
     style,
+    summary,
     table,
     text,
     titles,
@@ -47,14 +49,13 @@ def show_cost(page: Page, work: WorkPanel, export: ExportFacts, counted: StudioJ
     async def start() -> None:
         await work.start("profile", {"place": str(export.folder)})
 
-    with tag(ui.column().classes("ps-card w-full"), "cost"):
-        text(words("export.cost"), "h3")
+    with tag(ui.column().classes("ps-card w-full"), "cost"), _folded(words("export.cost")):
         if not profile:
             text(words("export.not_counted"))
         elif not current:
             notice(words("export.counted_before"))
         elif "refused" in profile:
-            tag(notice(profile["refused"]), "cost-refused")
+            tag(notice(words.sentence(profile["refused"])), "cost-refused")
         else:
             assert counted is not None
             _display_cost(words, profile, moment(counted.ended_s))
@@ -63,12 +64,12 @@ def show_cost(page: Page, work: WorkPanel, export: ExportFacts, counted: StudioJ
 
 
 def _display_cost(words: Words, profile: dict[str, Any], when: str) -> None:
-    text(words("export.cost_about", step=f"{profile['step_ms']:g}"), classes="ps-dim")
+    text(words("export.cost_about", step=words.significant(profile["step_ms"], 3)), classes="ps-dim")
     rows = [
         (
             each["chip"],
             f"{each['mhz']}",
-            words("export.between", low=f"{each['low']:.2g}", high=f"{each['high']:.2g}"),
+            words("export.between", low=words.significant(each["low"], 2), high=words.significant(each["high"], 2)),
             verdict(_FITS[each["fits"]], words(f"export.fits_{each['fits']}")),
         )
         for each in profile["estimated_ms"].values()
@@ -79,8 +80,8 @@ def _display_cost(words: Words, profile: dict[str, Any], when: str) -> None:
     counted = [
         (
             TARGETS[name].title,
-            *(f"{each[key]:,}" for key in ("instructions_per_step", "flash_bytes", "ram_bytes")),
-            f"{each['stack_push_bytes']:,}" if each["stack_push_bytes"] is not None else "–",
+            *(words.count(each[key]) for key in ("instructions_per_step", "flash_bytes", "ram_bytes")),
+            words.count(each["stack_push_bytes"]) if each["stack_push_bytes"] is not None else "–",
         )
         for name, each in profile["targets"].items()
         if each["instructions_per_step"] is not None
@@ -104,42 +105,60 @@ def show_facts(page: Page, export: ExportFacts, made: StudioJob | None) -> None:
             notice(words("shell.simulation"))
         for warning in made.warnings if made else ():
             notice(words.sentence(warning))
-        facts(
-            [
-                (words("export.network"), str(card["title"])),
-                (words("export.gestures"), str(card["classes"])),
-                (words("export.layout"), str(card.get("layout", ""))),
-                (words("export.flash"), words("export.flash_value", n=f"{export.flash_bytes:,}")),
-                (words("export.ram"), words("export.ram_value", n=f"{export.ram_bytes:,}")),
-                (
-                    words("export.step"),
-                    words("export.step_value", ms=f"{card['step_ms']:g}", macs=f"{card['macs_per_step']:,}"),
-                ),
-                (words("export.made"), moment(export.made_s)),
-                (words("export.place"), str(export.folder)),
-            ]
-        )
-        for name, each in card.get("conversions", {}).items():
-            apart = each.get("largest_difference")
-            message = words("export.converted", file=each["file"], n=f"{each['bytes']:,}", name=name)
-            text(message if apart is None else f"{message} {words('export.apart', d=f'{apart:.1g}')}")
-        with ui.expansion(words("export.files", n=len(export.files), size=size(sum(export.files.values())))) as files:
-            rows = [(name, f"{bytes_:,}") for name, bytes_ in export.files.items()]
-            table(words("export.files_caption"), (words("export.file"), words("export.bytes")), rows, (1,))
-        tag(files.classes("w-full"), "files")
+        text(words("export.hand_over"))
         download = ui.link(words("export.download"), download_address(EXPORTS, export.name)).classes("ps-link")
         tag(download.props("download"), "download")
+        with _folded(words("export.details")):
+            _list_facts(words, export)
+
+
+def _folded(title: str) -> ui.element:
+    """Add a part of the page that is folded at first, with its heading."""
+    box = ui.element("details").classes("w-full")
+    with box:
+        summary(title)
+    return box
+
+
+def _list_facts(words: Words, export: ExportFacts) -> None:
+    """List the facts and the files of an export."""
+    card = export.facts
+    step = words.significant(card["step_ms"], 3)
+    facts(
+        [
+            (words("export.network"), str(card["title"])),
+            (words("export.gestures"), str(card["classes"])),
+            (words("export.layout"), str(card.get("layout", ""))),
+            (words("export.flash"), words("export.flash_value", n=words.count(export.flash_bytes))),
+            (words("export.ram"), words("export.ram_value", n=words.count(export.ram_bytes))),
+            (
+                words("export.step"),
+                words("export.step_value", ms=step, macs=words.count(card["macs_per_step"])),
+            ),
+            (words("export.made"), moment(export.made_s)),
+            (words("export.place"), str(export.folder)),
+        ]
+    )
+    for name, each in card.get("conversions", {}).items():
+        apart = each.get("largest_difference")
+        message = words("export.converted", file=each["file"], n=words.count(each["bytes"]), name=name)
+        text(message if apart is None else f"{message} {words('export.apart', d=words.significant(apart, 1))}")
+    with ui.expansion(
+        words("export.files", n=len(export.files), size=size(sum(export.files.values()), words))
+    ) as files:
+        rows = [(name, words.count(bytes_)) for name, bytes_ in export.files.items()]
+        table(words("export.files_caption"), (words("export.file"), words("export.bytes")), rows, (1,))
+    tag(files.classes("w-full"), "files")
 
 
 def show_next(page: Page) -> None:
     """Build the card with the next steps for a firmware engineer."""
     words = page.words
-    with tag(ui.column().classes("ps-card w-full"), "next"):
-        text(words("export.next"), "h3")
-        with ui.element("ol").classes("ps-steps"):
-            for key in ("arduino", "idf", "plain", "read"):
-                message = words(f"export.next_{key}", arduino=ARDUINO, sketch=SKETCH, idf=IDF, example=IDF_EXAMPLE)
-                text(message, "li")
+    card = tag(ui.column().classes("ps-card w-full"), "next")
+    with card, _folded(words("export.next")), ui.element("ol").classes("ps-steps"):
+        for key in ("arduino", "idf", "plain", "read"):
+            message = words(f"export.next_{key}", arduino=ARDUINO, sketch=SKETCH, idf=IDF, example=IDF_EXAMPLE)
+            text(message, "li")
 
 
 def verification_verdict(words: Words, export: ExportFacts, proof: StudioJob | None) -> Markup:
@@ -172,15 +191,15 @@ class VerificationCard:
         with tag(ui.column().classes("ps-card w-full"), "proof"):
             text(words("export.prove"), "h3")
             text(words("export.prove_about"), classes="ps-dim")
-            with ui.row().classes("w-full"):
-                for name in (n for n, packages in missing.items() if not packages):
-                    self._chosen[name] = ui.checkbox(self._title(name), value=True)
-                    tag(self._chosen[name], f"target-{name}")
-            for name, packages in missing.items():
-                if packages:
-                    message = _missing_target(words, self._title(name), packages)
-                    tag(text(message, classes="ps-dim"), f"missing-{name}")
             with ui.expansion(words("export.more")).classes("w-full"):
+                with ui.row().classes("w-full"):
+                    for name in (n for n, packages in missing.items() if not packages):
+                        self._chosen[name] = ui.checkbox(self._title(name), value=True)
+                        tag(self._chosen[name], f"target-{name}")
+                for name, packages in missing.items():
+                    if packages:
+                        message = _missing_target(words, self._title(name), packages)
+                        tag(text(message, classes="ps-dim"), f"missing-{name}")
                 options = {"": words("export.recorded_none")} | await titles(self.page.workspace)
                 self._dataset = ui.select(options, value="", label=words("export.recorded")).classes("w-full")
                 self._faults = tag(ui.checkbox(words("export.faults")), "faults")
@@ -233,9 +252,9 @@ class VerificationCard:
                     words("export.host_short") if r["target"] == "host" else self._title(r["target"]),
                     r["compiler"],
                     r["flags"],
-                    f"{r['vectors']:,}",
-                    f"{r['mismatches']:,}",
-                    f"{r['max_abs_diff']:,}",
+                    words.count(r["vectors"]),
+                    words.count(r["mismatches"]),
+                    words.count(r["max_abs_diff"]),
                     verdict(not r["mismatches"], words("export.unequal" if r["mismatches"] else "export.equal")),
                 )
                 for r in result["runs"]
@@ -244,16 +263,16 @@ class VerificationCard:
             caption = words("export.runs_caption", when=moment(proof.ended_s))
             tag(table(caption, [words(f"export.{k}") for k in keys], rows, (3, 4, 5)), "runs")
             counts = ("samples", "frames", "answers")
-            streams = [(s["name"], *(f"{s[key]:,}" for key in counts)) for s in result["streams"]]
+            streams = [(s["name"], *(words.count(s[key]) for key in counts)) for s in result["streams"]]
             head = [words(f"export.{k}") for k in ("stream", *counts)]
             tag(table(words("export.streams_caption"), head, streams, (1, 2, 3)), "streams")
             for each in result["not_run"]:
-                text(words("export.not_run", what=each["what"], why=each["why"]), classes="ps-dim")
+                text(words("export.not_run", what=each["what"], why=words.sentence(each["why"])), classes="ps-dim")
             if result["faults"]:
                 self._mutants(result["faults"])
 
     def _sum(self, result: dict[str, Any]) -> str:
-        total, unequal = f"{result['vectors']:,}", f"{result['mismatches']:,}"
+        total, unequal = self.words.count(result["vectors"]), self.words.count(result["mismatches"])
         if not result["mismatches"]:
             return self.words("export.all_equal", n=total, settings=len(result["runs"]))
         return self.words("export.some_unequal", bad=unequal, n=total)
@@ -261,7 +280,7 @@ class VerificationCard:
     def _sentences(self, result: dict[str, Any]) -> list[str]:
         words, sentences = self.words, []
         if result["first"]:
-            sentences.append(result["first"])
+            sentences.append(words("export.first_difference", where=result["first"]))
         elif not result["decisions"]:
             sentences.append(words("export.nothing_proved"))
         elif not result["passed"]:
@@ -332,11 +351,13 @@ class _Exporting:
                 options, value=first, label=words("export.bundle"), on_change=lambda e: self._choose(e.value)
             )
             tag(select.classes("w-full"), "bundle")
-            self._about = tag(ui.column().classes("w-full"), "bundle-facts")
+            self._state = ui.column().classes("w-full")
             self._name = tag(ui.input(words("export.name")).props("maxlength=64").classes("w-full"), "name")
+            self._button = button("do", words("export.do"), self._start, "", icon="memory")
+            with _folded(words("export.about_network")):
+                self._about = tag(ui.column().classes("w-full"), "bundle-facts")
             with ui.expansion(words("export.more")).classes("w-full"):
                 await self._more()
-            self._button = button("do", words("export.do"), self._start, "", icon="memory")
             await self._choose(first)
 
     def _label(self, path: Path) -> str:
@@ -362,16 +383,19 @@ class _Exporting:
         chosen = await run.io_bound(lambda: BundleFacts.of(Path(path)))
         assert chosen is not None
         self.bundle = chosen
+        self._state.clear()
         self._about.clear()
-        with self._about:
+        with self._state:
             if chosen.bundle is None:
-                tag(notice(chosen.problem, "error"), "bundle-problem")
+                tag(notice(self.words.sentence(chosen.problem or ""), "error"), "bundle-problem")
             else:
                 if chosen.simulated:
                     notice(self.words("shell.simulation"))
-                facts(self._facts_of(chosen.bundle, chosen.bytes))
                 if chosen.cannot:
-                    tag(notice(chosen.cannot, "error"), "bundle-cannot")
+                    tag(notice(self.words.sentence(chosen.cannot), "error"), "bundle-cannot")
+        if chosen.bundle is not None:
+            with self._about:
+                facts(self._facts_of(chosen.bundle, chosen.bytes))
         self._name.set_value(self._free_name(Path(path).stem))
         self._allow()
 
@@ -390,7 +414,7 @@ class _Exporting:
             (words("export.layout"), bundle.layout.name),
             (words("export.trained_on"), trained if dataset else words("export.unknown_dataset")),
             (words("export.adapted_to"), bundle.adapted_to or ""),
-            (words("export.size"), size(bytes_)),
+            (words("export.size"), size(bytes_, words)),
         ]
         scores = origin.get("scores")
         if not isinstance(scores, dict) or "accuracy" not in scores:
@@ -415,7 +439,7 @@ class _Exporting:
     async def _start(self) -> None:
         self.page.say("")
         assert self.bundle is not None
-        with self.page.show_errors():
+        with errors_beside(self.page, self._name):
             bundle = self.workspace.inside(self.bundle.path)
             place = self.workspace.new(EXPORTS, self._name.value or "")
             dataset = str(self.workspace.inside(self._dataset.value)) if self._dataset.value else ""
@@ -461,7 +485,7 @@ class _Exporting:
             with self._detail:
                 text(words("export.one", name=name), "h2")
                 if export.problem:
-                    notice(export.problem, "error")
+                    notice(words.sentence(export.problem), "error")
                     return
                 show_facts(
                     self.page,
@@ -484,7 +508,7 @@ class _Exporting:
             rows.append(
                 (
                     link(each.name, address("export", name=each.name)),
-                    each.problem or str(each.facts["title"]),
+                    words.sentence(each.problem) if each.problem else str(each.facts["title"]),
                     words("export.simulation_short") if each.facts.get("simulated") else "",
                     moment(each.made_s) if each.made_s else "",
                     verification_verdict(words, each, proof),

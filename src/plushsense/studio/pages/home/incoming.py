@@ -298,9 +298,8 @@ class IncomingSection:
         facts(rows)
         gestures = [f"{words.gesture(label)}: {n}" for label, n in sorted(result["gestures"].items())]
         self._lines("preview_gestures", gestures)
-        notes = [
-            words.sentence(note) for note in result["notes"] if note["reason"] not in ("simulated", "layout_guessed")
-        ]
+        own = ("simulated", "layout_guessed")
+        notes = [words.sentence(n) for n in result["notes"] if not isinstance(n, dict) or n["reason"] not in own]
         if result["flagged"]:
             notes.append(words("home.flagged", n=result["flagged"]))
         for note in notes:

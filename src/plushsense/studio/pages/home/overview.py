@@ -15,13 +15,14 @@ from typing import Any
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import parse_name
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.build import RECORDER
 from plushsense.dataset.marks import MARKS
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead, RecordingInfo, read_index
 from plushsense.models.bundle import Bundle
 from plushsense.recording.session import is_finished
 from plushsense.recording.session_files import SessionHead
-from plushsense.studio.app.workspace import EXPORTS, Workspace, file_stamps
+from plushsense.studio.app.workspace import BACKUPS, EXPORTS, Workspace, file_stamps
 
 INDEX = "recordings.csv"
 # Number of recordings in one session of the paper; fewer than this from a single person are too few to train on.
@@ -95,6 +96,7 @@ class WorkspaceSummary:
     bundles: tuple[BundleEntry, ...] = ()
     exports: int = 0
     discarded: tuple[Path, ...] = ()
+    backups: tuple[Path, ...] = ()
 
     def batches(self) -> list[tuple[SessionEntry, ...]]:
         """Group sessions that can form one data set: same layout, all real or all simulated; real groups come first."""
@@ -173,7 +175,8 @@ class Overview:
             sessions = tuple(replace(s, active=f"{s.subject}/{s.session}" in active) for s in read)
             bundles = tuple(self._cached(p, _bundle, "") for p in self._workspace.bundles())
         exports = sum(1 for p in (self._workspace.folder / EXPORTS).glob("*") if p.is_dir() and p.name[0] != ".")
-        return WorkspaceSummary(datasets, sessions, bundles, exports, tuple(self._workspace.discarded()))
+        backups = tuple(sorted((self._workspace.folder / BACKUPS).glob("*.zip")))
+        return WorkspaceSummary(datasets, sessions, bundles, exports, tuple(self._workspace.discarded()), backups)
 
     def _cached(self, path: Path, read: Callable[[Path], Any], *files: str) -> Any:
         """Return ``read(path)``, cached until one of the files in ``path`` changes."""
@@ -183,10 +186,12 @@ class Overview:
         return self._cache[path][1]
 
 
-def _error_text(path: Path, cause: Exception) -> str:
-    if isinstance(cause, PlushSenseError):
-        return str(cause)
-    return f"'{path}' cannot be read: {getattr(cause, 'strerror', None) or cause}."
+def _refusal(path: Path, cause: Exception) -> Sentence:
+    if isinstance(cause, PlushSenseError) and cause.reason:
+        return Sentence.of(cause)
+    known = isinstance(cause, PlushSenseError)
+    message = str(cause) if known else f"'{path}' cannot be read: {getattr(cause, 'strerror', None) or cause}."
+    return Sentence(message, reason="entry_unreadable", path=path)
 
 
 def _dataset(path: Path) -> DatasetEntry:
@@ -195,7 +200,7 @@ def _dataset(path: Path) -> DatasetEntry:
         # A missing index is rebuilt when the data set is opened.
         rows = read_index(path / INDEX, RecordingInfo) if (path / INDEX).exists() else []
     except (PlushSenseError, OSError, ValueError, csv.Error) as cause:
-        return DatasetEntry(path, path.name, _error_text(path, cause))
+        return DatasetEntry(path, path.name, _refusal(path, cause))
     return DatasetEntry(
         path,
         head.name,
@@ -249,14 +254,14 @@ def _session(path: Path, datasets: Iterable[DatasetEntry]) -> SessionEntry:
             datasets=names,
         )
     except (PlushSenseError, OSError) as cause:
-        return SessionEntry(path, path.parent.name, path.name, refused=_error_text(path, cause))
+        return SessionEntry(path, path.parent.name, path.name, refused=_refusal(path, cause))
 
 
 def _bundle(path: Path) -> BundleEntry:
     try:
         bundle = Bundle.load(path)
     except (PlushSenseError, OSError) as cause:
-        return BundleEntry(path, path.stem, refused=_error_text(path, cause))
+        return BundleEntry(path, path.stem, refused=_refusal(path, cause))
     origin = bundle.provenance
     return BundleEntry(
         path, path.stem, str(origin.get("dataset") or ""), len(bundle.gestures), bool(origin.get("simulated"))

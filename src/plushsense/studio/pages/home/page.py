@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from markupsafe import Markup
 from nicegui import context, run, ui
 
+from plushsense.core.errors import need
 from plushsense.studio.app.jobs import RUNNING, Jobs
-from plushsense.studio.app.shell import Page, address, button, html, on_change, tag
+from plushsense.studio.app.shell import Page, address, button, html, named, on_change, tag
 from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.workspace import DATASETS, WORK
+from plushsense.studio.pages.home.datasets import DatasetSection
 from plushsense.studio.pages.home.incoming import IncomingSection
 from plushsense.studio.pages.home.overview import NextStep, Overview, WorkspaceSummary, next_step
 from plushsense.studio.pages.home.sections import (
-    DatasetSection,
     DiscardedSection,
     FileActions,
     JobList,
@@ -45,7 +47,7 @@ def bundles(page: Page, actions: FileActions) -> Callable[[WorkspaceSummary], No
                         ui.space()
                         actions.menu(entry.path, entry.name)
                     if entry.refused:
-                        ui.label(entry.refused).classes("ps-bad ps-break")
+                        ui.label(page.words.sentence(entry.refused)).classes("ps-bad ps-break")
                         continue
                     facts = [page.words("home.gestures", n=entry.gestures)]
                     if entry.dataset:
@@ -70,17 +72,35 @@ def invitation(page: Page) -> None:
         def show() -> None:
             place.clear()
             with place:
-                text = ui.input(words("home.invite_address"), value=invite()).props("readonly")
+                address_of_device = invite()
+                text = ui.input(words("home.invite_address"), value=address_of_device).props("readonly")
                 tag(text.classes("w-full ps-mono"), "invitation")
+                with page.show_errors():
+                    code = need("segno", "studio").make(address_of_device, error="m")
+                    # Light in the dark scheme, too: cameras do not read an inverted code.
+                    drawing = Markup(code.svg_inline(scale=5, border=3, light="#ffffff", dark="#000000"))
+                    image = html(drawing).props("role=img")
+                    tag(named(image, words("home.invite_code")), "invitation-code")
 
         button("invite-new", words("home.invite_new"), show)
 
 
-MAKING = ("simulate", "import")
-CHANGING = (*MAKING, "check", "train", "sweep", "search", "export", "publish")
+MAKING = ("simulate", "import", "restore")
+CHANGING = (
+    *MAKING,
+    "backup",
+    "restore",
+    "forget",
+    "pseudonymise",
+    "check",
+    "train",
+    "sweep",
+    "search",
+    "export",
+    "publish",
+)
 # Enough data to train a network, but simulated within seconds.
 _PEOPLE, _REPETITIONS = 6, 2
-_TRY_NAME = "virtual toy"
 
 
 async def show(page: Page) -> None:
@@ -179,7 +199,8 @@ class NextStepCard:
         workspace = self._page.workspace
         batch = next(b for b in self._summary.batches() if any(s.waiting for s in b))
         with self._page.show_errors():
-            place = workspace.dataset_for(batch[0].layout, batch[0].simulated)
+            name = self._page.words("home.new_dataset")
+            place = workspace.dataset_for(batch[0].layout, batch[0].simulated, name)
             title = self._page.words("home.import_title", name=workspace.title(place))
             self._jobs.import_sessions([s.path for s in batch if s.waiting], place, title)
 
@@ -189,10 +210,11 @@ class NextStepCard:
         with self._page.show_errors():
             if not workspace.toy:
                 self._toys.person(7)
+            name = workspace.free_name(DATASETS, self._page.words("home.try_name"), separator=" ")
             spec = {
                 "people": _PEOPLE,
                 "repetitions": _REPETITIONS,
-                "dest": str(workspace.folder / DATASETS / workspace.free_name(DATASETS, _TRY_NAME, separator=" ")),
+                "dest": str(workspace.folder / DATASETS / name),
                 "work": str(workspace.folder / WORK),
             }
             self._jobs.start("simulate", spec, self._page.words("home.try_title"))

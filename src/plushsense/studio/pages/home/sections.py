@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from nicegui import ui
 
+from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, address, button, html, moment, named, on_page, tag
-from plushsense.studio.app.workspace import DATASETS, DISCARDED
+from plushsense.studio.app.workspace import BACKUPS, DATASETS, DISCARDED
 from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
-from plushsense.studio.widgets.elements import ask, change_files, item_menu, summary
+from plushsense.studio.widgets.elements import ask, change_files, item_menu, summary, title_of
 
 SMALL = 'outline padding="4px 12px"'
 """Quasar properties of the buttons inside rows of a list."""
@@ -28,6 +29,8 @@ PAGE_OF = {
     "export": "export",
     "verify": "export",
     "publish": "publish",
+    "pseudonymise": "publish",
+    "restore": "review",
 }
 """Maps each task to the page that displays its result."""
 _SIGNS = {RUNNING: "▶", DONE: "✓", REFUSED: "✕", STOPPED: "■"}
@@ -62,8 +65,8 @@ class FileActions:
     def __init__(self, page: Page, jobs: Jobs, refresh: Callable[[], Awaitable[None]]) -> None:
         self._page, self._jobs, self._refresh = page, jobs, refresh
 
-    def menu(self, path: Path, name: str) -> None:
-        """Add the menu of a data set or bundle."""
+    def menu(self, path: Path, name: str, more: Mapping[str, Callable[[], Any]] | None = None) -> None:
+        """Add the menu of a data set or bundle; ``more`` maps the texts of further items to their functions."""
         words, workspace = self._page.words, self._page.workspace
 
         async def rename(new: str) -> None:
@@ -80,7 +83,7 @@ class FileActions:
             title = words("home.rename_title", name=name)
             ask(words, title, words("home.rename"), rename, words("home.new_name"), name)
 
-        item_menu(words, name, {words("home.rename"): ask_name, words("shell.discard"): discard})
+        item_menu(words, name, {words("home.rename"): ask_name, **(more or {}), words("shell.discard"): discard})
 
     async def change(self, work: Callable[[], Any], message: str, undo: Callable[[Any], Any] | None = None) -> None:
         """Change files as `change_files` does."""
@@ -124,62 +127,7 @@ class DiscardedSection:
             button("", words("home.delete"), ask_delete, SMALL, about=name)
 
 
-class DatasetSection:
-    """Section that lists the data sets, with links to the pages that use them."""
-
-    def __init__(self, page: Page, jobs: Jobs, actions: FileActions) -> None:
-        self._page, self._jobs, self._actions = page, jobs, actions
-        with titled_card(page, "home.datasets", "datasets"):
-            self._rows = ui.column().classes("w-full ps-small-gap")
-
-    def fill(self, summary: WorkspaceSummary) -> None:
-        """Replace the displayed data sets by those of ``summary``."""
-        self._rows.clear()
-        with self._rows:
-            if not summary.datasets:
-                ui.label(self._page.words("home.no_datasets")).classes("ps-dim")
-            for entry in summary.datasets:
-                self._row(entry)
-
-    def _row(self, entry: DatasetEntry) -> None:
-        page, words = self._page, self._page.words
-        with tag(ui.column().classes("ps-row w-full"), "dataset"):
-            with ui.row().classes("items-center w-full ps-small-gap"):
-                ui.label(entry.name).classes("text-bold")
-                if entry.simulated:
-                    simulation_badge(page)
-                ui.space()
-                self._actions.menu(entry.path, entry.name)
-            if entry.refused:
-                ui.label(entry.refused).classes("ps-bad")
-                return
-            excluded = f" ({words('home.excluded', n=entry.excluded)})" if entry.excluded else ""
-            facts = [
-                words("home.people", n=entry.people),
-                words("home.recordings", n=entry.recordings) + excluded,
-                _size(page, entry.bytes),
-                entry.layout,
-            ]
-            ui.label(" · ".join(facts)).classes("ps-dim")
-            checks = [j for j in self._jobs.all("check") if j.spec.get("dataset") == str(entry.path)]
-            last = next((j for j in checks if j.state == DONE and j.result.get("dataset") == str(entry.path)), None)
-            ui.label(_findings(page, last.result) if last is not None else words("home.unchecked"))
-            with ui.row().classes("items-center ps-small-gap"):
-                page_links(page, ("review", "train", "publish"), entry.name, dataset=entry.path)
-                if not any(j.state == RUNNING for j in checks):
-                    button("check", words("home.check"), lambda: self._check(entry), SMALL, about=entry.name)
-
-    def _check(self, entry: DatasetEntry) -> None:
-        with self._page.show_errors():
-            title = self._page.words("home.check_title", name=entry.name)
-            self._jobs.start("check", {"dataset": str(entry.path)}, title)
-
-
-def _size(page: Page, count: float) -> str:
-    return f"{page.words.number(count / 1e6, 1)} MB" if count < 1e9 else f"{page.words.number(count / 1e9, 2)} GB"
-
-
-def _findings(page: Page, result: dict[str, Any]) -> str:
+def findings_text(page: Page, result: dict[str, Any]) -> str:
     """Summarise the findings of a check in one line."""
     counts = result.get("by_severity") or {}
     return page.words(
@@ -244,7 +192,7 @@ class SessionSection:
     def _describe(self, entry: SessionEntry) -> str:
         words = self._page.words
         if entry.refused:
-            return f"{entry.subject}/{entry.session}: {entry.refused}"
+            return f"{entry.subject}/{entry.session}: {words.sentence(entry.refused)}"
         facts = [
             entry.subject,
             words("home.session", name=entry.session),
@@ -313,12 +261,12 @@ class JobList:
             bar.set_visibility(share is not None)
 
     def _row(self, job: StudioJob) -> None:
-        words = self._page.words
-        ui.label(f"{_SIGNS[job.state]} {job.title}").classes("text-bold ps-break")
+        words, title = self._page.words, title_of(self._page.words, job)
+        ui.label(f"{_SIGNS[job.state]} {title}").classes("text-bold ps-break")
         if job.state == RUNNING:
             label = tag(ui.label(), "job-progress")
             bar = ui.linear_progress(0.0, show_value=False, size="10px").props("rounded")
-            self._progress_bars[job.id] = (label, named(bar, job.title))
+            self._progress_bars[job.id] = (label, named(bar, title))
         else:
             ui.label(f"{words(f'home.{job.state}')} · {moment(job.ended_s or job.begun_s)}").classes("ps-dim")
         if job.state == REFUSED:
@@ -326,10 +274,8 @@ class JobList:
         if job.state == DONE:
             self._result(job)
         with ui.row().classes("items-center ps-small-gap"):
-            if job.state == DONE:
-                page_links(
-                    self._page, (PAGE_OF.get(job.task, "home"),), job.title, dataset=job.result.get("dataset") or ""
-                )
+            if job.state == DONE and job.task in PAGE_OF:
+                page_links(self._page, (PAGE_OF[job.task],), title, dataset=job.result.get("dataset") or "")
             if job.state == RUNNING:
                 self._button("stop", job, lambda: self._jobs.stop(job.id))
                 return
@@ -342,7 +288,7 @@ class JobList:
             with self._page.show_errors():
                 action()
 
-        button(f"job-{key}", self._page.words(f"home.{key}"), clicked, SMALL, about=job.title)
+        button(f"job-{key}", self._page.words(f"home.{key}"), clicked, SMALL, about=title_of(self._page.words, job))
 
     def _progress(self, job: StudioJob) -> tuple[str, float | None]:
         """Return the progress as text, and as a fraction from 0 to 1 (None if unknown)."""
@@ -350,20 +296,31 @@ class JobList:
         text = f"{self._page.words('home.running')} · {minutes}:{seconds:02d}"
         done, total = job.progress.get("done"), job.progress.get("total")
         if isinstance(done, int | float) and isinstance(total, int | float) and total > 0:
-            return f"{text} · {done:g} / {total:g}", min(1.0, done / total)
+            share = min(1.0, done / total)
+            count = f"{100 * share:.0f} %" if job.task in ("backup", "restore") else f"{done:g} / {total:g}"
+            return f"{text} · {count}", share
         return text, None
 
     def _result(self, job: StudioJob) -> None:
         page, words, result = self._page, self._page.words, job.result
         if job.task == "check":
-            ui.label(_findings(page, result))
-        if job.task in ("import", "simulate"):
+            ui.label(findings_text(page, result))
+        if job.task == "backup":
+            place = Path(job.spec["place"])
+            ui.label(words("home.backup_done", file=str(place))).classes("ps-break")
+            link = ui.link(words("home.download"), download_address(BACKUPS, place.stem)).classes("ps-link")
+            tag(link.props("download"), "download")
+        if job.task == "forget":
+            ui.label(words("home.forget_done", n=result["files"]))
+        if job.task in ("import", "simulate", "restore"):
             people = result.get("subjects", result.get("people", 0))
             facts = [words("home.recordings", n=result["recordings"]), words("home.people", n=people)]
             if job.spec.get("add"):
                 facts.append(words("home.new", n=result["added"]["recordings"]))
             ui.label(" · ".join(facts))
         warnings = [words.sentence(w) for w in (*job.warnings, *result.get("warnings", ()))]
+        if result.get("flagged"):
+            warnings.append(words("home.flagged", n=result["flagged"]))
         rejected = [f"{r['file']}: {words.sentence(r['reason'])}" for r in result.get("rejected", ())]
         for key, lines in (("warnings", warnings), ("rejected", rejected)):
             if lines:

@@ -28,7 +28,7 @@ def collect(page: Page, folder: Path) -> None:
     head = SessionHead.read(folder)
     if head is None:
         raise DatasetError(f"'{folder}' holds no session.", reason="session_missing", name=folder.name)
-    place = page.workspace.dataset_for(str(head.layout["name"]), head.simulated)
+    place = page.workspace.dataset_for(str(head.layout["name"]), head.simulated, words("home.new_dataset"))
     name = page.workspace.title(place)
     job = jobs.import_sessions([folder], place, words("home.import_title", name=name))
     page.say(words("record.collecting", name=name))
