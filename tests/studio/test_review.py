@@ -516,11 +516,11 @@ def test_links_from_other_pages(waves: Path, studio: Fixture, look: Fixture) -> 
     page.wait_for_function(f"() => document.querySelectorAll('[data-test=table] tbody tr').length === {len(ids)}")
     assert "not in this data set: 99" in marked(page, "message").inner_text()
     page = browser.open(started.url + "/review?recording=P1/none")
-    page.get_by_text("There is no recording 'P1/none'").wait_for()
+    page.get_by_text("There is no recording “P1/none”").wait_for()
     page = browser.open(started.url + "/review?selection=0000")
-    page.get_by_text("The selection '0000' does not exist").wait_for()
+    page.get_by_text("The selection “0000” does not exist").wait_for()
     page = browser.open(started.url + "/review?dataset=/etc")
-    page.get_by_text("lies outside the studio's folders").wait_for()
+    page.get_by_text("is not in the studio's folder").wait_for()
     assert browser.complaints == []
 
 
@@ -537,7 +537,7 @@ def test_a_folder_that_cannot_be_written(waves: Path, studio: Fixture, look: Fix
     page.keyboard.press("ArrowRight")
     state(page, "draft")
     page.keyboard.press("Enter")
-    page.locator("[role=alert]:has-text('marks.jsonl')").wait_for()
+    page.locator("[role=alert]:has-text('cannot be written')").wait_for()
     assert "cannot be written" in marked(page, "message").inner_text()
     assert axe(page) == []
     assert shown(page) == first
@@ -584,7 +584,7 @@ def test_a_broken_data_set_is_a_sentence(waves: Path, studio: Fixture, look: Fix
     (torn / "marks.jsonl").write_text("[1]\n")
     browser = look()
     started = studio(home=waves.parents[1])
-    for name, said in (("broken", "dataset.toml"), ("torn", "line 1, what was given is [1]: accepted is a table")):
+    for name, said in (("broken", "dataset.toml"), ("torn", "marks.jsonl is damaged")):
         page = browser.open(f"{started.url}/review?dataset=datasets/{name}")
         assert said in marked(page, "message").inner_text()
         assert axe(page) == []
@@ -641,7 +641,7 @@ def test_a_stretch_of_a_stream_is_labelled_by_mouse_and_keys(
         f"() => document.querySelector('{STREAM}')?.psPlot?.u && document.querySelector('{STREAM}').dataset.recording"
     )
     checked(page)
-    assert "20 s, 0 labelled" in marked(page, "stream-about").inner_text()
+    assert "20 s · labelled stretches: 0" in marked(page, "stream-about").inner_text()
     marked(page, "label-rest").click()
     page.get_by_text("Select a stretch first").wait_for()
     low, high = page.evaluate(
@@ -684,7 +684,7 @@ def test_a_stretch_of_a_stream_is_labelled_by_mouse_and_keys(
         (pytest.approx(first, abs=5), pytest.approx(last, abs=5))
         for first, last in ((100, 400), (800, 1000), (1400, 1600))
     ]
-    assert "3 labelled" in marked(page, "stream-about").inner_text()
+    assert "labelled stretches: 3" in marked(page, "stream-about").inner_text()
     page.keyboard.press("u")
     page.wait_for_selector("[data-test=stretches] :text('Handling')", state="detached")
     drag(2.0, 3.0)

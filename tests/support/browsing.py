@@ -41,7 +41,7 @@ CHROMIUM = [
 ]
 _PROGRAMS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 _START_S = 60.0
-_WAIT_MS = 15_000
+_WAIT_MS = 60_000
 _SETTLE_MS = 200
 _POLL_MS = 25
 DESK, TABLET, PHONE = (1280, 800), (820, 1180), (390, 844)

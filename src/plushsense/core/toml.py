@@ -59,19 +59,22 @@ def read_toml(path: Path, kind: str, error: type[BadInput]) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
-        raise error(f"There is no {kind} file '{path}': check the path.") from None
+        raise error(f"There is no {kind} file '{path}': check the path.", reason="no_file", name=path.name) from None
     except (OSError, UnicodeDecodeError) as cause:
-        raise error(f"The {kind} file '{path}' cannot be read ({cause}): give a UTF-8 TOML file.") from None
+        message = f"The {kind} file '{path}' cannot be read ({cause}): give a UTF-8 TOML file."
+        raise error(message, reason="file_broken", name=path.name) from None
     except (tomllib.TOMLDecodeError, RecursionError) as cause:
-        raise error(f"The {kind} file '{path}' is not valid TOML: {cause}.") from None
+        message = f"The {kind} file '{path}' is not valid TOML: {cause}."
+        raise error(message, reason="file_broken", name=path.name) from None
 
 
-def load_table(table: object, kind: type[T], where: str, error: type[BadInput]) -> T:
+def load_table(table: object, kind: type[T], where: str, error: type[BadInput], reason: str = "") -> T:
     """Create an instance of the dataclass ``kind`` from a table.
 
     Args:
         table: its keys are the fields of ``kind``; inner tables become dataclasses, and lists become tuples.
         where: name of the table in messages, such as "layout 'plush-15'".
+        reason: that of the error.
 
     Raises:
         error: for the first unknown or missing key or unfit value; the message has its path.
@@ -80,7 +83,7 @@ def load_table(table: object, kind: type[T], where: str, error: type[BadInput]) 
         made: T = _converter().structure(table, kind)
     except Exception as cause:  # noqa: BLE001
         steps, leaf, expected = next(_leaves(cause, (), kind))
-        raise error(_message(table, steps, leaf, expected, where)) from None
+        raise error(_message(table, steps, leaf, expected, where), reason=reason, where=where) from None
     return made
 
 

@@ -82,7 +82,11 @@ def open_dataset(path: str | Path) -> Dataset:
         if missing := missing_files(folder):
             raise DatasetError(
                 f"'{folder}' lacks {len(missing)} raw file{'s' if len(missing) > 1 else ''} that it had "
-                f"('{missing[0]}'): restore them, or delete {STAMP} there to go on without them."
+                f"('{missing[0]}'): restore them, or delete {STAMP} there to go on without them.",
+                reason="raw_files_missing",
+                folder=folder.name,
+                n=len(missing),
+                file=missing[0],
             )
         stamp = current_stamp(folder)
         if is_same_raw_data(folder, stamp):
@@ -92,13 +96,21 @@ def open_dataset(path: str | Path) -> Dataset:
         else:
             built = build_index(folder, head)
     except OSError as cause:
-        raise DatasetError(f"'{folder}' cannot be read: {cause.strerror or cause} ({cause.filename}).") from None
+        raise DatasetError(
+            f"'{folder}' cannot be read: {cause.strerror or cause} ({cause.filename}).",
+            reason="dataset_unreadable",
+            folder=folder.name,
+            why=cause.strerror or str(cause),
+        ) from None
     if built.unreadable:
         file, reason = next(iter(built.unreadable.items()))
         raise DatasetError(
             f"'{folder / file}' can no longer be read"
             f"{f', nor can {len(built.unreadable) - 1} other files' if len(built.unreadable) > 1 else ''}: "
-            f"restore it, or remove it from the data set. {reason}"
+            f"restore it, or remove it from the data set. {reason}",
+            reason="raw_file_unreadable",
+            folder=folder.name,
+            file=file,
         )
     try:
         with generation.writing():
@@ -293,7 +305,9 @@ def _recordings_from_files(
         name = parse_name(read.path.name)
         if name is None:
             raise DatasetError(
-                f"'{read.path}' is not named <label>_<epoch ms>_<rows>.csv: move it out of {RECORDINGS}/."
+                f"'{read.path}' is not named <label>_<epoch ms>_<rows>.csv: move it out of {RECORDINGS}/.",
+                reason="raw_file_name",
+                file=read.path.name,
             )
         if name.label not in gestures:
             gestures[name.label] = head.gestures.find(name.label)

@@ -64,7 +64,9 @@ def check_label(dataset: Dataset, label: str) -> str:
     known = [HANDLING, REST, *(PRACTICE + each for each in dataset.gestures.labels)]
     raise DatasetError(
         f"The label '{label}' is unknown: accepted are {HANDLING}, {REST}, and {PRACTICE} with a gesture of "
-        f"'{dataset.head.name}', such as '{known[-1]}'.{nearest(label, known)}"
+        f"'{dataset.head.name}', such as '{known[-1]}'.{nearest(label, known)}",
+        reason="label_unknown",
+        label=label,
     )
 
 
@@ -77,10 +79,14 @@ def find_streams(dataset: Dataset, pattern: str = "*") -> list[StreamInfo]:
     if dataset.layout.is_labelled:
         raise DatasetError(
             f"The streams of '{dataset.head.name}' have a label on every row (layout '{dataset.layout.name}'): nothing "
-            "between the recordings is left to label."
+            "between the recordings is left to label.",
+            reason="stream_labelled",
         )
     if not dataset.streams:
-        raise DatasetError(f"'{dataset.head.name}' has no streams: labels are for streams, between the recordings.")
+        raise DatasetError(
+            f"'{dataset.head.name}' has no streams: labels are for streams, between the recordings.",
+            reason="no_streams",
+        )
     ids = {s.id: s for s in dataset.streams}
     return [ids[identity] for identity in match_ids(pattern, ids, "stream")]
 
@@ -127,7 +133,12 @@ def label_stretches(
     for s in stretches:
         (stream,) = find_streams(dataset, s.stream)
         if not 0 <= s.start < s.stop <= stream.rows:
-            raise DatasetError(f"'{s.stream}' has rows 0 to {stream.rows}: {s.start} to {s.stop} cannot be labelled.")
+            raise DatasetError(
+                f"'{s.stream}' has rows 0 to {stream.rows}: {s.start} to {s.stop} cannot be labelled.",
+                reason="rows_not_labelled",
+                start=s.start,
+                stop=s.stop,
+            )
         checked.append(LabelledStretch(s.stream, s.start, s.stop, check_label(dataset, s.label)))
     name, now = author_name(who), dict(read_marks(dataset.path))
     marks, new = [], []

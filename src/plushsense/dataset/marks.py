@@ -99,7 +99,10 @@ def _refuse_contradictions(mark: Mark, where: str) -> None:
     """Raise DatasetError for a mark whose values contradict each other, or are out of range."""
     if mark.action not in ACTIONS:
         raise DatasetError(
-            f"{where}: unknown mark '{mark.action}': accepted are {', '.join(ACTIONS)}.{nearest(mark.action, ACTIONS)}"
+            f"{where}: unknown mark '{mark.action}': accepted are {', '.join(ACTIONS)}.{nearest(mark.action, ACTIONS)}",
+            reason="marks_unknown",
+            where=where,
+            action=mark.action,
         )
     for key, low in (("start", 0), ("stop", -1)):
         if (value := getattr(mark, key)) < low:
@@ -137,7 +140,7 @@ def match_ids(pattern: str, known: Iterable[str], kind: str) -> list[str]:
     if not matched:
         hint = nearest(pattern, ids)
         example = f" For example '{ids[0]}', or a pattern such as 'P01/*'." if ids and not hint else ""
-        raise DatasetError(f"There is no {kind} '{pattern}'.{hint}{example}")
+        raise DatasetError(f"There is no {kind} '{pattern}'.{hint}{example}", reason="no_such_id", name=pattern)
     return matched
 
 
@@ -170,7 +173,11 @@ def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
                     lines.insert(0, "\n")
             file.write("".join(lines).encode("utf-8"))
     except OSError as cause:
-        raise DatasetError(f"'{path}' cannot be written: {cause.strerror or cause}.") from None
+        raise DatasetError(
+            f"'{path}' cannot be written: {cause.strerror or cause}.",
+            reason="marks_not_written",
+            why=cause.strerror or str(cause),
+        ) from None
 
 
 def read_marks(folder: Path) -> dict[str, MarkState]:
@@ -212,7 +219,11 @@ class MarksFollower:
                 file.seek(self._bytes)
                 *whole, rest = file.read().split(b"\n")
         except OSError as cause:
-            raise DatasetError(f"'{self._path}' cannot be read: {cause.strerror or cause}.") from None
+            raise DatasetError(
+                f"'{self._path}' cannot be read: {cause.strerror or cause}.",
+                reason="marks_not_read",
+                why=cause.strerror or str(cause),
+            ) from None
         states = dict(self._states)
         for line in whole:
             self._take(line, self._lines + 1, states)
@@ -234,7 +245,11 @@ class MarksFollower:
         except FileNotFoundError:
             return None
         except OSError as cause:
-            raise DatasetError(f"'{self._path}' cannot be read: {cause.strerror or cause}.") from None
+            raise DatasetError(
+                f"'{self._path}' cannot be read: {cause.strerror or cause}.",
+                reason="marks_not_read",
+                why=cause.strerror or str(cause),
+            ) from None
         return now.st_ino, now.st_size, now.st_mtime_ns
 
     def _continues(self, file: BinaryIO, now: tuple[int, int, int]) -> bool:
@@ -250,7 +265,7 @@ class MarksFollower:
         except (ValueError, RecursionError):
             return
         where = f"'{self._path}' line {number}"
-        mark = load_table(table, Mark, where, DatasetError)
+        mark = load_table(table, Mark, where, DatasetError, "marks_broken")
         _refuse_contradictions(mark, where)
         states[mark.recording] = apply_mark(states.get(mark.recording, MarkState()), mark)
 

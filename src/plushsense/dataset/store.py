@@ -78,12 +78,16 @@ class Generation:
         if self.of(self.folder) != self:
             raise ForgottenError(
                 f"A person was removed from '{self.folder}' (plushsense forget) while this ran, so its results were "
-                "not written: run it again on the data set as it is now."
+                "not written: run it again on the data set as it is now.",
+                reason="person_removed",
+                folder=self.folder.name,
             )
         if (self.folder / UNDER_WAY).exists():
             raise ForgottenError(
                 f"The removal of a person from '{self.folder}' is not finished, so nothing was written: run  "
-                "plushsense forget  there first."
+                "plushsense forget  there first.",
+                reason="removal_unfinished",
+                folder=self.folder.name,
             )
 
     @contextmanager
@@ -101,7 +105,9 @@ class Generation:
             lock.acquire()
         except Timeout:
             raise DatasetError(
-                f"Another program has held '{self.folder / LOCK}' for {_LOCK_S / 60:.0f} minutes: end it first."
+                f"Another program has held '{self.folder / LOCK}' for {_LOCK_S / 60:.0f} minutes: end it first.",
+                reason="dataset_locked",
+                folder=self.folder.name,
             ) from None
         except (OSError, NotImplementedError):
             pass
@@ -245,16 +251,27 @@ class DatasetHead:
         """Read the head of the data set in ``folder``; raise DatasetError if the folder is missing or no data set."""
         path = folder / HEAD
         if not folder.is_dir():
-            raise DatasetError(f"There is no folder '{folder}': give the folder of a data set.")
+            raise DatasetError(
+                f"There is no folder '{folder}': give the folder of a data set.",
+                reason="no_dataset_folder",
+                folder=folder.name,
+            )
         if not path.is_file():
             raise DatasetError(
-                f"'{folder}' is not a data set (it has no {HEAD}): create one with  plushsense import SRC {folder}"
+                f"'{folder}' is not a data set (it has no {HEAD}): create one with  plushsense import SRC {folder}",
+                reason="not_a_dataset",
+                folder=folder.name,
             )
         table = read_toml(path, "data set", DatasetError)
         version = table.pop("format", None)
         if version != FORMAT_VERSION:
-            raise DatasetError(f"'{path}' has the format {version}; this version reads {FORMAT_VERSION}.")
-        file = load_table(table, _HeadFile, f"'{path}'", DatasetError)
+            raise DatasetError(
+                f"'{path}' has the format {version}; this version reads {FORMAT_VERSION}.",
+                reason="dataset_format",
+                folder=folder.name,
+                version=version,
+            )
+        file = load_table(table, _HeadFile, f"'{path}'", DatasetError, "head_broken")
         values = vars(file) | {
             "layout": Layout.from_dict(file.layout, f"layout in '{path}'"),
             "gestures": GestureSet.from_dict(file.gesture_set, f"gesture set in '{path}'"),

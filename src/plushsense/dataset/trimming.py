@@ -107,7 +107,8 @@ def suggest_trims(
     if dataset.layout.is_labelled:
         raise DatasetError(
             f"The recordings of '{dataset.head.name}' are cut where the label on the rows changes (layout "
-            f"'{dataset.layout.name}'), so there is no reaction time to trim: trim data sets of single recordings."
+            f"'{dataset.layout.name}'), so there is no reaction time to trim: trim data sets of single recordings.",
+            reason="dataset_not_trimmed",
         )
     chosen = list(dataset.used if recordings is None else recordings)
     marks = read_marks(dataset.path)
@@ -200,7 +201,13 @@ def set_rows(dataset: Dataset, trim: Trim, start: int, stop: int, who: str, why:
     """
     info = trim.recording
     if not 0 <= start < stop <= info.rows:
-        raise DatasetError(f"'{info.id}' has rows 0 to {info.rows}: {start} to {stop} cannot be kept.")
+        raise DatasetError(
+            f"'{info.id}' has rows 0 to {info.rows}: {start} to {stop} cannot be kept.",
+            reason="rows_not_kept",
+            recording=info.id,
+            start=start,
+            stop=stop,
+        )
     if trim.state == "adjusted" and trim.current_rows() == (start, stop):
         return False
     end = stop if stop < info.rows else -1

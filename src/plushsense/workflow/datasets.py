@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from plushsense.core.errors import BundleError, ConfigError, DatasetError
 from plushsense.core.files import write_file
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.index import as_dataset, open_dataset
 from plushsense.dataset.marks import append_marks
 from plushsense.dataset.privacy.forget import RemovalPlan, plan_removal
@@ -214,9 +215,9 @@ def publish_dataset(
             write_file(dataset.path / HEAD, head.to_toml())
         except OSError as cause:
             # The package is complete: this is only a warning.
-            done.warnings.append(
-                f"licence, contact and consent could not be written into '{dataset.path}': {cause.strerror or cause}"
-            )
+            why = cause.strerror or str(cause)
+            message = f"licence, contact and consent could not be written into '{dataset.path}': {why}"
+            done.warnings.append(Sentence(message, "statements_not_kept", why=why))
     return done
 
 
@@ -237,10 +238,17 @@ def _read_key(path: Path, *beside: Path) -> bytes:
         return key
     except ValueError:
         raise DatasetError(
-            f"'{path}' is not a key of plushsense publish: give a file that does not exist yet."
+            f"'{path}' is not a key of plushsense publish: give a file that does not exist yet.",
+            reason="no_key_file",
+            file=path.name,
         ) from None
     except OSError as cause:
-        raise DatasetError(f"The key '{path}' cannot be used: {cause.strerror or cause}.") from None
+        raise DatasetError(
+            f"The key '{path}' cannot be used: {cause.strerror or cause}.",
+            reason="key_not_written",
+            file=path.name,
+            why=cause.strerror or str(cause),
+        ) from None
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, Layout
 from plushsense.core.recorder_csv import ReadResult, parse_name, read_recording, read_stream
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.files import STAMP, DatasetFile, list_files, match_code, person_folders
 from plushsense.dataset.index import DUPLICATE_FOLDER, build_index, open_dataset, write_index_files
 from plushsense.dataset.marks import MARKS
@@ -121,7 +122,10 @@ def pseudonymise(
             return _Pseudonymisation(source, key, words, drop_notes, progress).run(dest)
     except OSError as cause:
         raise DatasetError(
-            f"'{cause.filename or folder}' cannot be used ({cause.strerror or cause}): check the path and the disk."
+            f"'{cause.filename or folder}' cannot be used ({cause.strerror or cause}): check the path and the disk.",
+            reason="not_readable",
+            name=folder.name,
+            why=cause.strerror or str(cause),
         ) from None
 
 
@@ -178,7 +182,9 @@ class _Pseudonymisation:
         # Write in the order of the new codes, so that the times of files do not reveal the old order.
         self.files = sorted(files, key=lambda c: (self._pseudonym(c.person).code if c.person else "", c.path))
         if self.names.too_short:
-            self.notes.add("", f"too short to be searched in texts: {_listed(self.names.too_short)}; read the notes")
+            listed = _listed(self.names.too_short)
+            message = f"too short to be searched in texts: {listed}; read the notes"
+            self.notes.add("", Sentence(message, "names_too_short", listed=listed))
 
     def _pseudonym(self, person: str) -> Pseudonym:
         return self.codes.get(person) or self.codes[match_code(person, self.people) or NOBODY]
@@ -199,19 +205,24 @@ class _Pseudonymisation:
             for file, name in find_traces(work, old, self.names, times):
                 raise DatasetError(
                     f"'{file}' would still hold '{name}': nothing was written. If that is a gesture or another word of "
-                    "the data, rename the person or the gesture first; if the file does not belong there, remove it."
+                    "the data, rename the person or the gesture first; if the file does not belong there, remove it.",
+                    reason="name_remains",
+                    file=file,
+                    name=name,
                 )
             files = len(list_files(work))
             write_key(self.key, self.codes)
         if self.notes.prose:
-            self.notes.add("", f"{self.notes.prose} notes in free text were kept: names are replaced, but read them")
+            message = f"{self.notes.prose} notes in free text were kept: names are replaced, but read them"
+            self.notes.add("", Sentence(message, "free_text_kept", n=self.notes.prose))
         words = sorted({s for new in self.moved.values() for s in PurePosixPath(new).parts[2:-1] if _in_words(s)})
         if words:
-            self.notes.add(
-                "",
-                f"names of sessions that are words stay as they are: {_listed(words)}; if one identifies a person, add "
-                "it to --words",
+            listed = _listed(words)
+            message = (
+                f"names of sessions that are words stay as they are: {listed}; if one identifies a person, add it to "
+                "--words"
             )
+            self.notes.add("", Sentence(message, "session_names_kept", listed=listed))
         result = Dataset(dest, made.head, made.recordings, made.streams)
         return PseudonymisationResult(result, files, self.notes.merged(), self.key)
 
@@ -233,7 +244,9 @@ class _Pseudonymisation:
             times += clocks.values()
             if not _same(before, reader(target, self.source.layout), clocks, shift_ms):
                 raise DatasetError(
-                    f"The times in '{content.path}' cannot be shifted alone, so nothing was written: exclude it."
+                    f"The times in '{content.path}' cannot be shifted alone, so nothing was written: exclude it.",
+                    reason="times_not_shifted",
+                    file=content.path,
                 )
             if self.progress is not None:
                 self.progress(done, len(raw))
@@ -253,7 +266,8 @@ class _Pseudonymisation:
         for content in self.files:
             path = self.folder / content.path
             if content.path.name == ORIGIN:
-                self.notes.add("", f"'{ORIGIN}' of a converted file was left out: it names the file that it came from")
+                message = f"'{ORIGIN}' of a converted file was left out: it names the file that it came from"
+                self.notes.add("", Sentence(message, "origin_left_out", file=ORIGIN))
             elif content.kind == "words" and content.person:
                 new = self._place(content)
                 text = redact_json(path, new.as_posix(), self._words(content.person))
@@ -270,7 +284,8 @@ class _Pseudonymisation:
             elif content.kind in ("other", "link", "words"):
                 left.append(content.path.as_posix())
         if left:
-            self.notes.add("", f"not copied, since their contents are not known: {_listed(left)}")
+            message = f"not copied, since their contents are not known: {_listed(left)}"
+            self.notes.add("", Sentence(message, "files_not_copied", listed=_listed(left)))
 
     def _words_of_id(self, identity: str) -> Redactor | None:
         if not identity:
@@ -297,15 +312,17 @@ class _Pseudonymisation:
         new = {r.id: r for r in made.recordings}
         wrong = sorted(old.keys() ^ new.keys()) or [i for i in old if not self._agrees(old[i], new[i])]
         if wrong or len(made.streams) != len(self.source.streams):
-            raise DatasetError(f"The new data set would differ from the old one ({_listed(wrong)}): report it.")
+            raise DatasetError(
+                f"The new data set would differ from the old one ({_listed(wrong)}): report it.", reason="copy_differs"
+            )
         across = [r for r in self.source.recordings for f in r.flags if f.startswith(_SAME)]
         lost = [r for r in across if not any(f.startswith(_SAME) for f in new[self._renamed(r.id)].flags)]
         if lost:
-            self.notes.add(
-                "",
+            message = (
                 f"{len(lost)} recordings have the same content as one of another person, which their different shifts "
-                "of time now hide: check them in the original",
+                "of time now hide: check them in the original"
             )
+            self.notes.add("", Sentence(message, "same_content_hidden", n=len(lost)))
 
     def _agrees(self, old: RecordingInfo, new: RecordingInfo) -> bool:
         def facts(r: RecordingInfo) -> tuple[Any, ...]:
@@ -326,7 +343,7 @@ def _in_words(session: str) -> bool:
 
 def _listed(names: Iterable[str]) -> str:
     listed = list(names)
-    more = f" and {len(listed) - _SHOWN} more" if len(listed) > _SHOWN else ""
+    more = f", … (+{len(listed) - _SHOWN})" if len(listed) > _SHOWN else ""
     return ", ".join(f"'{n}'" for n in listed[:_SHOWN]) + more
 
 

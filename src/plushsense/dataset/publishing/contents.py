@@ -28,6 +28,7 @@ from plushsense.core.recorder_csv import (
     read_stream,
     recording_filename,
 )
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.index import DUPLICATE_FOLDER, build_index
 from plushsense.dataset.marks import MARKS, Mark, MarkState, mark_line, read_marks
 from plushsense.dataset.store import (
@@ -124,7 +125,7 @@ class PackageContents:
     dataset: Dataset
     people: dict[str, PersonInfo]
     origin: dict[str, RecordingInfo]
-    notes: tuple[str, ...]
+    notes: tuple[Sentence, ...]
 
 
 class ContentsWriter:
@@ -142,7 +143,7 @@ class ContentsWriter:
         self.options = options
         self.progress = progress
         self.labelled = dataset.layout.is_labelled
-        self.notes: list[str] = []
+        self.notes: list[Sentence] = []
         if self.labelled and not options.streams:
             raise DatasetError(
                 f"'{dataset.path}' holds its recordings as parts of streams: it cannot be published without streams.",
@@ -184,14 +185,20 @@ class ContentsWriter:
         origin = {ids[r.id]: r for r in self.kept}
         if built.unreadable or published.keys() != origin.keys():
             odd = next(iter([*built.unreadable, *(published.keys() ^ origin.keys())]))
-            raise DatasetError(f"The package would differ from the data set in '{odd}'. Please report it.")
+            raise DatasetError(
+                f"The package would differ from the data set in '{odd}'. Please report it.",
+                reason="package_differs",
+                name=odd,
+            )
         for identity, before in origin.items():
             after = published[identity]
             for key in ("gesture", "rows", "first_row", "start", "stop", "excluded"):
                 if getattr(before, key) != getattr(after, key):
                     raise DatasetError(
                         f"'{identity}' would be published with another {key}: {getattr(after, key)!r} instead of "
-                        f"{getattr(before, key)!r}. Please report it."
+                        f"{getattr(before, key)!r}. Please report it.",
+                        reason="package_differs",
+                        name=identity,
                     )
         self._note_changes(built.dataset, origin)
         return PackageContents(built.dataset, people, origin, tuple(self.notes))
@@ -212,7 +219,11 @@ class ContentsWriter:
         code = _folder_of(recording.file)
         name = parse_name(Path(recording.file).name)
         if name is None:
-            raise DatasetError(f"'{recording.file}' is not named <label>_<epoch ms>_<rows>.csv.")
+            raise DatasetError(
+                f"'{recording.file}' is not named <label>_<epoch ms>_<rows>.csv.",
+                reason="raw_file_name",
+                file=recording.file,
+            )
         raw = read_recording(self.source.path / recording.file, self.source.layout)
         frames = raw.frames
         if raw.integrated and recording.stream_row >= 0 and self.streams:
@@ -242,7 +253,11 @@ class ContentsWriter:
             and (frames.labels is None or np.array_equal(back.frames.labels, frames.labels))  # type: ignore[arg-type]
         )
         if not same:
-            raise DatasetError(f"'{target}' would differ from the recording when it is read. Please report it.")
+            raise DatasetError(
+                f"'{target}' would differ from the recording when it is read. Please report it.",
+                reason="package_differs",
+                name=target,
+            )
 
     def _free(self, path: str) -> str:
         """Return a path below the data folder that is unused, also on file systems that ignore case."""
@@ -274,9 +289,10 @@ class ContentsWriter:
         if not self.labelled:
             lacking += sum(read_recording(folder / r.file, layout).frames.host_ms is None for r in self.kept)
         if lacking:
-            self.notes.append(
+            message = (
                 f"Left out: the computer's clock, since {_count(lacking, 'file')} lacked it; the toy's clock is kept."
             )
+            self.notes.append(Sentence(message, "no_host_clock", n=lacking))
         return lacking == 0
 
     def _shifts(self) -> dict[str, Shift]:
@@ -312,7 +328,9 @@ class ContentsWriter:
             if column not in columns:
                 raise DatasetError(
                     f"{PEOPLE} has no column '{column}' to publish; besides {', '.join(PUBLIC_COLUMNS)} it has "
-                    f"{', '.join(sorted(columns)) or 'none'}."
+                    f"{', '.join(sorted(columns)) or 'none'}.",
+                    reason="no_column",
+                    column=column,
                 )
         people = {
             public: PersonInfo(public, p.age_group, p.gender, "", {c: p.more.get(c, "") for c in self.options.columns})
@@ -324,7 +342,8 @@ class ContentsWriter:
         left_out = len(columns - set(self.options.columns)) + any(p.consent for p in known.values())
         if left_out:
             # Give only the number, since even the name of a column may be private.
-            self.notes.append(f"Left out: {_count(left_out, 'column')} of the people's table.")
+            message = f"Left out: {_count(left_out, 'column')} of the people's table."
+            self.notes.append(Sentence(message, "columns_left_out", n=left_out))
         return people
 
     def _write_marks(self, ids: dict[str, str], files: dict[str, str]) -> None:
@@ -351,33 +370,42 @@ class ContentsWriter:
     def _note_changes(self, published: Dataset, origin: dict[str, RecordingInfo]) -> None:
         out = [r for r in self.source.recordings if r.excluded]
         if out and not self.options.excluded and not self.labelled:
-            still = " Their rows are still in the session's stream." if self.streams else ""
-            self.notes.append(f"Left out: {_count(len(out), 'excluded recording')}.{still}")
+            message = f"Left out: {_count(len(out), 'excluded recording')}."
+            message += " Their rows are still in the session's stream." if self.streams else ""
+            self.notes.append(
+                Sentence(message, "excluded_in_stream" if self.streams else "excluded_left_out", n=len(out))
+            )
         elif out:
-            self.notes.append(f"In the package, but marked as excluded: {_count(len(out), 'recording')}.")
+            message = f"In the package, but marked as excluded: {_count(len(out), 'recording')}."
+            self.notes.append(Sentence(message, "excluded_included", n=len(out)))
         if self.source.streams and not self.streams:
-            self.notes.append(f"Left out: {_count(len(self.source.streams), 'session stream')}.")
+            n = len(self.source.streams)
+            self.notes.append(Sentence(f"Left out: {_count(n, 'session stream')}.", "streams_left_out", n=n))
         trimmed = sum((r.start, r.stop) != (0, r.rows) for r in published.recordings)
         if trimmed:
-            self.notes.append(
+            message = (
                 f"Trimmed: {_count(trimmed, 'recording')}; the files hold all rows, start and stop say which remain."
             )
+            self.notes.append(Sentence(message, "trimmed", n=trimmed))
         relabelled = sum(r.gesture != r.recorded for r in published.recordings)
         if relabelled:
-            self.notes.append(
+            message = (
                 f"Relabelled: {_count(relabelled, 'recording')}; the files are named after the gesture that was asked "
                 "for, the tables state the one that was made."
             )
+            self.notes.append(Sentence(message, "relabelled", n=relabelled))
         renamed = [code for code, public in self.codes.items() if code != public]
         if renamed:
-            self.notes.append(
+            message = (
                 f"Renamed: {_count(len(renamed), 'subject code')} that looked like a number or nothing, now with "
                 "a P in front."
             )
+            self.notes.append(Sentence(message, "codes_renamed", n=len(renamed)))
         if self.streams and published.recordings and not self.labelled:
             lost = sum(origin[r.id].stream_row >= 0 and r.stream_row < 0 for r in published.recordings)
             if lost:
-                self.notes.append(f"No longer found in their stream: {_count(lost, 'recording')}.")
+                message = f"No longer found in their stream: {_count(lost, 'recording')}."
+                self.notes.append(Sentence(message, "lost_in_stream", n=lost))
 
 
 def _count(n: int, noun: str) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 
 from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, Channel, Layout
+from plushsense.core.sentences import Sentence
 from plushsense.core.templates import fill_text
 from plushsense.dataset.about import About, Creator
 from plushsense.dataset.files import sha256_of
@@ -109,7 +110,7 @@ class Description:
     consent: str
     published: str
     tables: tuple[PackageTable, ...]
-    notes: tuple[str, ...] = ()
+    notes: tuple[Sentence, ...] = ()
     """Notes on what was left out or changed, one sentence each."""
     files: tuple[FileEntry, ...] = field(default=())
 

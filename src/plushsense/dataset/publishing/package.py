@@ -15,6 +15,7 @@ from plushsense.core.errors import DatasetError, need
 from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import SIMULATION_MARK
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.about import Contact
 from plushsense.dataset.publishing.checking import EXTRA, StageProgress, ValidationResult, check_folder
 from plushsense.dataset.publishing.contents import ContentsWriter, PublishOptions
@@ -75,7 +76,7 @@ class PublishResult:
     description: Description
     checked: ValidationResult
     seconds: float
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[Sentence] = field(default_factory=list)
 
     @property
     def valid(self) -> bool:
@@ -97,6 +98,7 @@ class PublishResult:
             "simulated": d.simulated,
             "notes": list(d.notes),
             "warnings": self.warnings,
+            "sentences": [sentence.to_dict() for sentence in (*self.warnings, *d.notes)],
             "seconds": round(self.seconds, 1),
             **self.checked.to_dict(),
         }
@@ -285,32 +287,40 @@ def _with_files(work: Path, d: Description) -> Description:
     return replace(d, files=entries)
 
 
-def _warnings(source: Dataset, d: Description, people: dict[str, PersonInfo]) -> list[str]:
+def _warnings(source: Dataset, d: Description, people: dict[str, PersonInfo]) -> list[Sentence]:
     warnings = []
     groups = Counter((p.age_group, p.gender, *p.more.values()) for p in people.values() if p.age_group or p.gender)
     rare = sum(n for n in groups.values() if n < FEWEST_ALIKE)
     if rare:
-        warnings.append(
+        message = (
             f"{rare} people have an age group and gender that fewer than {FEWEST_ALIKE} people share, which alone may "
             "identify them: use coarser groups in subjects.csv"
         )
+        warnings.append(Sentence(message, "rare_groups", n=rare, least=FEWEST_ALIKE))
     without_digit = [s for s in d.dataset.subjects if not any(c.isdigit() for c in s)]
     if without_digit:
-        warnings.append(
-            f"subject codes are published as they are, and {len(without_digit)} hold no digit ('{without_digit[0]}'): "
-            "if they are names, pseudonymise the data set first"
+        n, code = len(without_digit), without_digit[0]
+        message = (
+            f"subject codes are published as they are, and {n} hold no digit ('{code}'): if they are names, "
+            "pseudonymise the data set first"
         )
+        warnings.append(Sentence(message, "codes_like_names", n=n, code=code))
     if d.licence.travels and not any((source.path / name).is_file() for name in _LICENCE_FILES):
-        warnings.append(f"{d.licence.spdx} requires its text in every copy: put it into the data set as LICENSE.txt")
+        licence = d.licence.spdx
+        message = f"{licence} requires its text in every copy: put it into the data set as LICENSE.txt"
+        warnings.append(Sentence(message, "licence_text", licence=licence))
     if not d.about.title:
-        warnings.append(
+        message = (
             f"the published title is the data set's name, '{source.head.name}', often that of the imported folder: "
             "check it, or set title in [about] in dataset.toml"
         )
+        warnings.append(Sentence(message, "title_is_name", name=source.head.name))
     if not d.about.creators:
-        warnings.append("nobody is named as creator, so the contact is: add creators to [about] in dataset.toml")
+        message = "nobody is named as creator, so the contact is: add creators to [about] in dataset.toml"
+        warnings.append(Sentence(message, "contact_is_creator"))
     if any(r.subject == UNKNOWN_SUBJECT for r in d.dataset.recordings):
-        warnings.append("the people of some recordings are not known, so they share one time shift")
+        message = "the people of some recordings are not known, so they share one time shift"
+        warnings.append(Sentence(message, "people_share_shift"))
     if not {r.subject for r in d.dataset.recordings} - {NOBODY, UNKNOWN_SUBJECT}:
-        warnings.append("no recording has a known person")
+        warnings.append(Sentence("no recording has a known person", "nobody_known"))
     return warnings

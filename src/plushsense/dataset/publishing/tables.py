@@ -186,7 +186,11 @@ def write_zip(root: Path, target: Path, folder: str) -> None:
         DatasetError: if ``target`` exists.
     """
     if target.exists():
-        raise DatasetError(f"'{target}' is already there: nothing is overwritten, give another OUT.")
+        raise DatasetError(
+            f"'{target}' is already there: nothing is overwritten, give another OUT.",
+            reason="name_exists",
+            name=target.name,
+        )
     with replacing_file(target) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         for path in list_package_files(root):
             entry = zip_entry(f"{folder}/{path.relative_to(root).as_posix()}")
@@ -204,15 +208,28 @@ def open_package(package: Path) -> Iterator[Path]:
         yield package
         return
     if not package.is_file() or not zipfile.is_zipfile(package):
-        raise DatasetError(f"'{package}' is no package: give the folder or the zip that  plushsense publish  made.")
+        raise DatasetError(
+            f"'{package}' is no package: give the folder or the zip that  plushsense publish  made.",
+            reason="not_a_package",
+            name=package.name,
+        )
     with TemporaryDirectory(prefix="plushsense-package-") as scratch:
         target = Path(scratch).resolve()
         try:
             refused = unpack(package, target, _LIMITS)
         except OSError as cause:
-            raise DatasetError(f"'{package}' cannot be unpacked: {cause.strerror or cause}.") from None
+            raise DatasetError(
+                f"'{package}' cannot be unpacked: {cause.strerror or cause}.",
+                reason="package_not_unpacked",
+                name=package.name,
+                why=cause.strerror or str(cause),
+            ) from None
         if refused:
             name, reason = refused[0]
-            raise DatasetError(f"'{package}' is not used, since its entry '{name}' is refused: {reason}.")
+            raise DatasetError(
+                f"'{package}' is not used, since its entry '{name}' is refused: {reason}.",
+                reason="package_refused",
+                name=package.name,
+            )
         inside = list(target.iterdir())
         yield inside[0] if len(inside) == 1 and inside[0].is_dir() else target

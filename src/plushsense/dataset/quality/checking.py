@@ -308,7 +308,9 @@ def author_name(who: str | None) -> str:
     try:
         return who or getpass.getuser()
     except (OSError, KeyError, ImportError):
-        raise ConfigError("This computer gives no login name: name the person who decides with --who NAME.") from None
+        raise ConfigError(
+            "This computer gives no login name: name the person who decides with --who NAME.", reason="who_missing"
+        ) from None
 
 
 def exclusions(

@@ -14,6 +14,7 @@ from nicegui import run, ui
 
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.core.recorder_csv import SIMULATION_MARK
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.privacy.pseudonyms import is_drawn
 from plushsense.dataset.publishing.checking import VALIDATORS
@@ -202,7 +203,7 @@ class PackagesSection:
                 link(each.name, address("publish", name=each.name)),
                 each.title,
                 words("export.simulation_short") if each.simulated else "",
-                moment(each.made_s),
+                Markup('<span class="text-no-wrap">{}</span>').format(moment(each.made_s)),
                 self._state(newest_validation(workspace.part(Jobs), each)),
             )
             for each in packages
@@ -245,12 +246,15 @@ class PackagesSection:
                         text(sentence)
                 self._contents(package)
 
+    def _size(self, count: int) -> str:
+        return size(count).replace(".", self.words("shell.decimal_point"))
+
     def _take(self, package: PackageFacts) -> None:
         words = self.words
         with tag(ui.column().classes("ps-card ps-next w-full"), "take"):
             text(words("publish.take"), "h3")
             if package.zip is not None:
-                message = words("publish.download", size=size(package.zip.stat().st_size))
+                message = words("publish.download", size=self._size(package.zip.stat().st_size))
                 download = ui.link(message, download_address(PACKAGES, package.name)).classes("ps-link")
                 tag(download.props("download"), "download")
             else:
@@ -269,8 +273,8 @@ class PackagesSection:
                     html(self._state(job))
                     text(words("publish.all_agree" if job.result["valid"] else "publish.some_disagree"), "span")
                 self._validators(job.result)
-                for each in [*job.result.get("warnings", ()), *job.result.get("notes", ())]:
-                    notice(f"{words('publish.note')} {each}", "info")
+                for each in job.result.get("sentences", ()):
+                    notice(words.sentence(Sentence.from_dict(each)), "info")
             self._thorough = tag(ui.checkbox(words("publish.with_thorough")), "check-thorough")
             check = button("check", words("publish.check"), lambda: self._check(package), icon="fact_check")
             check.set_enabled("publish" not in self.lacking)
@@ -284,8 +288,8 @@ class PackagesSection:
             mark = verdict(
                 good, words("publish.passed") if good else words("publish.problems_found", n=each["problems"])
             )
-            rows.append((name, mark, about, each["looked_at"]))
-        head = [words(f"publish.{k}") for k in ("validator", "answer", "looks_at", "looked_at")]
+            rows.append((name, mark, about))
+        head = [words(f"publish.{k}") for k in ("validator", "answer", "looks_at")]
         tag(table(words("publish.validators_caption"), head, rows), "validators")
         if problems := result["problems"]:
             listed = [
@@ -306,9 +310,9 @@ class PackagesSection:
         words = self.words
         with tag(ui.column().classes("ps-card w-full"), "contents"):
             text(words("publish.contents"), "h3")
-            rows = [(name, f"{files:,}", size(total)) for name, (files, total) in package.contents.items()]
+            rows = [(name, str(files), self._size(total)) for name, (files, total) in package.contents.items()]
             files, total = (sum(each) for each in zip(*package.contents.values(), strict=True)) if rows else (0, 0)
-            with ui.expansion(words("publish.files", n=f"{files:,}", size=size(total))).classes("w-full"):
+            with ui.expansion(words("publish.files", n=files, size=self._size(total))).classes("w-full"):
                 head = [words(f"publish.{k}") for k in ("file", "files_count", "size")]
                 table(words("publish.contents_caption"), head, rows, (1, 2))
             if package.citation:
@@ -338,16 +342,16 @@ def reidentification_text(words: Words, figures: dict[str, Any]) -> list[str]:
     if head is None:
         return [words("publish.nobody_looked")]
     top, low, chance = head["top1"], (head["top1"].get("ci95") or [head["top1"]["mean"]])[0], head["chance"]
-    interval = [_of_100(limit) for limit in top["ci95"] or ()]
+    interval = [_of_100(words, limit) for limit in top["ci95"] or ()]
     between = words("publish.interval", low=interval[0], high=interval[1]) if interval else ""
     sentences = [
         words(
             "publish.named",
-            right=_of_100(top["mean"]),
+            right=_of_100(words, top["mean"]),
             people=head["people"],
             recordings=head["recordings"],
             between=between,
-            chance=_of_100(chance),
+            chance=_of_100(words, chance),
         )
     ]
     for key, trial in (
@@ -357,12 +361,12 @@ def reidentification_text(words: Words, figures: dict[str, Any]) -> list[str]:
         ("session", trials.get(("sessions", "everything"))),
     ):
         if trial is not None:
-            sentences.append(words(f"publish.named_{key}", right=_of_100(trial["top1"]["mean"])))
+            sentences.append(words(f"publish.named_{key}", right=_of_100(words, trial["top1"]["mean"])))
     if ("sessions", "everything") not in trials:
         sentences.append(words("publish.no_sessions"))
     meaning = "simulated" if figures.get("simulated") else "guessing" if low <= chance else "personal"
     return [*sentences, words(f"publish.means_{meaning}"), words("publish.lower_bound")]
 
 
-def _of_100(share: float) -> str:
-    return f"{100 * share:.0f}" if share >= 0.095 or share == 0 else f"{100 * share:.1f}"
+def _of_100(words: Words, share: float) -> str:
+    return words.number(100 * share, 0 if share >= 0.095 or share == 0 else 1)

@@ -9,6 +9,7 @@ from typing import Any
 from nicegui import run, ui
 
 from plushsense.core.errors import ConfigError
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.store import Dataset
 from plushsense.studio.app.jobs import StudioJob
 from plushsense.studio.app.shell import Page, address, button, focus, query, tag
@@ -263,4 +264,5 @@ class _Publishing:
             tag(link.classes("ps-link"), "go-renamed")
             for finding in result["findings"]:
                 where = [str(finding[k]) for k in ("file", "line") if finding[k]]
-                notice(": ".join([*where, finding["message"]]))
+                times = [f"{finding['times']} ×"] if finding["times"] > 1 else []
+                notice(": ".join([*where, *times, self.words.sentence(Sentence.from_dict(finding["sentence"]))]))

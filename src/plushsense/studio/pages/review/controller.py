@@ -479,8 +479,12 @@ class ReviewController:
             return
         self._rows = rows
         self._update_counts()
-        if self.view == TABLE and not self.order:
+        if not self.order:
+            # A filter by findings fits nothing before the checks have ended.
             self.arrange()
+            if self.order and self.view == ONE:
+                background_tasks.create(self.go(self.order[0]), name="review: first recording")
+                return
         self.views[self.view].refresh()
 
     async def _look(self) -> None:

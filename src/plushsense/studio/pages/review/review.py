@@ -238,7 +238,11 @@ class Review:
         try:
             return self.infos[identity]
         except KeyError:
-            raise DatasetError(f"There is no recording '{identity}' in '{self.dataset.head.name}'.") from None
+            raise DatasetError(
+                f"There is no recording '{identity}' in '{self.dataset.head.name}'.",
+                reason="no_recording",
+                recording=identity,
+            ) from None
 
     # One recording ------------------------------------------------------------------------------------------------
 
@@ -311,16 +315,26 @@ class Review:
         """
         info = self.info(identity)
         if self.is_labelled:
-            raise DatasetError(f"'{identity}' is cut where the label changes, so there is nothing to trim.")
+            raise DatasetError(
+                f"'{identity}' is cut where the label changes, so there is nothing to trim.",
+                reason="labelled_not_trimmed",
+                recording=identity,
+            )
         with self._lock:
             if self.standing(identity).excluded:
-                raise DatasetError(f"'{identity}' is excluded: take it back in before you trim it.")
+                raise DatasetError(
+                    f"'{identity}' is excluded: take it back in before you trim it.",
+                    reason="excluded_not_trimmed",
+                    recording=identity,
+                )
             first, last = self.kept_rows(identity, ends)
             first = first if start is None else min(max(0, start), info.rows - 1)
             last = last if stop is None else min(max(1, stop), info.rows)
             if last <= first:
                 raise DatasetError(
-                    f"Nothing of '{identity}' would be left: set the start before the end, and the end after the start."
+                    f"Nothing of '{identity}' would be left: set the start before the end.",
+                    reason="nothing_left",
+                    recording=identity,
                 )
             self._drafts.pop(identity, None)
             if (first, last) != self.trim(identity).current_rows(ends):
@@ -368,7 +382,9 @@ class Review:
                 return False
             if state == LOOKING:
                 raise DatasetError(
-                    f"The start of '{identity}' is still being computed: wait a moment, or set it yourself."
+                    f"The start of '{identity}' is still being computed: wait a moment, or set it yourself.",
+                    reason="start_not_ready",
+                    recording=identity,
                 )
             suggested = current.suggested_rows(ends)
             rows = draft or suggested
@@ -548,4 +564,6 @@ class Reviews:
             selection = json.loads((self._selections / f"{key}.json").read_text(encoding="utf-8"))
             return str(selection["title"]), [str(r) for r in selection["recordings"]]
         except (OSError, ValueError, KeyError, TypeError):
-            raise ConfigError(f"The selection '{key}' does not exist: follow the link again.") from None
+            raise ConfigError(
+                f"The selection '{key}' does not exist: follow the link again.", reason="no_selection", key=key
+            ) from None

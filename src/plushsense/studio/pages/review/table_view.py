@@ -293,8 +293,8 @@ class RecordingTableView:
         self.others.clear()
         with self.others:
             for f in findings:
-                with ui.row().classes("w-full items-center no-wrap"):
-                    ui.label(finding_text(words, f)).style("min-width: 140px")
+                with ui.row().classes("w-full items-center ps-small-gap ps-row"):
+                    ui.label(finding_text(words, f)).classes("text-bold")
                     ui.label(f"{f.about or words('review.dataset')}: {words.sentence(f.message)}").classes(
                         "flex-grow ps-break"
                     )
