@@ -11,7 +11,7 @@ import pytest
 
 from plushsense.recording.session import is_finished
 from plushsense.recording.session_files import SessionHead
-from support.browsing import DESK, TABLET, axe, connected, marked
+from support.browsing import DESK, PHONE, TABLET, axe, connected, marked
 from support.recording_pages import CALM, begun, choose, events, files, heard, sat, showing, take, until, whats
 
 if TYPE_CHECKING:
@@ -22,13 +22,66 @@ SPEED = ("--device", CALM, "--speed", "10")
 
 
 def test_one_press_is_one_command(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
-    server, browser = studio(*SPEED), look()
-    page = begun(browser.open(server.url + "/record"), server.url, "S01")
+    server, browser = studio(*SPEED), look(own=True)
+    # What sounds: each tone is an oscillator.
+    browser.context.add_init_script(
+        "window.tones = []; const start = OscillatorNode.prototype.start; OscillatorNode.prototype.start = "
+        "function (...at) { window.tones.push(this.frequency.value); return start.apply(this, at) }"
+    )
+    page = browser.open(server.url + "/record?new=1")
+    page.get_by_text("More settings").click()
+    marked(page, "mark-first").click()
+    choose(page, "protocol", "Short trial")
+    marked(page, "code").fill("S01")
+    marked(page, "begin").click()
+    sat(page, "S01/1")
     # With the focus on each button in turn: the space starts and stops, and presses none of them.
     for number, focused in enumerate(("main", "skip", "redo")):
         marked(page, focused).focus()
         take(page, number)
-    assert [w for w in whats(tmp_path / "home") if w not in ("open", "take", "gap")] == ["countdown", "start"] * 3
+    # Countdown, start, stop, and the mark for the video at the very first start.
+    assert {660, 990, 440, 1320} == set(page.evaluate("() => window.tones"))
+    marked(page, "sound").click()
+    page.evaluate("() => { window.tones = [] }")
+    # The last recording: its signal, its length, and the key that makes it again.
+    marked(page, "result-text").get_by_text("Hold strong, 1: ").wait_for()
+    assert marked(page, "result-text").get_attribute("data-length") == "first"
+    assert marked(page, "result").locator("polyline").count() == 1
+    page.keyboard.press("PageUp")
+    showing(page, "idle.2.2.0.1")
+    marked(page, "result").wait_for(state="hidden")
+    # A clicker or pedal.
+    page.locator("body").click(position={"x": 2, "y": 400})
+    page.keyboard.press("PageDown")
+    showing(page, "recording.2.")
+    page.keyboard.press("Enter")
+    showing(page, "idle.3.3.0.1")
+    # A question is answered by its own buttons, and no recording begins.
+    marked(page, "end").focus()
+    page.keyboard.press("Space")
+    page.wait_for_function("document.activeElement.dataset.test === 'end-no'")
+    page.keyboard.press("PageDown")
+    page.keyboard.press("Space")
+    marked(page, "ending").wait_for(state="hidden")
+    page.wait_for_function("document.activeElement.dataset.test === 'end'")
+    outline = "() => getComputedStyle(document.activeElement).outlineStyle"
+    assert page.evaluate(outline) == "solid", "the focus is visible"
+    page.keyboard.press("Space")
+    page.wait_for_function("document.activeElement.dataset.test === 'end-no'")
+    page.keyboard.press("Enter")
+    marked(page, "ending").wait_for(state="hidden")
+    assert showing(page, "").startswith("idle.3.3.0.1")
+    assert (page.evaluate("() => window.tones"), page.evaluate("() => localStorage.plushsense_sound")) == ([], "off")
+    page.reload()
+    connected(page)
+    assert marked(page, "sound").inner_text() == "Sound: off"
+    heard(page)
+    marked(page, "mark").click()
+    page.get_by_text("Marked for the video.").wait_for()
+    mark, second = (e.details for e in events(tmp_path / "home") if e.kind == "mark")
+    assert mark["host_ms"] < second["host_ms"] and mark["device_ms"] < second["device_ms"]
+    assert whats(tmp_path / "home").count("start") == whats(tmp_path / "home").count("take") == 4
+    assert "cancel" not in whats(tmp_path / "home")
     # A held key is one press: it neither stops what it started nor cancels it.
     showing(page, "idle.3.")
     page.keyboard.down("Space")
@@ -46,8 +99,8 @@ def test_one_press_is_one_command(studio: Fixture, look: Fixture, tmp_path: Path
         page.keyboard.down("Enter")
     page.keyboard.up("Enter")
     showing(page, "finished.")
-    assert whats(tmp_path / "home").count("take") == 4
-    assert len(files(tmp_path / "home")) == 4
+    assert whats(tmp_path / "home").count("take") == 5
+    assert len(files(tmp_path / "home")) == 5
     assert axe(page) == []
     assert "Next: look at the recordings" in marked(page, "all-done").inner_text()
     marked(page, "collect").click()
@@ -55,7 +108,7 @@ def test_one_press_is_one_command(studio: Fixture, look: Fixture, tmp_path: Path
     marked(page, "title").wait_for()
     assert page.url.endswith("/datasets/recordings")
     with (tmp_path / "home" / "datasets" / "recordings" / "recordings.csv").open() as index:
-        assert len(index.readlines()) == 1 + 4
+        assert len(index.readlines()) == 1 + 5, "the discarded one too, excluded"
     assert browser.complaints == []
 
 
@@ -181,14 +234,14 @@ def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture
     drawn = '<svg xmlns="http://www.w3.org/2000/svg" width="32" height="20"><script>alert(1)</script></svg>'
     picture.write_text(drawn, encoding="utf-8")
     server, browser = studio(*SPEED), look()
-    page = begun(browser.open(server.url + "/record"), server.url, "S01", "mine.toml")
+    page = begun(browser.open(server.url + "/record"), server.url, "S01", "mine")
     # A user's own picture, shown and never run.
     shown = marked(page, "picture").locator("img")
     assert shown.evaluate("async image => { await image.decode(); return image.naturalWidth }") == 32
     assert shown.get_attribute("alt") == "Picture: Back stroke 1"
     take(page, 0)
     first = events(tmp_path / "home")[-1].details["file"]
-    assert marked(page, "last").inner_text() == f"Last: {first}"
+    marked(page, "last").get_by_text(f"Last: {first}").wait_for()
     page.keyboard.press("r")
     showing(page, "idle.0.0.0.1")
     # Skipped while it is to be made again: the earlier one counts after all.
@@ -235,15 +288,44 @@ def test_redo_skip_back_pause_and_going_to_a_step(studio: Fixture, look: Fixture
     assert marked(page, "pause").inner_text() == "Discard and pause"
     marked(page, "pause").click()
     showing(page, "paused.2.2.0.0")
-    assert "record it again" in marked(page, "recorder-message").inner_text()
+    assert "Record it again" in marked(page, "recorder-message").inner_text()
     marked(page, "main").click()
     showing(page, "idle.2.2.0.0")
     assert len(files(tmp_path / "home")) == 2
     assert browser.complaints == []
 
 
+def own_list(page: Page) -> None:
+    """Make an own list of gestures; an error stands beside the name; it is discarded and restored."""
+    marked(page, "own-protocol").locator("summary").click()
+    marked(page, "own-name").fill("Mans saraksts")
+    marked(page, "own-save").click()
+    page.get_by_role("alert").filter(has_text="Izvēlieties vismaz vienu žestu").wait_for()
+    for label in ("Tail pull", "Hold strong"):
+        marked(page, f"own-{label}").click()
+    choose(page, "own-order", "Jauktā secībā")
+    page.get_by_role("listbox").wait_for(state="detached")
+    assert axe(page) == []
+    marked(page, "own-save").click()
+    marked(page, "discard-protocol").wait_for()
+    assert marked(page, "protocol").input_value() == "Mans saraksts"
+    marked(page, "own-protocol").locator("summary").click()
+    marked(page, "own-Tail pull").click()
+    marked(page, "own-name").fill("Mans saraksts")
+    marked(page, "own-save").click()
+    page.get_by_role("alert").filter(has_text="“Mans saraksts” jau ir").wait_for()
+    marked(page, "own-protocol").locator("summary").click()
+    marked(page, "discard-protocol").click()
+    marked(page, "message").get_by_text("“Mans saraksts” ir izmests").wait_for()
+    assert not marked(page, "discard-protocol").is_visible()
+    marked(page, "undo").click()
+    marked(page, "discard-protocol").wait_for()
+
+
 def test_two_tabs_show_and_press_the_same_once(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     server, browser = studio(*SPEED), look(own=True)
+    child = browser.open(server.url + "/record?session=S01/1&view=child")
+    assert marked(child, "child-gesture").inner_text() == "Thank you!"
     frozen: list[bool] = [False]
     held: list[Callable[[], None]] = []
 
@@ -280,6 +362,13 @@ def test_two_tabs_show_and_press_the_same_once(studio: Fixture, look: Fixture, t
     both_press()
     for page in (one, other):
         showing(page, "recording.0.")
+    # The child's screen follows, and has nothing to press.
+    marked(child, "child-state").get_by_text("Now!").wait_for()
+    assert marked(child, "child-gesture").inner_text() == "Back stroke 1"
+    assert marked(child, "child-prompt").inner_text().startswith("Stroke the toy's back")
+    at_centre = "() => document.elementFromPoint(innerWidth / 2, 20).closest('.ps-child') !== null"
+    assert child.evaluate(at_centre), "the navigation bar is covered"
+    assert axe(child) == []
     # The two presses travel on their own connections: either may arrive first.
     until(lambda: any(marked(page, "message").get_by_text("came too late").count() for page in (one, other)))
     both_press()
@@ -296,6 +385,7 @@ def test_two_tabs_show_and_press_the_same_once(studio: Fixture, look: Fixture, t
         page.wait_for_url("**/record?ended=S01/1")
         connected(page)
         assert "1 of 4 recorded" in marked(page, "message").inner_text()
+    marked(child, "child-gesture").get_by_text("Thank you!").wait_for()
     one.get_by_role("button", name="Continue: S01/1").click()
     sat(one, "S01/1")
     assert showing(one, "idle.") == "idle.1.1.0.0"
@@ -311,7 +401,7 @@ def test_a_lost_connection_loses_nothing(studio: Fixture, look: Fixture, tmp_pat
     browser.context.set_offline(True)
     page.evaluate("() => window.socket.io.engine.close()")
     page.wait_for_function("() => !window.socket.connected")
-    marked(page, "connection-lost").get_by_text("CONNECTION TO THE STUDIO LOST").wait_for()
+    marked(page, "connection-lost").get_by_text("CONNECTION LOST, NOT RECORDING").wait_for()
     # Nobody hears these, now or later.
     for _ in range(3):
         page.keyboard.press("Space")
@@ -342,14 +432,16 @@ def test_a_lost_connection_loses_nothing(studio: Fixture, look: Fixture, tmp_pat
 def test_a_studio_that_is_gone_is_not_shown_as_recording(studio: Fixture, look: Fixture, shots: Fixture) -> None:
     server, browser = studio("--device", CALM), look()
     page = begun(browser.open(server.url + "/record"), server.url, "S01")
-    showing(page, "idle.0.")
+    take(page, 0, 0.8)
     page.keyboard.press("Space")
-    showing(page, "recording.0.")
+    showing(page, "recording.1.")
     marked(page, "state").get_by_text("RECORDING. Press again").wait_for()
     assert axe(page) == []
     # One that stands still keeps the connection open and answers nothing.
     server.signal(signal.SIGSTOP)
-    lost = page.get_by_role("alert").get_by_text("The recording may still be running")
+    lost = page.get_by_role("alert").get_by_text(
+        "CONNECTION LOST, NOT RECORDING. Kept: 1 of 4 recordings. To be made again: Head stroke 1, 1 of 1."
+    )
     lost.wait_for()
     server.signal(signal.SIGCONT)
     lost.wait_for(state="detached")
@@ -364,22 +456,29 @@ def test_a_studio_that_is_gone_is_not_shown_as_recording(studio: Fixture, look: 
     # Another process knows nothing of this page, which is loaded again: what was broken off is to be taken up.
     page.get_by_text("Unfinished sessions").wait_for()
     assert lost.count() == 0
+    page.get_by_role("button", name="Continue: S01/1").click()
+    sat(page, "S01/1")
+    assert "Head stroke 1, 1, was interrupted: record it again" in marked(page, "notice").first.inner_text()
+    assert showing(page, "idle.") == "idle.1.1.0.0"
     assert not [c for c in browser.complaints if "Failed to" not in c and "WebSocket" not in c]
 
 
-def test_it_speaks_latvian_and_fits_a_tablet(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:
+def test_it_speaks_latvian_and_fits_a_phone(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:
     server = studio("--device", CALM, "--speed", "3")
-    for number, (language, dark, size) in enumerate((("lv", True, TABLET), ("en", False, DESK))):
-        browser, code = look(size, dark, language, touch=size == TABLET), f"S0{number + 1}"
+    for number, (language, dark, size) in enumerate((("lv", True, PHONE), ("en", False, DESK))):
+        browser, code = look(size, dark, language, touch=size == PHONE), f"S0{number + 1}"
         page = browser.open(server.url + "/record?new=1")
         where = f"record-{language}-{'dark' if dark else 'light'}-{size[0]}"
         assert axe(page) == []
         shots(page, f"{where}-new")
         page.locator('[data-test="code"]').fill("Anna B")
         marked(page, "begin").click()
-        page.get_by_role("alert").wait_for()
-        assert "no code for a person" in marked(page, "message").inner_text()
+        page.get_by_role("alert").filter(
+            has_text="nav dalībnieka kods" if language == "lv" else "is no code for a person"
+        ).wait_for()
         assert axe(page) == []
+        if language == "lv":
+            own_list(page)
         marked(page, "code").fill(code)
         choose(page, "protocol", "Izmēģināšanai" if language == "lv" else "Short trial")
         marked(page, "begin").click()
@@ -393,6 +492,9 @@ def test_it_speaks_latvian_and_fits_a_tablet(studio: Fixture, look: Fixture, sho
         assert marked(page, "simulation").is_visible()
         assert marked(page, "picture").locator("svg").get_attribute("aria-label")
         page.wait_for_function("() => document.querySelectorAll('[data-test^=plot-] canvas').length === 3")
+        for name in ("gesture", "prompt", "state-box", "main"):
+            box = marked(page, name).bounding_box()
+            assert box is not None and box["y"] + box["height"] <= size[1], f"{name} is visible without scrolling"
         for state in ("idle", "countdown", "recording"):
             if state == "countdown":
                 marked(page, "main").click()

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import shutil
+import socket
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,9 +18,11 @@ from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.recording.recorder import SessionRequest
 from plushsense.recording.session import OpenSession
 from plushsense.recording.session_files import SessionHead, read_events
+from plushsense.studio.app import toys
 from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.record.controller import NO_CONSENT, PSEUDO, ActiveSession, RecordController
-from support.recording_pages import CALM, until
+from plushsense.studio.pages.record.controller import MARKERS, NO_CONSENT, PSEUDO, ActiveSession, RecordController
+from plushsense.studio.pages.record.result import measure_result
+from support.recording_pages import CALM, tcp_toy, until
 
 SPEED = 30.0
 QUICK = SessionRequest(CALM, "S01", "quick", speed=SPEED)
@@ -227,35 +232,114 @@ def test_a_users_own_protocol_and_layout(controller: RecordController, tmp_path:
 
 
 def test_a_real_session_never_goes_on_with_a_virtual_toy(controller: RecordController, tmp_path: Path) -> None:
-    from plushsense.devices.virtual.server import ToyServer
-
-    stop, ready, urls = threading.Event(), threading.Event(), list[str]()
-
-    def on_ready(url: str) -> None:
-        urls.append(url)
-        ready.set()
-
-    toy = threading.Thread(target=lambda: ToyServer(on_ready=on_ready, stop=stop).serve_tcp(0), daemon=True)
-    toy.start()
-    assert ready.wait(10)
-    try:
-        assert controller.speed_for(urls[0], False) == 1.0
-        assert controller.speed_for(urls[0], True) == SPEED
+    with tcp_toy() as url:
+        assert controller.speed_for(url, False) == 1.0
+        assert controller.speed_for(url, True) == SPEED
         assert controller.speed_for("virtual://?speed=3", False) == 3.0
-        session = controller.begin(SessionRequest(urls[0], "S03", "quick"))
+        session = controller.begin(SessionRequest(url, "S03", "quick"))
         assert (session.head.simulated, session.notices) == (False, (NO_CONSENT,))
+        with pytest.raises(DatasetError, match="begun with a real toy"):
+            controller.exchange("S03/1", CALM)
         controller.close_session("S03/1")
         with pytest.raises(DatasetError, match="begun with a real toy"):
             controller.resume("S03/1", CALM)
         assert controller.active_sessions() == []
         assert controller.resume("S03/1").name == "S03/1"
         controller.close_session("S03/1")
-    finally:
-        stop.set()
-        toy.join(10)
     with pytest.raises(DeviceError):
         controller.resume("S03/1")
     assert PSEUDO == "pseudo"
+
+
+def test_a_toy_is_tried_first_and_exchanged(controller: RecordController, tmp_path: Path) -> None:
+    with tcp_toy(layout="plush-14") as other_layout, socket.create_server(("127.0.0.1", 0)) as silent:
+        silent_url = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        for url, reason in ((other_layout, "toy_unreadable"), (silent_url, "toy_silent")):
+            with pytest.raises(DeviceError) as refused, pytest.MonkeyPatch.context() as patch:
+                if url == silent_url:
+                    patch.setattr(toys, "_TIMEOUT_S", 0.3)
+                controller.begin(SessionRequest(url, "S01", "quick"))
+            assert refused.value.reason == reason
+        assert not (tmp_path / "recordings").exists(), "no session begins with a toy that does not work"
+        session = controller.begin(replace(QUICK, device=f"{CALM}&seed=2"))
+        take(session)
+        press(session, "p")
+        former = session.device
+        for url, reason in (
+            (f"virtual://?person=7&seed=2&lost=0&garbled=0&glitch=0&speed={SPEED + 1:g}", "other_speed"),
+            (f"{CALM}&seed=2", "same_toy"),
+            ("virtual://?persons=7", "url_bad"),
+        ):
+            with pytest.raises(PlushSenseError) as refused:
+                controller.exchange("S01/1", url)
+            assert (refused.value.reason, session.device.closed) == (reason, False)
+    controller.exchange("S01/1", "virtual://?person=9")
+    assert (former.closed, session.device.url.startswith("virtual://?person=9")) == (True, True)
+    assert (session.recorder.status().state, session.recorder.status().done) == ("paused", 1)
+    press(session, "p")
+    take(session)
+    kinds = [e.kind for e in read_events(tmp_path / "recordings/S01/1")]
+    assert [k for k in kinds if k in ("open", "take", "exchange")] == ["open", "take", "exchange", "take"]
+    # The result of the last recording, compared with the only earlier one of its gesture.
+    press(session, "go:0")
+    take(session)
+    files = sorted((tmp_path / "recordings/S01/1").glob("Back*.csv"))
+    result = measure_result(session, files[-1].name, tmp_path / "recordings")
+    assert (result.gesture, result.length, max(result.size)) == ("Back stroke 1", "first", 1.0)
+    (tmp_path / "recordings/S02/1").mkdir(parents=True)
+    for beside in (files[0], files[0].with_suffix(".json")):
+        shutil.copy(beside, tmp_path / "recordings/S02/1" / beside.name)
+    assert measure_result(session, files[-1].name, tmp_path / "recordings").length in ("usual", "short", "long")
+    assert [replace(result, seconds=s, usual_s=2.0).length for s in (1.19, 1.21, 2.79, 2.81)] == [
+        "short", "usual", "usual", "long",
+    ]  # fmt: skip
+
+
+@pytest.mark.usefixtures("lsl_possible")
+def test_the_markers_of_a_session_are_sent_by_lsl(controller: RecordController) -> None:
+    import pylsl
+
+    session = controller.begin(QUICK, lsl=True)
+    (stream,) = pylsl.resolve_byprop("name", MARKERS, timeout=20.0)
+    inlet = pylsl.StreamInlet(stream)
+    inlet.open_stream(timeout=20.0)
+    assert session.markers is not None
+    take(session)
+    session.recorder.mark()
+    assert [inlet.pull_sample(timeout=20.0)[0] for _ in range(3)] == [["Back stroke 1"], ["end"], ["mark"]]
+
+
+def test_an_own_list_of_gestures_is_saved_chosen_and_discarded(controller: RecordController, tmp_path: Path) -> None:
+    path = controller.save_protocol("Mixed", ["Tail pull", "At rest"], 2, "random")
+    assert controller.protocols()[str(path)] == "Mixed"
+    for name, gestures, repetitions, reason in (
+        ("Mixed", ["Tail pull"], 1, "name_exists"),
+        ("a/b", ["Tail pull"], 1, "name_bad"),
+        ("", ["Tail pull"], 1, "name_bad"),
+        ("none", [], 1, "no_gestures"),
+        ("none", ["Tail pull"], 0, "repetitions_bad"),
+    ):
+        with pytest.raises(ConfigError) as refused:
+            controller.save_protocol(name, gestures, repetitions, "gesture")
+        assert refused.value.reason == reason
+    orders = []
+    for code in ("S01", "S02", "S03"):
+        session = controller.begin(SessionRequest(CALM, code, str(path), words="lv", speed=SPEED))
+        orders.append([(s.step.gesture, s.step.repetition) for s in session.recorder.steps()])
+        assert session.recorder.steps()[0].step.prompt.startswith(("Vienreiz", "Noliec"))
+        controller.close_session(session.name)
+        again = controller.resume(session.name)
+        assert [(s.step.gesture, s.step.repetition) for s in again.recorder.steps()] == orders[-1]
+        controller.close_session(session.name)
+    seeds = {SessionHead.read(s.folder).protocol["seed"] for s in controller.sessions()}  # type: ignore[union-attr]
+    assert len(seeds) == 3
+    place = controller._workspace.discard(path)
+    assert (str(path) in controller.protocols(), controller._workspace.discarded()) == (False, [place])
+    assert controller._workspace.restore(place) == path
+    path.write_text("repetitions = 3", encoding="utf-8")
+    with pytest.raises(ConfigError) as refused:
+        controller.begin(SessionRequest(CALM, "S04", str(path), speed=SPEED))
+    assert (refused.value.reason, controller.get("S04/1")) == ("protocol_bad", None)
 
 
 def test_a_session_that_another_program_has(controller: RecordController, tmp_path: Path) -> None:

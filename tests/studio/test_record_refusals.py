@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,39 +14,35 @@ import pytest
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import STREAM_NAME, read_stream
 from plushsense.devices.opening import open_device
-from plushsense.devices.virtual.server import ToyServer
-from plushsense.devices.virtual.stream import ToySpec
 from plushsense.recording.session import OpenSession
 from support.browsing import axe, connected, marked
-from support.pty_toys import QUIET, pty_toy
-from support.recording_pages import CALM, begun, choose, files, heard, sat, showing, take, until, whats
+from support.pty_toys import pty_toy
+from support.recording_pages import (
+    CALM,
+    begun,
+    choose,
+    events,
+    files,
+    heard,
+    sat,
+    showing,
+    take,
+    tcp_toy,
+    until,
+    whats,
+)
 
 Fixture = Callable[..., Any]
-
-
-@contextmanager
-def tcp_toy(port: int = 0, speed: float = 1.0, layout: str = "plush-15", spec: ToySpec = QUIET) -> Iterator[str]:
-    """A toy on a port of this machine: its URL."""
-    stop, ready, urls = threading.Event(), threading.Event(), list[str]()
-
-    def on_ready(url: str) -> None:
-        urls.append(url)
-        ready.set()
-
-    options: dict[str, Any] = {"layout": load_layout(layout), "speed": speed, "on_ready": on_ready, "stop": stop}
-    thread = threading.Thread(target=lambda: ToyServer(spec, **options).serve_tcp(port), daemon=True)
-    thread.start()
-    assert ready.wait(10)
-    try:
-        yield urls[0]
-    finally:
-        stop.set()
-        thread.join(15)
 
 
 def said(page: Any, text: str) -> None:
     """A sentence of this kind stands on the page, as an alert."""
     page.get_by_role("alert").filter(has_text=text).wait_for()
+
+
+def beside(page: Any, field: str) -> Any:
+    """The field with this name, if an error stands beside it."""
+    return page.locator(".q-field--error", has=marked(page, field))
 
 
 def fill(page: Any, code: str, toy: str = "") -> None:
@@ -72,20 +67,36 @@ def test_a_session_that_cannot_begin(
     page = browser.open(server.url + "/record")
     for code in ("", "Anna Bērziņa", "Anna", "../../x1", "S01/2"):
         fill(page, code)
-        said(page, "The session has no person" if not code else "is no code for a person")
+        said(page, "Enter the code of the person" if not code else f"“{code}” is no code for a person")
         assert marked(page, "code").input_value() == code, "what was typed stays"
+        assert beside(page, "code").count() == 1
     assert axe(page) == []
     shots(page, "record-refused")
     fill(page, "S01", "replay:///etc/passwd")
-    said(page, "refers to a file")
+    said(page, "is a file")
+    # A dead port, a port in use, and a toy of another layout, each beside the field of the toy.
     fill(page, "S01", "serial:///dev/nowhere7")
-    said(page, "there is no port")
+    said(page, "There is no port /dev/nowhere7")
+    assert beside(page, "other_toy").filter(has_text="There is no port").count() == 1
     with pty_toy(tmp_path / "none.jsonl", 1.0) as toy, open_device(toy.url):
         fill(page, "S01", toy.url)
-        said(page, "another program is using")
-    assert not (home / "recordings").exists()
+        said(page, "Another program is using")
+    with tcp_toy(layout="plush-14") as url:
+        fill(page, "S01", url)
+        said(page, "not of the layout plush-15")
+        assert not (home / "recordings").exists(), "no session begins with a toy that does not work"
+        page.get_by_text("More settings").click()
+        choose(page, "layout", "plush-14")
+        marked(page, "begin").click()
+        sat(page, "S01/1")
+        assert "There is no consent number" in marked(page, "notice").inner_text()
+        marked(page, "end").click()
+        marked(page, "end-yes").click()
+        page.wait_for_url("**/record?ended=S01/1")
+    shutil.rmtree(home / "recordings")
+    page.goto(server.url + "/record?new=1")
+    connected(page)
     # A file where the folder should be.
-    home.mkdir(exist_ok=True)
     (home / "recordings").write_text("not a folder", encoding="utf-8")
     fill(page, "S01")
     said(page, "cannot be used")
@@ -114,33 +125,6 @@ def test_a_session_that_cannot_begin(
     assert browser.complaints == []
 
 
-def test_another_layout(studio: Fixture, look: Fixture, tmp_path: Path, shots: Fixture) -> None:
-    with tcp_toy(layout="plush-14") as url:
-        server, browser = studio("--device", url), look()
-        page = browser.open(server.url + "/record")
-        fill(page, "S01")
-        page.wait_for_url("**/record?session=S01/1")
-        page.wait_for_selector('[data-signal="unreadable"]')
-        connected(page)
-        assert "CANNOT BE READ" in marked(page, "state").inner_text()
-        assert "There is no consent number" in marked(page, "notice").inner_text()
-        page.keyboard.press("Space")
-        page.get_by_text("none is a frame of plush-15").wait_for()
-        assert axe(page) == []
-        shots(page, "record-unreadable")
-        marked(page, "end").click()
-        marked(page, "end-yes").click()
-        page.wait_for_url("**/record?ended=S01/1")
-        connected(page)
-        # The session keeps its layout; with the right one, a new session.
-        page.get_by_text("More settings").click()
-        choose(page, "layout", "plush-14")
-        page.get_by_text("Begin a new session even if").click()
-        fill(page, "S01")
-        sat(page, "S01/2")
-        assert browser.complaints == []
-
-
 def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, tmp_path: Path, shots: Fixture) -> None:
     home = tmp_path / "home"
     with tcp_toy() as url:
@@ -152,7 +136,16 @@ def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, tmp
     marked(page, "state").get_by_text("THE TOY IS AWAY").wait_for()
     page.wait_for_selector('[data-signal="none"]')
     shots(page, "record-away")
+    # It cannot be exchanged for one that does not answer either, nor for a virtual one.
+    marked(page, "change-toy").click()
+    marked(page, "exchange-other_toy").fill("tcp://127.0.0.1:9")
+    marked(page, "exchange-go").click()
+    said(page, "tcp://127.0.0.1:9 cannot be reached")
+    marked(page, "exchange-other_toy").fill(CALM)
+    marked(page, "exchange-go").click()
+    said(page, "was begun with a real toy")
     assert axe(page) == []
+    marked(page, "exchange-no").click()
     page.wait_for_timeout(1000)
     with tcp_toy(int(url.rpartition(":")[2])):
         heard(page)
@@ -163,8 +156,22 @@ def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, tmp
         take(page, 1, 0.8)
         # A machine that stands still for a while may have lost it more than once.
         assert reconnected(page) > before
+        with tcp_toy() as other:
+            page.keyboard.press("p")
+            showing(page, "paused.2.2.")
+            marked(page, "change-toy").click()
+            marked(page, "exchange-other_toy").fill(other)
+            marked(page, "exchange-go").click()
+            page.get_by_text("The session goes on with another toy").wait_for()
+            page.wait_for_load_state("load")
+            connected(page)
+            heard(page)
+            marked(page, "main").click()
+            take(page, 2, 0.8)
+    assert [e.details["device"] for e in events(home) if e.kind == "exchange"] == [other]
+    assert [b["device"] for b in files(home)] == [url, url, other]
     gaps = [len(b["gaps"]) for b in files(home)]
-    assert gaps == [1, 0]
+    assert gaps == [1, 0, 0]
     marked(page, "end").click()
     marked(page, "end-yes").click()
     page.wait_for_url("**/record?ended=S01/1")
@@ -186,7 +193,7 @@ def test_a_full_disk(studio: Fixture, look: Fixture, tmp_path: Path, shots: Fixt
     resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (stream.stat().st_size + 20_000, free[1]))
     showing(page, "stopped.")
     page.get_by_text("cannot be written any more").first.wait_for()
-    page.get_by_text("the session has stopped, with 2 recordings saved").first.wait_for()
+    page.get_by_text("The session has stopped; recordings saved: 2").first.wait_for()
     assert axe(page) == []
     shots(page, "record-full-disk")
     assert len(files(home)) == 2

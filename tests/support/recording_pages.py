@@ -3,19 +3,45 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from plushsense.core.layouts import load_layout
+from plushsense.devices.virtual.server import ToyServer
+from plushsense.devices.virtual.stream import ToySpec
 from plushsense.recording.session_files import SessionEvent, read_events
 from support.browsing import connected, marked
+from support.pty_toys import QUIET
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
 CALM = "virtual://?person=7&lost=0&garbled=0&glitch=0"
 """A virtual toy that loses nothing."""
+
+
+@contextmanager
+def tcp_toy(port: int = 0, speed: float = 1.0, layout: str = "plush-15", spec: ToySpec = QUIET) -> Iterator[str]:
+    """A toy on a port of this machine: its URL."""
+    stop, ready, urls = threading.Event(), threading.Event(), list[str]()
+
+    def on_ready(url: str) -> None:
+        urls.append(url)
+        ready.set()
+
+    options: dict[str, Any] = {"layout": load_layout(layout), "speed": speed, "on_ready": on_ready, "stop": stop}
+    thread = threading.Thread(target=lambda: ToyServer(spec, **options).serve_tcp(port), daemon=True)
+    thread.start()
+    assert ready.wait(10)
+    try:
+        yield urls[0]
+    finally:
+        stop.set()
+        thread.join(15)
 
 
 def showing(page: Page, *starts: str) -> str:

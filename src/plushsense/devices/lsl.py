@@ -42,7 +42,8 @@ def load_pylsl() -> ModuleType:
         try:
             pylsl = need("pylsl", extra="lsl")
         except RuntimeError as cause:
-            raise DeviceError(f"LSL cannot be used here: {' '.join(str(cause).split()).rstrip('.')}.") from None
+            message = f"LSL cannot be used here: {' '.join(str(cause).split()).rstrip('.')}."
+            raise DeviceError(message, reason="lsl_unusable") from None
         paths = ("lsl_api.cfg", "~/lsl_api/lsl_api.cfg", "/etc/lsl_api/lsl_api.cfg")
         configured = os.environ.get("LSLAPICFG") or any(Path(p).expanduser().exists() for p in paths)
         if not configured and hasattr(pylsl, "set_config_content") and not hasattr(pylsl, "_plushsense_quiet"):
@@ -311,6 +312,30 @@ class LslOutlet:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+class LslMarkers:
+    """A published LSL stream of markers, which LabRecorder stores beside the streams of other devices.
+
+    Raises:
+        MissingExtraError: if pylsl is not installed.
+        DeviceError: if LSL cannot be used here.
+    """
+
+    def __init__(self, name: str) -> None:
+        pylsl = load_pylsl()
+        source = f"plushsense-markers:{socket.gethostname()}:{name}"
+        info = pylsl.StreamInfo(name, "Markers", 1, pylsl.IRREGULAR_RATE, pylsl.cf_string, source)
+        self._outlet: Any = pylsl.StreamOutlet(info)
+
+    def push(self, text: str) -> None:
+        """Publish a marker with the present time; nothing after `close`."""
+        if self._outlet is not None:
+            self._outlet.push_sample([text])
+
+    def close(self) -> None:
+        """Close the stream. Closing it again has no effect."""
+        self._outlet = None
 
 
 def forward(device: Device, outlet: LslOutlet, stop: threading.Event | None = None) -> int:

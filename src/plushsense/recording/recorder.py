@@ -6,6 +6,7 @@ Commands do not wait for their effects, which `plushsense.recording.states` impl
 from __future__ import annotations
 
 import secrets
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -355,6 +356,19 @@ def prompt_virtual(recorder: Recorder) -> None:
     def on_change(change: str, status: RecorderStatus) -> None:
         if change == "countdown" and status.state == "countdown" and recorder.device is device:
             inner.perform(status.step.gesture, recorder.begins_ms)
+
+    recorder.subscribe(on_change)
+
+
+def send_markers(recorder: Recorder, push: Callable[[str], None]) -> None:
+    """Call ``push`` with a marker when a recording begins (its gesture) or ends ("end"), and for each `Recorder.mark`.
+
+    These are the markers by which an XDF file is imported. Call it before the recorder starts.
+    """
+
+    def on_change(change: str, status: RecorderStatus) -> None:
+        if change in ("start", "saving", "abandon", "mark"):
+            push(status.step.gesture if change == "start" else "mark" if change == "mark" else "end")
 
     recorder.subscribe(on_change)
 

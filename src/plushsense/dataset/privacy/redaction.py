@@ -98,7 +98,7 @@ ORIGIN = "origin.json"
 _MENDED = "mended"
 LOGINS = frozenset({"who", "by", "user", "author", "leader", "operator", "recorded_by"})
 _SUBJECT, _CONSENT = "subject", "consent"
-_PLACES = frozenset({"device", "port", "address", "url", "mac", "hostname", "computer", "serial_number"})
+_PLACES = frozenset({"device", "former", "port", "address", "url", "mac", "hostname", "computer", "serial_number"})
 PROSE = frozenset({"why", "text", "note", "notes", "comment", "comments", "said", "description"})
 _SECONDS = ("_s", "timestamp", "epoch")
 # Marks can be signed by programs, whose names identify nobody.

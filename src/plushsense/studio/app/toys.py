@@ -129,9 +129,11 @@ class TappedDevice(Device):
             if frames is None:
                 break
             self._tried += frames
-            bad = self.counters.malformed
-            if len(self._tried) >= _ENOUGH and bad <= _MAX_MALFORMED * (bad + len(self._tried)):
+            good, bad = len(self._tried), self.counters.malformed
+            if good + bad >= _ENOUGH and bad <= _MAX_MALFORMED * (good + bad):
                 return
+            if bad >= _MANY:
+                break
         raise _unfit(self.url, self.layout.name, self.counters.malformed)
 
     @property
@@ -171,8 +173,8 @@ class TappedDevice(Device):
 PERSONS = 25
 TEST_S = 1.0
 _TIMEOUT_S = 6.0
-# So many frames are enough to try a toy.
-_ENOUGH = 20
+# So many lines are enough to try a toy, and so many unreadable ones to give up.
+_ENOUGH, _MANY = 20, 100
 # If the share of malformed lines is higher, the toy probably has another layout.
 _MAX_MALFORMED = 0.2
 # Without a single frame, as many malformed lines are enough to know that the layout is another.

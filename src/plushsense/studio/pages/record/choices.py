@@ -12,7 +12,7 @@ from plushsense.core.gestures import load_gestures
 from plushsense.devices.opening import list_devices
 from plushsense.recording.plan import ORDERS
 from plushsense.recording.recorder import is_virtual
-from plushsense.studio.app.shell import Page, button, html, named, tag
+from plushsense.studio.app.shell import Page, button, named, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import RecordController
 from plushsense.studio.widgets.elements import summary
@@ -87,7 +87,7 @@ class ProtocolForm:
         with tag(ui.element("details").classes("w-full"), "own-protocol") as self._box:
             summary(words("record.own_protocol"))
             with ui.column().classes("w-full q-pt-sm"):
-                html(words("record.own_gestures"), "h3").props('id="own-gestures"')
+                ui.label(words("record.own_gestures")).classes("text-bold")
                 with named(ui.row().classes("w-full ps-no-gap").props("role=group"), words("record.own_gestures")):
                     self._gestures = {
                         label: tag(ui.checkbox(words.gesture(label)).style("width: 16rem"), f"own-{label}")

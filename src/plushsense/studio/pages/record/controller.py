@@ -12,6 +12,7 @@ from plushsense.core.layouts import Layout, layout_names
 from plushsense.core.sentences import Sentence
 from plushsense.core.toml import builtin_names
 from plushsense.core.version import __version__
+from plushsense.devices.lsl import LslMarkers
 from plushsense.devices.opening import parse_url
 from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.recording.plan import save_protocol
@@ -24,6 +25,7 @@ from plushsense.recording.recorder import (
     lacks_consent,
     open_toy,
     prompt_virtual,
+    send_markers,
     session_folder,
     session_head,
     session_layout,
@@ -47,6 +49,8 @@ LAYOUTS = "layouts"
 NO_CONSENT, PSEUDO = "no_consent", "pseudo"
 """Notices shown before recording; each is the key of a text in the table ``record``."""
 SOFTWARE = f"plushsense {__version__} studio"
+MARKERS = "PlushSense markers"
+"""Name of the LSL stream of a session's markers."""
 
 
 @dataclass
@@ -57,7 +61,8 @@ class ActiveSession:
         name: ``<subject>/<session>``, as used in the address of the page.
         notices: those of `NO_CONSENT` and `PSEUDO` that apply.
         repairs: descriptions of repairs made to the files after a crash.
-        mark_first: whether the first press on the page is to mark the moment for a video.
+        mark_first: whether the first countdown is to mark the moment for a video.
+        markers: LSL stream of the markers of its recordings, None for none.
     """
 
     name: str
@@ -67,6 +72,7 @@ class ActiveSession:
     notices: tuple[str, ...] = ()
     repairs: tuple[Sentence, ...] = ()
     mark_first: bool = False
+    markers: LslMarkers | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @property
@@ -135,12 +141,15 @@ class RecordController:
         """Return all sessions in the studio's folder, newest first."""
         return list_sessions(self._workspace.recordings)
 
-    def begin(self, request: SessionRequest, anew: bool = False, mark_first: bool = False) -> ActiveSession:
+    def begin(
+        self, request: SessionRequest, anew: bool = False, mark_first: bool = False, lsl: bool = False
+    ) -> ActiveSession:
         """Start a session, or return the active session of the same person.
 
         Args:
             anew: whether to start another session even if the last one of the person is unfinished.
             mark_first: see `ActiveSession`.
+            lsl: whether to send the markers of the recordings by LSL.
 
         Raises:
             PlushSenseError: if the request is invalid, the toy cannot be opened, or the last session is unfinished.
@@ -159,7 +168,7 @@ class RecordController:
                     subject=folder.parent.name,
                     name=f"{folder.parent.name}/{folder.name}",
                 )
-            session = self._open(request, folder, None)
+            session = self._open(request, folder, None, lsl)
             session.mark_first = mark_first
             return session
 
@@ -249,6 +258,8 @@ class RecordController:
     def _end(self, session: ActiveSession) -> None:
         session.recorder.close()
         session.device.close()
+        if session.markers is not None:
+            session.markers.close()
         with self._lock:
             self._active.pop(session.name, None)
         self._changed()
@@ -382,16 +393,21 @@ class RecordController:
             former.close()
         self._changed()
 
-    def _open(self, request: SessionRequest, folder: Path, known: SessionHead | None) -> ActiveSession:
+    def _open(
+        self, request: SessionRequest, folder: Path, known: SessionHead | None, lsl: bool = False
+    ) -> ActiveSession:
         layout = session_layout(request, folder, known)
         device = self._tried(request.device, request.speed, layout)
         try:
             head = session_head(request, folder, known is None, device.layout, SOFTWARE)
             notices = ((PSEUDO, is_pseudo_terminal(request, known or head)), (NO_CONSENT, lacks_consent(known or head)))
+            markers = LslMarkers(MARKERS) if lsl else None
             files = OpenSession(folder, head)
             try:
                 recorder = Recorder(files, device, speed=request.speed, software=SOFTWARE)
                 prompt_virtual(recorder)
+                if markers is not None:
+                    send_markers(recorder, markers.push)
                 recorder.subscribe(lambda _what, _status: self._changed())
                 recorder.start()
             except BaseException:
@@ -407,6 +423,7 @@ class RecordController:
             replace(request, subject=head.subject),
             tuple(key for key, applies in notices if applies),
             tuple(files.progress.repairs),
+            markers=markers,
         )
         with self._lock:
             self._active[session.name] = session

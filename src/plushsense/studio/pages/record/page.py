@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -250,6 +251,8 @@ class _Form:
                     self._simulated = ui.checkbox(words("record.is_virtual"))
                     self._anew = ui.checkbox(words("record.anew"))
                     self._mark = tag(ui.checkbox(words("record.mark_first")), "mark-first")
+                    self._lsl = tag(ui.checkbox(words("record.lsl")), "lsl")
+                    self._lsl.set_visibility(find_spec("pylsl") is not None)
             self._begin = button("begin", words("record.begin"), self._begin_session, "unelevated size=lg")
         self._choose_words()
 
@@ -322,8 +325,8 @@ class _Form:
                 if self._refused(error):
                     return
                 raise
-            anew, mark = bool(self._anew.value), bool(self._mark.value)
-            work = partial(self._controller.begin, request, anew, mark)
+            anew, mark, lsl = bool(self._anew.value), bool(self._mark.value), bool(self._lsl.value)
+            work = partial(self._controller.begin, request, anew, mark, lsl)
             await _open_session(self._page, self._begin, work, self._refused)
 
     def _refused(self, error: PlushSenseError) -> bool:

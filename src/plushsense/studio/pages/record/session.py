@@ -8,6 +8,7 @@ from pathlib import Path
 
 from nicegui import run, ui
 from nicegui.element import Element
+from nicegui.events import GenericEventArguments
 
 from plushsense.core.errors import DatasetError, PlushSenseError
 from plushsense.recording.session_files import SessionHead
@@ -62,11 +63,13 @@ class Sounds(Element, component="sounds.js"):
         self._session = session
         texts = {"on": words("record.sound_on"), "off": words("record.sound_off"), "mark": words("record.mark")}
         self._props.update(texts=texts, beat="", mark_first=session.mark_first)
-        self.on("mark", self._mark, args=[])
+        self.on("mark", self._mark)
 
-    def _mark(self) -> None:
-        self._session.mark_first = False
-        self._session.recorder.mark()
+    def _mark(self, event: GenericEventArguments) -> None:
+        # Of several pages that show the first countdown, one marks it.
+        if self._session.mark_first or not event.args["first"]:
+            self._session.mark_first = False
+            self._session.recorder.mark()
 
     def play(self, s: RecorderStatus) -> None:
         """Play the sound of a change of the state or of the number of the countdown."""

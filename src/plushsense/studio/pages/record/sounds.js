@@ -5,7 +5,7 @@ export default {
   template: `<span class="ps-sounds">
     <button type="button" class="ps-plain-button" data-test="sound" :aria-pressed="on ? 'true' : 'false'" @click="toggle">
       {{ on ? texts.on : texts.off }}</button>
-    <button type="button" class="ps-plain-button" data-test="mark" @click="mark">{{ texts.mark }}</button>
+    <button type="button" class="ps-plain-button" data-test="mark" @click="mark(false)">{{ texts.mark }}</button>
     </span>`,
   props: { texts: Object, beat: String, mark_first: Boolean },
   data() {
@@ -15,33 +15,26 @@ export default {
     beat(now, before) {
       const [state, number] = now.split(".");
       const was = before.split(".")[0];
+      if (state === "countdown" && this.mark_first && !this.marked) this.mark(true);
       if (state === "countdown" && number !== "0") this.tone(660, 0.06);
       if (state === "recording" && was !== "recording") this.tone(990, 0.3);
       if (was === "recording" && state !== "recording") this.tone(440, 0.3);
     },
   },
-  mounted() {
-    this.listener = () => this.pressed();
-    // Browsers play sounds only after the first press on a page.
-    for (const type of ["keydown", "pointerdown"]) window.addEventListener(type, this.listener, true);
-  },
   beforeUnmount() {
-    for (const type of ["keydown", "pointerdown"]) window.removeEventListener(type, this.listener, true);
     this.audio?.close();
   },
   methods: {
-    pressed() {
-      this.audio ??= new AudioContext();
-      if (this.audio.state === "suspended") this.audio.resume();
-      if (this.mark_first && !this.marked) this.mark();
-    },
     toggle() {
       this.on = !this.on;
       localStorage.setItem(STORED, this.on ? "on" : "off");
       if (this.on) this.tone(660, 0.06);
     },
     tone(hertz, seconds) {
-      if (!this.on || !this.audio) return;
+      // Browsers play sounds only after the first press on a page.
+      if (!this.on || navigator.userActivation?.hasBeenActive === false) return;
+      this.audio ??= new AudioContext();
+      if (this.audio.state === "suspended") this.audio.resume();
       const { audio } = this, now = audio.currentTime;
       const oscillator = audio.createOscillator(), gain = audio.createGain();
       oscillator.frequency.value = hertz;
@@ -51,13 +44,13 @@ export default {
       oscillator.start(now);
       oscillator.stop(now + seconds);
     },
-    mark() {
+    mark(first) {
       this.marked = true;
       const flash = document.createElement("div");
       flash.className = "ps-flash";
       document.body.append(flash);
       this.tone(1320, 0.2);
-      this.$emit("mark");
+      this.$emit("mark", { first });
       setTimeout(() => flash.remove(), 300);
     },
   },
