@@ -90,3 +90,27 @@ def test_refusals(
     monkeypatch.setenv("PATH", str(tmp_path))
     assert main(["profile", str(export), "--target", "cortex-m4"]) == 2
     assert "install Debian's gcc-arm-none-eabi qemu-system-arm libnewlib-arm-none-eabi" in capsys.readouterr().err
+
+
+def test_the_papers_estimate_beside_ours(
+    export: Path, capsys: pytest.CaptureFixture[str], target_here: Callable[[str], str]
+) -> None:
+    assert main(["profile", str(export), "--target", target_here("xtensa"), "--paper", "--json"]) == 0
+    paper = json.loads(capsys.readouterr().out)["paper"]
+    window, whole, step = paper["estimates"]
+    # Section 4.7: "around 3.2 MMAC", 55 ms in floats, 23 ms in 16-bit integers.
+    assert (round(window["macs"] / 1e6, 1), int(window["float_ms"]), int(window["int16_ms"])) == (3.2, 55, 23)
+    assert whole["macs"] > step["macs"] > 0
+    assert paper["ours_step_ms"][0] < paper["ours_step_ms"][1]
+    assert paper["ours_window_ms"][0] > paper["ours_step_ms"][0]
+    assert paper["paper_assumes"] and paper["ours_assumes"]
+
+
+def test_the_papers_estimate_needs_no_emulator(export: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["profile", str(export), "--target", "host", "--paper"]) == 0
+    text = capsys.readouterr().out
+    assert "the paper's network, a window of 250 samples  3.212" in text
+    assert "not counted: needs the target xtensa" in text
+    assert "nothing ran on a chip" in text
+    assert main(["profile", str(export), "--target", "host"]) == 0
+    assert "Section 4.7" not in capsys.readouterr().out

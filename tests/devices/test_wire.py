@@ -95,6 +95,25 @@ def test_old_firmware_adds_up_its_delays() -> None:
     assert [p.device_ms for p in parsed] == [0, 10, 21, 30]
 
 
+def test_lines_of_another_layout_say_which_one_fits() -> None:
+    old = b" ".join(b"7" for _ in range(14)) + b"\r\n"
+    parser = LineParser(load_layout("plush-15"))
+    parser.feed(old * 9)
+    assert parser.mismatch("serial:///dev/x") == ""
+    parser.feed(old)
+    assert parser.mismatch("serial:///dev/x?baud=9600&layout=plush-15") == (
+        "The toy sends 14 numbers a line, but layout 'plush-15' has 15; 'plush-14' has 14: "
+        "open it as serial:///dev/x?baud=9600&layout=plush-14"
+    )
+    parser.feed(b"1 2 3\n" * 10)
+    assert "3 numbers a line" in parser.mismatch("x")
+    assert "give a layout file" in parser.mismatch("x")
+    parser.feed(b" ".join(b"7" for _ in range(15)) + b"\n")
+    assert parser.mismatch("x") == "", "a line that fits is a frame, so that the others were damaged"
+    parser.feed(b"ready ok\n" * 20 + b"7 7 7 7 7 7 7 7 7 7 7 7 7 7 x\n" * 20)
+    assert parser.mismatch("x") == "", "words are no numbers, and a damaged frame is no other layout"
+
+
 def test_other_layouts() -> None:
     parsed, _ = lines(ACCEL, b"176637 -6992 -3328 -176\n")
     assert parsed == [ParsedLine(176637, (-6992, -3328, -176), False)]

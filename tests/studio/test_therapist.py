@@ -1,6 +1,8 @@
-"""A therapist who sees the studio for the first time, in Latvian, finds the whole way by what the pages say: two virtual
-children are recorded (the studio is killed once, the page closed once), reviewed, read by a network of her own, watched
-live, and handed over as a package. No page shows English, or anything that axe-core objects to."""
+"""A therapist who sees the studio for the first time, in Latvian, finds the whole way by what the pages say.
+
+Two virtual children are recorded (the studio is killed once, the page closed once), reviewed, read by a network of her
+own, watched live, and handed over as a package. No page shows English, or anything that axe-core objects to.
+"""
 
 from __future__ import annotations
 

@@ -12,8 +12,12 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from plushsense.core.recorder_csv import SIMULATION_MARK, STREAM_NAME
 from plushsense.recording.simulate import simulate
+from support.matlab_files import write_mat
 
 SESSIONS, LABELLED, CHOICES = "Training Data", "Training Data - labelled", "truncate_choices.csv"
 BACKUP = "Training Data - backup 2025-05-06_101112"
@@ -122,3 +126,40 @@ def _rows(path: Path) -> list[list[str]]:
     lines = path.read_text().splitlines()
     cells = [[cell.strip() for cell in line.split(";")] for line in lines]
     return cells[1:] if any(not cell.lstrip("-").isdigit() for cell in cells[0]) else cells
+
+
+def cut_windows(root: Path, *, length: int = 250, hop: int = 50) -> tuple[list[NDArray[np.float64]], list[str]]:
+    """Return windows (T, 11) of the labelled recordings and their labels, as ``d_data_preparation.m`` cuts them."""
+    windows, labels = [], []
+    for path in sorted((root / LABELLED).rglob("*.csv")):
+        table = np.array([[float(cell) for cell in row[:13]] for row in _rows(path)])
+        signal = np.column_stack([table[:, :10], np.sqrt(np.square(table[:, 10:]).sum(axis=1))])
+        if len(signal) < length:
+            signal = np.tile(signal, (-(-length // len(signal)), 1))[:length]
+        found = [signal[at : at + length] for at in range(0, len(signal) - length + 1, hop)]
+        windows += found
+        labels += [path.parent.name] * len(found)
+    return windows, labels
+
+
+def save_windows(root: Path, *, categorical: bool = True) -> tuple[Path, int]:
+    """Write ``plush_train_data_<n>.mat`` as the authors save it for their experiment; return it and the windows.
+
+    ``splitlabels`` without "randomized" takes the first 70 % of each label for training, then 15 % for validation.
+    """
+    windows, labels = cut_windows(root)
+    sets: dict[str, list[int]] = {"train": [], "val": [], "test": []}
+    for label in sorted(set(labels)):
+        mine = [i for i, text in enumerate(labels) if text == label]
+        first, second = round(0.7 * len(mine)), round(0.85 * len(mine))
+        for name, part in zip(sets, (mine[:first], mine[first:second], mine[second:]), strict=True):
+            sets[name] += part
+    path = root / f"plush_train_data_{len(windows)}.mat"
+    write_mat(
+        path,
+        {f"{name}data": [windows[i] for i in mine] for name, mine in sets.items()},
+        {f"{name}labels": [labels[i] for i in mine] for name, mine in sets.items()},
+        sorted(set(labels)),
+        categorical=categorical,
+    )
+    return path, len(windows)

@@ -12,6 +12,7 @@ from plushsense.core.errors import ConfigError
 from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
+    from plushsense.deploy.paper_estimate import PaperComparison
     from plushsense.deploy.profile import Cost, Profile
     from plushsense.deploy.proof.verify import VerificationReport
 
@@ -146,8 +147,41 @@ def run_profile(args: argparse.Namespace) -> int:
     )
     for name, packages in result.missing.items():
         say(f"left out: {name}, which needs Debian's {' '.join(packages)}")
-    emit(args, result.to_dict(), format_profile(result))
+    if not args.paper:
+        emit(args, result.to_dict(), format_profile(result))
+        return 0
+    from plushsense.deploy.paper_estimate import compare_with_paper
+
+    paper = compare_with_paper(result)
+    emit(args, result.to_dict() | {"paper": paper.to_dict()}, format_profile(result) + format_paper(paper))
     return 0
+
+
+def format_paper(paper: PaperComparison) -> list[str]:
+    """Format the paper's estimate beside ours as text."""
+    from plushsense.deploy.paper_estimate import FLOAT_MMAC_S, INT16_MMAC_S, OURS_ASSUMES, PAPER_ASSUMES
+
+    def written(ms: float) -> str:
+        return f"{ms:.2f}" if ms < 1 else f"{ms:.1f}" if ms < 10 else f"{ms:.0f}"
+
+    def bounds(ms: tuple[float, float] | None) -> str:
+        return "not counted: needs the target xtensa" if ms is None else f"{written(ms[0])} to {written(ms[1])} ms"
+
+    rows = [(e.what, f"{e.macs / 1e6:.3f}", written(e.float_ms), written(e.int16_ms)) for e in paper.estimates]
+    head = ("", "MMAC", f"ms at {FLOAT_MMAC_S:g} MMAC/s (float)", f"ms at {INT16_MMAC_S:g} MMAC/s (int16)")
+    return [
+        "",
+        "Section 4.7 of the paper: the time on an ESP32 from its MACs. All are estimates: nothing ran on a chip.",
+        table(head, rows),
+        f"  ours, a step of this network               {bounds(paper.step_ms)}, 8 bits, from counted instructions",
+        f"  ours, if it computed its whole span again  {bounds(paper.window_ms)}, by the same instructions for each "
+        "MAC, without waiting for the flash",
+        f"  weights in floats, as the paper counts     {paper.float_bytes / 1000:.0f} kB",
+        "The paper assumes:",
+        *(line for text in PAPER_ASSUMES for line in _wrapped(f"{text}.")),
+        "Our estimate assumes:",
+        *(line for text in OURS_ASSUMES for line in _wrapped(f"{text}.")),
+    ]
 
 
 def format_profile(profile: Profile) -> list[str]:

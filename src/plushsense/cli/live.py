@@ -46,16 +46,21 @@ def run(args: argparse.Namespace) -> int:
         live = run_live(device, classifier, seconds=args.seconds)
         try:
             state: State | None = None
+            mismatch = ""
             for decision in live:
+                if decision.state == "no signal" and device.mismatch != mismatch:
+                    say(mismatch := device.mismatch)
                 reactions = reactor.push(decision) if reactor else []
                 if args.text or args.events:
                     changed, state = decision.state != state, decision.state
                     if not (changed or decision.events or reactions):
                         continue
                 if args.text:
-                    lines = format_update(decision, changed, reactions)
+                    lines = format_update(decision, changed, reactions, device.mismatch)
                 else:
-                    more = {"reactions": [r.to_dict() for r in reactions]} if reactor else {}
+                    more: dict[str, object] = {"reactions": [r.to_dict() for r in reactions]} if reactor else {}
+                    if decision.state == "no signal" and device.mismatch:
+                        more["mismatch"] = device.mismatch
                     lines = [json.dumps(decision.to_dict() | more, ensure_ascii=False)]
                 sys.stdout.write("".join(f"{line}\n" for line in lines))
                 sys.stdout.flush()
@@ -67,12 +72,18 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def format_update(decision: Decision, state_changed: bool, reactions: Sequence[Reaction] = ()) -> list[str]:
-    """Format event changes, reactions and, if ``state_changed``, the new state as lines of text."""
+def format_update(
+    decision: Decision, state_changed: bool, reactions: Sequence[Reaction] = (), mismatch: str = ""
+) -> list[str]:
+    """Format event changes, reactions and, if ``state_changed``, the new state as lines of text.
+
+    ``mismatch`` states why no line of the toy can be read, and replaces "no signal".
+    """
     lines = [f"{event.t_s:9.2f} s  {_event(event)}" for event in decision.events]
     lines += [f"{reaction.t_s:9.2f} s    {_reaction(reaction)}" for reaction in reactions]
     if state_changed:
-        lines.append(f"{decision.t_s:9.2f} s  {STATES[decision.state]}")
+        unread = mismatch if decision.state == "no signal" else ""
+        lines.append(f"{decision.t_s:9.2f} s  {unread or STATES[decision.state]}")
     return lines
 
 

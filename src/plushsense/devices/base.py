@@ -111,6 +111,11 @@ class Device(ABC):
             DeviceError: if the connection is lost.
         """
 
+    @property
+    def mismatch(self) -> str:
+        """What to do if the toy sends lines that do not fit the layout; "" if they do, or nothing has been received."""
+        return ""
+
     def _shut(self) -> None:  # noqa: B027, RUF100
         """Release resources; called only once."""
 

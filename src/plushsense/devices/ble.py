@@ -135,6 +135,11 @@ class BleDevice(Device):
     def _on_notification(self, _: Any, data: bytearray) -> None:
         self._received.put((time.perf_counter(), now_ms(), bytes(data)))
 
+    @property
+    def mismatch(self) -> str:
+        """As in `Device`."""
+        return self._parser.mismatch(self.url)
+
     def _shut(self) -> None:
         self._loop.call_soon_threadsafe(self._end)
         self._received.put(None)

@@ -71,6 +71,11 @@ class SerialDevice(Device):
         self.arrived_s = time.perf_counter()
         return self._parser.frames(data, now_ms())
 
+    @property
+    def mismatch(self) -> str:
+        """As in `Device`."""
+        return self._parser.mismatch(self.url)
+
     def _shut(self) -> None:
         with contextlib.suppress(*_FAULTS):
             self._port.close()
@@ -183,6 +188,11 @@ class TcpDevice(Device):
             self._parser.finish()
             return None
         return self._parser.frames(data, now_ms())
+
+    @property
+    def mismatch(self) -> str:
+        """As in `Device`."""
+        return self._parser.mismatch(self.url)
 
     def _shut(self) -> None:
         with contextlib.suppress(OSError):

@@ -115,6 +115,12 @@ class ReconnectingDevice(Device):
             self._last = frames[-1]
         return frames
 
+    @property
+    def mismatch(self) -> str:
+        """As in `Device`, of the connected toy."""
+        inner = self.inner
+        return inner.mismatch if inner is not None else ""
+
     def _count(self) -> None:
         inner = self.inner
         if inner is None:

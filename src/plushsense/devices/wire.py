@@ -9,7 +9,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Layout
+from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Layout, layout_names, load_layout
 from plushsense.devices.base import Counters, Frame, LossCounter
 
 _INTEGER = re.compile(rb"[+-]?[0-9]{1,18}\Z")
@@ -17,6 +17,8 @@ _DECIMAL = re.compile(rb"[+-]?(?:[0-9]{1,18}(?:\.[0-9]{0,18})?|\.[0-9]{1,18})(?:
 _SEPARATORS = bytes.maketrans(b",;\t", b"   ")
 _LIMIT = 2**53
 _LONGEST_DELAY_MS = 2**31
+# So many lines of another width in a row are not lines that were cut or joined.
+_SURE = 10
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,25 @@ class LineParser:
             else None
         )
         self._delay_at = layout.wire.index(DELAY_MS) if DELAY_MS in layout.wire else -1
+        self._other_fields = self._others = 0
+
+    def mismatch(self, url: str) -> str:
+        """Return what to do if the last lines all have another number of numbers than the layout; "" otherwise."""
+        if self._others < _SURE:
+            return ""
+        number, layout = self._other_fields, self.layout
+        known = [load_layout(name) for name in layout_names()]
+        fitting = [other for other in known if len(other.wire) == number]
+        # A model reads any layout with its channels.
+        fitting = [other for other in fitting if other.channels == layout.channels] or fitting
+        problem = f"The toy sends {number} numbers a line, but layout '{layout.name}' has {self._fields}"
+        if not fitting:
+            sizes = ", ".join(f"{other.name} {len(other.wire)}" for other in known)
+            return f"{problem}: give a layout file that names them (?layout=FILE.toml); built-in are {sizes}."
+        place, _, query = url.partition("?")
+        kept = [part for part in query.split("&") if part and not part.startswith("layout=")]
+        fits = f"'{fitting[0].name}' has {number}"
+        return f"{problem}; {fits}: open it as {place}?{'&'.join([*kept, f'layout={fitting[0].name}'])}"
 
     def feed(self, data: bytes) -> list[ParsedLine]:
         """Return the frames that end within these bytes; keep the rest of the last line for the next call."""
@@ -122,7 +143,9 @@ class LineParser:
         numbers = self._numbers(fields, line)
         if numbers is None:
             self.counters.malformed += 1
+            self._note_other(fields)
             return None
+        self._others = 0
         if joined:
             return None
         if self._clock_at >= 0:
@@ -144,6 +167,12 @@ class LineParser:
         self.counters.garbage += garbage
         self.counters.lost += self._loss.push(device_ms)
         return ParsedLine(device_ms, values, garbage)
+
+    def _note_other(self, fields: list[bytes]) -> None:
+        """Count lines in a row that hold the same wrong number of numbers."""
+        if len(fields) != self._other_fields or not all(_DECIMAL.match(field) for field in fields):
+            self._other_fields, self._others = len(fields), 0
+        self._others += len(fields) != self._fields
 
     def _numbers(self, fields: list[bytes], line: bytes) -> list[int] | None:
         """Return all fields as integers (channels in steps, clocks in ms); None if the line is not a frame."""

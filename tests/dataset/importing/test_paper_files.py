@@ -155,7 +155,12 @@ def test_flags_of_one_kind_are_one_warning() -> None:
 
 def test_zeros_of_the_accelerometer_that_stand_for_low_values_are_found(tmp_path: Path) -> None:
     scripts.record(tmp_path / "study")
-    (found,) = check(imported(tmp_path / "study", tmp_path / "DS").dataset, only=["zeroed"]).findings
+    done = imported(tmp_path / "study", tmp_path / "DS")
+    checked = check(done.dataset)
+    (found,) = checked.findings_of("zeroed")
     assert (found.severity, found.about) == ("warning", "")
     assert found.message.startswith("2 channels (acc_x, acc_y) read exactly 0 in ")
     assert "never less than -2000" in found.message
+    # They are neither faults of the sensor nor a centre of the sphere of gravity.
+    assert not [f for f in checked.findings_of("flat", "stuck", "saturated") if set(f.channels) & {10, 11}]
+    assert not [p for p in done.proposals if p["key"] == "offset"]

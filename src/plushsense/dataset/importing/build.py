@@ -189,6 +189,12 @@ NO_PEOPLE = Sentence(
 )
 
 
+WINDOWS = "windows"
+NO_PEOPLE_OF_WINDOWS = (
+    "the windows do not name the people, so splits by subject are not possible: import the recordings, if they exist"
+)
+
+
 @dataclass
 class ImportSummary:
     """Result of an import; ``rejected`` and ``left_out`` have an entry for each file, ``warnings`` for each kind.
@@ -413,7 +419,11 @@ def summarize_import(
         account.rejected,
         group_flags((info.id, flag) for info in flagged for flag in info.flags),
         0.0,
-        [*([SIMULATED] if dataset.head.simulated else ()), *notes, *([NO_PEOPLE] if unknown else ())],
+        [
+            *([SIMULATED] if dataset.head.simulated else ()),
+            *notes,
+            *([NO_PEOPLE_OF_WINDOWS if account.search.shape == WINDOWS else NO_PEOPLE] if unknown else ()),
+        ],
         left_out=account.left_out,
         companions=account.count(COMPANIONS),
         excluded=sum(r.excluded for r in mine),

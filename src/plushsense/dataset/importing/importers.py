@@ -28,6 +28,7 @@ from plushsense.dataset.files import CACHE, sha256_of, walk_files
 from plushsense.dataset.importing.archives import UnpackLimits, unpack
 from plushsense.dataset.importing.build import (
     RECORDER,
+    WINDOWS,
     Copier,
     ImportedFiles,
     ImportSummary,
@@ -40,6 +41,7 @@ from plushsense.dataset.importing.build import (
     summarize_import,
 )
 from plushsense.dataset.importing.proposals import adopt, matching_layouts, propose_settings, readable_layouts
+from plushsense.dataset.importing.saved_windows import read_windows, windows_layout, write_windows
 from plushsense.dataset.importing.sources import (
     LEFT_OUT,
     SourceFile,
@@ -374,8 +376,8 @@ def scan_xdf(path: Path, options: ImportOptions) -> SourceScan:
     return search
 
 
-def _scan_of_file(path: Path, shape: str, options: ImportOptions) -> SourceScan:
-    layout, notes = options.known_layout(None, [path])
+def _scan_of_file(path: Path, shape: str, options: ImportOptions, own: Layout | None = None) -> SourceScan:
+    layout, notes = options.known_layout(own, [path])
     simulated = is_simulation(path.resolve().parent, [])
     return SourceScan(layout, options.known_gestures(layout), shape, [], notes=notes, simulated=simulated)
 
@@ -407,6 +409,16 @@ def scan_table(path: Path, options: ImportOptions) -> SourceScan:
     return search
 
 
+def scan_windows(path: Path, options: ImportOptions) -> SourceScan:
+    """Convert and search windows that MATLAB saved."""
+    sets = read_windows(path, path.name)
+    layout = windows_layout(sets[0].windows[0].shape[1], options.layout, path.name)
+    search = _scan_of_file(path, WINDOWS, options, layout)
+    person = (options.mapping or {}).get(path.name)
+    _add(write_windows(path, path.name, options.new_folder("converted"), person, search.layout, sets), search)
+    return search
+
+
 def _add(entries: Iterable[SourceFile | str], search: SourceScan) -> None:
     """Add ``entries`` to ``search``: files to its files, texts to its notes."""
     for entry in entries:
@@ -421,6 +433,7 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], SourceScan]] = {
     ".xdf": scan_xdf,
     ".parquet": scan_table,
     ".csv": scan_table,
+    ".mat": scan_windows,
 }
 
 
@@ -514,7 +527,7 @@ def import_recordings(
 
     Args:
         source: a folder that a recorder wrote (sessions, a folder per person or per label), a zip of one, an XDF file,
-            or one table (.csv, .parquet).
+            one table (.csv, .parquet), or windows that MATLAB saved (.mat).
         dest: a new or empty folder for the data set; with ``add_to`` the existing data set.
         layout: the sensor layout, its name or path; not needed with ``add_to``, for sessions of PlushSense, and for
             files whose header names all channels of one built-in layout.

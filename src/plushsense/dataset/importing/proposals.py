@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import FileFormatError
 from plushsense.core.layouts import ACCELERATION, DEVICE_MS, Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import read_recording
+from plushsense.dataset.quality.measurements import zeroing_limit
 from plushsense.dataset.store import Dataset
 
 DEFAULT_WINDOW_S = 2.5
@@ -164,12 +165,16 @@ def _zeros(dataset: Dataset) -> Iterator[Proposal]:
 def _still_means(dataset: Dataset, axes: list[int]) -> Floats | None:
     """Return the means (n, 3) of the stillest blocks of 0.3 s, in steps of the layout; None for too few."""
     layout, blocks = dataset.layout, []
+    replaced = zeroing_limit(layout) is not None
     used = dataset.used
     for recording in used[:: max(1, len(used) // _RECORDINGS)]:
         values = np.clip(dataset.read(recording).values, layout.valid_min_int, layout.valid_max_int)[:, axes]
         rows = max(3, round(_BLOCK_S * (recording.rate_hz or layout.rate_hz)))
         if n := len(values) // rows:
             cut = values[: n * rows].reshape(n, rows, 3).astype(np.float64)
+            if replaced:
+                # An axis that stays at 0 probably had values that the authors' recorder replaced.
+                cut = cut[(cut != 0).any(axis=1).all(axis=1)]
             blocks.append(np.concatenate([cut.mean(axis=1), cut.std(axis=1).max(axis=1)[:, None]], axis=1))
     if not blocks:
         return None

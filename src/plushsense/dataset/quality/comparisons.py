@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from plushsense.core.gestures import NOBODY
-from plushsense.core.layouts import ACCELERATION
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.quality.findings import PARTLY_THERE, Issue
 from plushsense.dataset.quality.measurements import (
@@ -18,6 +17,7 @@ from plushsense.dataset.quality.measurements import (
     DatasetSummary,
     RecordingSummary,
     gesture_of,
+    zeroing_limit,
 )
 from plushsense.dataset.store import UNKNOWN_SUBJECT, RecordingInfo, StreamInfo
 
@@ -33,7 +33,6 @@ _PLAIN = 0.25
 _GENTLE = 0.5
 _SHORTEST_S = 0.3
 _RAIL = 0.99
-_ZEROS = 0.002
 _ALIKE = 3
 _OFTEN = 0.04
 _OVERLAP = 0.1
@@ -124,7 +123,7 @@ def flat(w: DatasetSummary) -> Iterator[Issue]:
             severity="warning",
         )
     for o in (*long, *(s for s in w.streams if s.rows >= _FLAT_ROWS)):
-        dead = np.flatnonzero((o.runs >= o.rows) & ~always)
+        dead = np.flatnonzero((o.runs >= o.rows) & ~always & ~(w.zeroed & (o.zeros == o.rows)))
         if len(dead):
             stream = isinstance(o.info, StreamInfo)
             message = (
@@ -149,38 +148,22 @@ def _channels(names: tuple[str, ...], at: np.ndarray) -> str:
 
 
 def zeroed(w: DatasetSummary) -> Iterator[Issue]:
-    """Find axes of an accelerometer in which 0 stands for every value under the limit of the capacitive channels.
-
-    The authors' recorder (``PlushSamples.pde``) takes values under -2000 for garbage of capacitive sensors and writes 0
-    instead, in every column. Such an axis is never lower, and 0 is more frequent than the 20 values beside it together.
-    """
-    channels = w.dataset.layout.channels
-    axes = [c for c, ch in enumerate(channels) if ch.kind == ACCELERATION]
-    limits = [
-        v for v, ch in zip(w.dataset.layout.valid_min_int.tolist(), channels, strict=True) if ch.kind in LEVEL_KINDS
-    ]
-    if not (axes and limits and w.recordings) or (limit := max(limits)) >= 0:
-        return
-    zeros, near = (np.array([getattr(o, key) for o in w.recordings]) for key in ("zeros", "near_zeros"))
-    lowest = np.min([o.lowest for o in w.recordings], axis=0)
-    highest = np.max([o.highest for o in w.recordings], axis=0)
-    rows = sum(o.rows for o in w.recordings)
-    # A sensor that never reaches the limit on the other side either has no values that could have been replaced.
-    reaches = max(highest[axes]) > -limit
-    often = (zeros.sum(axis=0) > np.maximum(near.sum(axis=0), _ZEROS * rows)) & (highest > lowest)
-    affected = np.array([c for c in axes if reaches and often[c] and lowest[c] >= limit], dtype=np.int64)
+    """Report axes of an accelerometer in which the authors' recorder has replaced low values by 0."""
+    affected = np.flatnonzero(w.zeroed)
     if len(affected):
-        share = round(100 * float(zeros[:, affected].any(axis=1).mean()))
-        percent = round(100 * float(zeros[:, affected].sum(axis=0).max()) / rows, 1)
-        named = _channels(w.dataset.layout.names, affected)
+        zeros = np.array([o.zeros for o in w.recordings])[:, affected]
+        limit, names = zeroing_limit(w.dataset.layout), w.dataset.layout.names
+        percent = round(100 * float(zeros.sum(axis=0).max()) / sum(o.rows for o in w.recordings), 1)
+        n = int(zeros.any(axis=1).sum())
         message = Sentence(
-            f"{named} {'reads' if len(affected) == 1 else 'read'} exactly 0 in {percent:.1f} % of the rows (in "
-            f"{share} % of the recordings) and never less than {limit}: the authors' recorder writes 0 for every value "
+            f"{_channels(names, affected)} {'reads' if len(affected) == 1 else 'read'} exactly 0 in up to "
+            f"{percent:.1f} % of the rows ({n} of {len(zeros)} recordings) and never less than {limit}: the authors' recorder writes 0 for every value "
             f"under {limit}, so that magnitude and direction are wrong there",
             "zeroed",
-            channels=named,
+            channels=_names(names, affected),
             percent=percent,
-            share=share,
+            n=n,
+            of=len(zeros),
             limit=limit,
         )
         yield Issue(message, channels=tuple(affected.tolist()))
@@ -194,7 +177,8 @@ def stuck(w: DatasetSummary) -> Iterator[Issue]:
     limit = np.maximum(w.limits.stuck_s * 1000, 10 * w.usual_run_ms)
     for o, least in [(o, limit) for o in w.recordings] + [(o, 4 * limit) for o in w.streams]:
         run_ms = o.runs * o.period_ms
-        affected = np.flatnonzero((run_ms > least) & (o.runs < o.rows))
+        # The check `zeroed` reports an axis that stays at 0 because low values were replaced.
+        affected = np.flatnonzero((run_ms > least) & (o.runs < o.rows) & ~(w.zeroed & (o.zeros >= o.runs)))
         if not len(affected):
             continue
         c = int(affected[np.argmax(run_ms[affected])])
@@ -231,7 +215,7 @@ def saturated(w: DatasetSummary) -> Iterator[Issue]:
         long = np.where(at_rail, run_ms >= most / 2, run_ms >= most) & (o.top_runs >= 3)
         often = at_rail & (o.top_rows >= 10) & (o.top_rows >= _OFTEN * o.rows)
         moving = (o.spread > 0.5 * usual) & (o.spread > 0) & (o.runs < o.rows)
-        affected = np.flatnonzero((long | often) & moving)
+        affected = np.flatnonzero((long | often) & moving & ~(w.zeroed & (o.top == 0)))
         if not len(affected):
             continue
         c = int(affected[np.argmax(run_ms[affected])])

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.layouts import Layout
+from plushsense.core.layouts import ACCELERATION, Layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.quality.findings import CheckLimits
 from plushsense.dataset.store import Dataset, RecordingInfo, StreamInfo
@@ -250,6 +250,20 @@ def summarize(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) 
     )
 
 
+def zeroing_limit(layout: Layout) -> int | None:
+    """Return the limit under which the authors' recorder replaces values by 0, in every column; None if there is none.
+
+    ``PlushSamples.pde`` takes values under -2000 for garbage of the capacitive sensors.
+    """
+    lows = layout.valid_min_int.tolist()
+    limit = max((low for low, ch in zip(lows, layout.channels, strict=True) if ch.kind in LEVEL_KINDS), default=0)
+    return limit if limit < 0 else None
+
+
+# Share of rows from which zeros of an accelerometer's axis are more than chance.
+_ZEROS = 0.002
+
+
 @dataclass(frozen=True)
 class DatasetSummary:
     """Summaries of all used recordings and of the streams: the input of the checks that compare them."""
@@ -268,6 +282,26 @@ class DatasetSummary:
             free = gesture is not None and gesture.free_choice
             groups.setdefault(f"{gesture_of(o)}\n{o.info.subject}" if free else gesture_of(o), []).append(o)
         return groups
+
+    @cached_property
+    def zeroed(self) -> NDArray[np.bool_]:
+        """Axes of an accelerometer (C,) in which 0 probably stands for every value under `zeroing_limit`.
+
+        Such an axis is never lower, and 0 is more frequent than the 20 values beside it together.
+        """
+        layout = self.dataset.layout
+        axes = np.array([ch.kind == ACCELERATION for ch in layout.channels])
+        limit = zeroing_limit(layout)
+        if limit is None or not axes.any() or not self.recordings:
+            return np.zeros(len(axes), dtype=bool)
+        lowest = np.min([o.lowest for o in self.recordings], axis=0)
+        highest = np.max([o.highest for o in self.recordings], axis=0)
+        zeros = np.sum([o.zeros for o in self.recordings], axis=0)
+        near = np.sum([o.near_zeros for o in self.recordings], axis=0)
+        often = zeros > np.maximum(near, _ZEROS * sum(o.rows for o in self.recordings))
+        # A sensor that never reaches the limit on the other side either has no values that could have been replaced.
+        reaches = highest[axes].max() > -limit
+        return np.asarray(axes & often & (lowest >= limit) & (highest > lowest) & reaches)
 
     @cached_property
     def noise(self) -> NDArray[np.float64]:

@@ -80,6 +80,8 @@ class Words:
             return self.sentence(value)
         if isinstance(value, float):
             return f"{value:.10g}".replace(".", self._texts["shell.decimal_point"])
+        if key in ("channel", "channels"):
+            return self.channel(str(value))
         return self.gesture(str(value)) if key in ("gesture", "gestures") else str(value)
 
     def error(self, error: PlushSenseError) -> str:
