@@ -48,3 +48,13 @@ def test_the_two_contexts_are_told_apart():
     assert "Leak" not in dict(wording.describe_protocol({"split": "windows:5", "leaky": True}))
     title = wording.evaluation_title({"split": "by-subject:5", "context": "stream", "train_context": "loop"})
     assert title == "by-subject:5, trained on loops, scored on real context"
+
+
+def test_recordings_at_rest_are_named_apart_only_where_they_are() -> None:
+    people = {"over": "subjects", "subjects": [{}, {}], "nobody": {"recordings": 2}, "split": "by-subject:2"}
+    assert "2 people, without recordings at rest;" in wording.describe_spread(people)
+    assert "with recordings at rest" in wording.describe_spread(people)
+    folds = people | {"over": "folds", "folds": [{}, {}], "split": "by-recording:2"}
+    assert "recordings at rest" not in wording.describe_spread(folds)
+    answers = [dict(wording.describe_protocol(one))["At rest"] for one in (people, folds)]
+    assert [answer.rpartition(" and ")[2] for answer in answers] == ["reported apart.", "counted like all others."]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import shutil
 from collections import Counter
@@ -15,13 +16,14 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from plushsense.cli.main import main
-from support.browsing import DESK, TABLET, axe, marked
+from support.browsing import TABLET, axe, marked
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
 Fixture = Callable[..., Any]
 _LONG_MS = 90_000
+PHONE = (390, 844)
 
 
 def fill(page: Page, name: str, text: str) -> None:
@@ -44,6 +46,9 @@ def choose(page: Page, name: str, text: str) -> None:
 
 
 def kind(page: Page, name: str) -> None:
+    """Choose another job than the recommended one, whose settings are folded away."""
+    if not marked(page, "kind").is_visible():
+        marked(page, "more").locator(".q-item").first.click()
     marked(page, "kind").get_by_role("radio", name=name).click()
 
 
@@ -66,6 +71,7 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     page = browser.open(f"{here.url}/train")
     marked(page, "facts").get_by_text("6 people, 119 recordings, 18 gestures").wait_for()
     assert marked(page, "facts").get_by_text("simulation", exact=True).is_visible()
+    kind(page, "Train one network")
     fill(page, "name", "by page")
     fill(page, "epochs", "20")
     page.wait_for_function("() => document.querySelector('[data-test=command]').textContent.includes('--epochs 20')")
@@ -101,12 +107,19 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     state(page, "stopped")
     marked(page, "resume").click()
     done = state(page, "done")
-    assert done.locator('[data-test="result"]').inner_text().startswith("Saved as “by page”. Accuracy 0.")
+    verdict = done.locator('[data-test="verdict"]').inner_text()
+    assert re.fullmatch(
+        r"It reads about [\d.]+ of 10 touches of people it never met; guessing gives 0.6 of 10.", verdict
+    )
+    # The curve ends at the figure of the sentence, which stands in the table, too.
+    (figure,) = re.findall(r"^Accuracy ([\d.]+), macro-F1", done.locator('[data-test="result"]').inner_text())
     assert done.get_by_text("simulation", exact=True).is_visible()
     # The curve begins with the first epoch, though three runs drew it.
     (job,) = (json.loads(path.read_text(encoding="utf-8")) for path in (home / "work").glob("*.json"))
     assert [r["epoch"] for r in job["reports"] if r["stage"] == "training" and "epoch" in r] == list(range(1, 21))
+    assert f"{job['reports'][-2]['accuracy']:.3f}" == figure
     page.locator('[data-column="kind"]').get_by_text("training").nth(1).wait_for()
+    assert page.locator('[data-row$="by page.plush"] [data-column="accuracy"]').inner_text() == figure
     by_page = (home / "bundles" / "by page.plush").read_bytes()
     assert not list(kept.glob("[!.]*.npz"))
     out = home / "bundles" / "by command.plush"
@@ -114,6 +127,12 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     assert main(asked[1:]) == 0
     capsys.readouterr()
     assert out.read_bytes() == by_page
+    # Its confusions lead to the recordings of the person that was held back.
+    done.locator('[data-test="open-result"]').click()
+    marked(page, "show-confusions").click()
+    page.locator("[data-test=worst] [data-cell]").first.click()
+    marked(page, "cell-list").wait_for()
+    assert "dataset=" in (page.locator("[data-test=cell-list] a").first.get_attribute("href") or "")
     assert axe(page) == []
     shots(page, "train-done")
     assert [c for c in browser.complaints if "ERR_CONNECTION" not in c and "WebSocket" not in c] == []
@@ -144,7 +163,13 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(
     marked(page, "split-about").get_by_text("too good").wait_for(state="detached")
     marked(page, "start").click()
     done = state(page, "done")
-    assert "mean ± standard deviation over 6 people; split by-subject:5, context stream" in done.inner_text()
+    result = done.locator('[data-test="result"]').inner_text()
+    (figure,) = re.findall(r"^Accuracy ([\d.]+) ± .*; mean over 6 people, counted in windows\.", result)
+    # The plot beneath shows each person; their mean is the figure of the sentence.
+    bars = dict(row.split("\t")[:2] for row in done.locator("[data-test=people-bars] tbody tr").all_inner_texts())
+    assert len(bars) == 8 and bars["Mean"] == figure
+    assert done.locator('[data-test="verdict"]').inner_text().startswith("It reads about ")
+    assert done.get_by_text("This figure is uncertain: it was measured on only 6 people.").is_visible()
     done.locator('[data-test="open-result"]').click()
     page.locator("[data-cell]").first.wait_for()
 
@@ -172,7 +197,7 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(
     (truth, said), windows = next((k, n) for k, n in counts.most_common() if k[0] != k[1])
     wanted = {r for t, p, r in zip(was, told, of, strict=True) if (t, p) == (truth, said)}
     assert page.locator(".ps-confusion tbody tr").count() == 18
-    button = page.locator("[data-cell]").filter(has_text=f"{truth} read as {said}.")
+    button = page.locator("[data-test=confusion] [data-cell]").filter(has_text=f"{truth} read as {said}.")
     assert button.inner_text().split()[0] == str(windows)
     button.click()
     marked(page, "cell-list").wait_for()
@@ -202,7 +227,7 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(
     page.wait_for_function("() => document.querySelectorAll('.ps-confusion tbody tr').length === 3")
     affect = {g: a for a, gs in AFFECTS.items() for g in gs}
     read = Counter((affect[t], affect[p]) for (t, p), n in counts.items() for _ in range(n))
-    cell = page.locator("[data-cell]").filter(has_text="positive read as ○ neutral")
+    cell = page.locator("[data-test=confusion] [data-cell]").filter(has_text="positive read as ○ neutral")
     assert cell.inner_text().split()[0] == str(read["positive", "neutral"])
     cell.click()
     page.get_by_text("positive read as neutral (recordings").wait_for()
@@ -215,7 +240,7 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(
     assert browser.complaints == []
 
     # In the dark, in Latvian, on a tablet: the same, and nothing to scroll sideways.
-    for size, dark in ((TABLET, True), (DESK, False)):
+    for size, dark in ((TABLET, True), (PHONE, False)):
         later = look(size, dark, "lv")
         page = later.open(f"{here.url}/train")
         page.locator('[data-do^="open:"]').first.wait_for()
@@ -224,6 +249,9 @@ def test_a_proof_its_table_and_the_recordings_of_a_cell(
         assert page.locator(".ps-mark-leaky").first.inner_text() == "noplūde"
         assert axe(page) == []
         assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
+        # Nothing is in English: neither the marks nor the splits, contexts and figures.
+        body = page.locator("#content").inner_text()
+        assert re.findall(r"by-subject|validation|held back|windows:|\b0\.\d|\bpeople\b", body) == []
         shots(page, f"train-lv-{'dark' if dark else 'light'}")
         assert later.complaints == []
 
@@ -279,7 +307,7 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     assert axe(page) == []
     marked(page, "start").click()
     done = state(page, "done")
-    assert "4 of 4 trials. Most accurate: " in done.inner_text()
+    assert "but this test is too easy" in done.locator('[data-test="verdict"]').inner_text()
     done.get_by_text("leaky", exact=True).first.wait_for()
     drawn = marked(page, "pareto")
     drawn.wait_for()
@@ -290,8 +318,9 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     assert marked(page, "pareto-marks").inner_text().split() == ["simulation", "leaky"]
     done.locator('[data-test="open-result"]').click()
     marked(page, "confusion").wait_for()
-    assert page.get_by_text("A sweep stores only the counts").is_visible()
-    assert page.locator("[data-cell]").count() == 0
+    # The predictions of the best network are stored.
+    page.locator("[data-test=worst] [data-cell]").first.click()
+    marked(page, "cell-list").wait_for()
     assert axe(page) == []
     shots(page, "train-sweep")
 
@@ -303,46 +332,96 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     marked(page, "estimate").click()
     marked(page, "plan-text").get_by_text("networks compared after 1, 2 epochs, 1 beyond").wait_for(timeout=_LONG_MS)
     marked(page, "start").click()
-    page.locator('[data-test="result"]', has_text="Best: ").wait_for(timeout=_LONG_MS)
+    found_job = page.locator('[data-test="job"][data-state="done"]', has_text="Find a small network")
+    found_job.wait_for(timeout=_LONG_MS)
     (found,) = (home / "datasets" / "virtual" / "evaluations").glob("search-little-*")
     best = json.loads((found / "search.json").read_text(encoding="utf-8"))["winner"]
     assert best["parameters"] <= 1400
-    text = page.locator('[data-test="result"]', has_text="Best: ").inner_text()
-    assert text.startswith(f"Best: {best['arch']} {best['filters']}, macro-F1 {best['macro_f1']:.3f}")
+    assert f"macro-F1 {best['macro_f1']:.3f}" in found_job.locator('[data-test="result"]').inner_text()
     assert browser.complaints == []
 
 
-def test_what_is_wrong_is_a_sentence_and_nothing_is_lost(
-    studio: Fixture, look: Fixture, shots: Fixture, home: Path
-) -> None:
+def test_what_is_wrong_is_named_beside_its_field(studio: Fixture, look: Fixture, shots: Fixture, home: Path) -> None:
     little = (home / "bundles" / "little.plush").read_bytes()
     folder = home / "datasets" / "virtual"
     (folder / "evaluations").write_text("in the way", encoding="utf-8")
-    browser = look()
+    browser = look(language="lv")
     page = browser.open(f"{studio(home=home).url}/train")
+
+    def beside(field: str) -> Any:
+        box = page.locator(f'[data-test="{field}"]').locator("xpath=ancestor-or-self::label")
+        return box.locator(".q-field__messages")
+
+    fill(page, "minutes", "daudz")
+    marked(page, "make").click()
+    beside("minutes").get_by_text("Ievadiet veselu skaitli no 1 līdz 600.").wait_for()
+    assert axe(page) == []
+    shots(page, "train-minutes-lv")
+    fill(page, "minutes", "10")
+    beside("minutes").get_by_text("Ievadiet").wait_for(state="detached")
+    kind(page, "Apmācīt vienu tīklu")
     fill(page, "name", "little")
     marked(page, "start").click()
-    marked(page, "message").get_by_text("'little.plush' exists already").wait_for()
+    beside("name").get_by_text("jau ir. Dodiet citu nosaukumu").wait_for()
     fill(page, "name", "other")
     fill(page, "epochs", "lots")
     marked(page, "start").click()
-    marked(page, "message").get_by_text("epochs is 'lots': accepted is a whole number").wait_for()
-    marked(page, "advanced").get_by_text("Advanced settings").click()
-    page.locator('[data-test="quantize_aware"]').wait_for()
-    page.wait_for_timeout(400)  # until it has unfolded
+    beside("epochs").get_by_text("Ievadiet veselu skaitli no 1").wait_for()
+    fill(page, "epochs", "")
+    marked(page, "advanced").locator(".q-item").first.click()
+    fill(page, "arch", "14x")
+    marked(page, "start").click()
+    beside("arch").get_by_text("Tas nav tīkls").wait_for()
+    fill(page, "arch", "")
     assert axe(page) == []
-    kind(page, "Evaluate on people left out")
+    kind(page, "Pārbaudīt ar svešiem cilvēkiem")
     marked(page, "start").click()
     refused = state(page, "refused").locator('[data-test="refused"]')
-    assert "'evaluations' is a file; give a folder" in refused.inner_text().replace(f"{folder}/", "")
+    assert refused.inner_text() == f"Rezultātu nevar ierakstīt: “{folder / 'evaluations'}” ir fails, nevis mape. " + (
+        "Pārvietojiet vai pārdēvējiet to."
+    )
     shots(page, "train-refused")
     shutil.move(folder, home / "elsewhere")
-    kind(page, "Train one network")
-    fill(page, "epochs", "2")
-    marked(page, "start").click()
-    marked(page, "message").get_by_text("does not exist any more: put it back").wait_for()
+    marked(page, "make").click()
+    beside("dataset").get_by_text("Datu kopas “virtual” vairs nav").wait_for()
     assert (home / "bundles" / "little.plush").read_bytes() == little
     assert [path.name for path in (home / "bundles").iterdir()] == ["little.plush"]
+    assert browser.complaints == []
+
+
+def test_one_button_makes_a_network_that_a_stop_does_not_lose(
+    studio: Fixture, look: Fixture, shots: Fixture, few: Path
+) -> None:
+    browser = look(PHONE, language="lv")
+    page = browser.open(f"{studio(home=few).url}/train")
+    button = marked(page, "make")
+    button.wait_for()
+    assert page.evaluate("(b) => b.getBoundingClientRect().bottom <= innerHeight", button.element_handle())
+    button.click()
+    # While the network is tested, it is saved already.
+    page.wait_for_function(
+        "() => document.querySelector('[data-test=at]')?.textContent.includes('pārbauda ar svešiem cilvēkiem')",
+        timeout=_LONG_MS,
+    )
+    marked(page, "stop").click()
+    stopped = state(page, "stopped")
+    network = few / "bundles" / "virtual toy.plush"
+    saved = network.read_bytes()
+    assert "“virtual toy” ir saglabāts" in stopped.locator('[data-test="saved"]').inner_text()
+    assert stopped.locator('[data-test="to-live"]').is_visible()
+    assert axe(page) == []
+    shots(page, "train-make-stopped-lv-phone")
+    marked(page, "resume").click()
+    done = state(page, "done")
+    assert network.read_bytes() == saved
+    assert "No 10 pieskārieniem, ko veic tīklam sveši cilvēki" in done.locator('[data-test="verdict"]').inner_text()
+    assert done.get_by_text("pārbaudē piedalījās tikai 3 cilvēki").is_visible()
+    assert done.get_by_text("Nav mērīts, ko dotu vairāk cilvēku.").is_visible()
+    assert done.get_by_text("simulācija", exact=True).is_visible()
+    page.locator('[data-column="kind"]').get_by_text("pārbaude").wait_for()
+    assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
+    assert axe(page) == []
+    shots(page, "train-made-lv-phone")
     assert browser.complaints == []
 
 

@@ -20,7 +20,8 @@ from plushsense.models.bundle import Bundle
 from plushsense.studio.app.jobs import Jobs, StudioJob
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.train.jobs import JobRequest, free_name, grids, job_request, progress_charts
+from plushsense.studio.pages.train.jobs import progress_charts
+from plushsense.studio.pages.train.requests import JobRequest, free_name, grids, job_request
 from plushsense.studio.pages.train.results import (
     TRAINING,
     Confusion,
@@ -66,14 +67,14 @@ def test_the_command_resolves_to_the_same_settings(home: Path, monkeypatch: pyte
     [
         ({"kind": "train", "name": "little"}, "'little.plush' exists already"),
         ({"kind": "train", "name": "../x"}, "cannot be a name"),
-        ({"kind": "train", "name": "n", "epochs": "many"}, "epochs is 'many': accepted is a whole number"),
+        ({"kind": "train", "name": "n", "epochs": "many"}, "epochs is 'many': give a whole number"),
         ({"kind": "train", "name": "n", "epochs": 0}, "epochs is 0"),
         ({"kind": "train", "name": "n", "arch": "14x"}, "14x"),
         ({"kind": "train", "name": "n", "preset": "pepole"}, "people"),
         ({"kind": "train", "name": "n", "quantize_aware": -1}, "quantize_aware is -1"),
         ({"kind": "train", "name": "n", "quantize_aware": "many"}, "quantize_aware is 'many'"),
         ({"kind": "evaluate", "split": "by-people:5"}, "split"),
-        ({"kind": "sweep", "seeds": "many"}, "seeds is 'many': give a whole number of at least 1"),
+        ({"kind": "sweep", "seeds": "many"}, "seeds is 'many': give a whole number from 1"),
         ({"kind": "sweep", "seeds": 0}, "seeds is 0"),
         ({"kind": "search", "max_parameters": "few"}, "max_parameters is 'few'"),
         ({"kind": "search", "share": "half"}, "share is 'half'"),
@@ -82,12 +83,20 @@ def test_the_command_resolves_to_the_same_settings(home: Path, monkeypatch: pyte
         ({"kind": "train", "name": "n", "dataset": "/tmp"}, "outside the studio's folders"),
         ({"kind": "train", "name": "n", "dataset": "datasets/gone"}, "does not exist any more"),
         ({"kind": "train", "name": "n", "dataset": ""}, "No data set is chosen"),
+        ({"kind": "train", "name": "n", "filters": "8;12"}, "8;12"),
+        ({"kind": "make", "minutes": "ten"}, "minutes is 'ten'"),
+        ({"kind": "make", "minutes": 0}, "minutes is 0"),
     ],
 )
 def test_what_cannot_be_done_is_a_sentence(home: Path, form: dict[str, Any], said: str) -> None:
     workspace = Workspace(home)
-    with pytest.raises(PlushSenseError, match=said):
+    with pytest.raises(PlushSenseError, match=said) as caught:
         made(workspace, **form)
+    if form.get("preset", form.get("split")) is None:
+        # Every error that a person can provoke, in their language and beside the field.
+        latvian = Words("lv").error(caught.value)
+        assert "angliski" not in latvian
+        assert caught.value.reason == "outside" or caught.value.values["field"] in {*form, "dataset"}
 
 
 def test_the_same_work_is_not_begun_twice(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,6 +115,12 @@ def test_the_same_work_is_not_begun_twice(home: Path, monkeypatch: pytest.Monkey
     jobs.start(proof.task, proof.spec, proof.title)
     with pytest.raises(ConfigError, match="running already"):
         job_request(workspace, jobs, again)
+    usual = {"dataset": form["dataset"], "kind": "make", "minutes": 10}
+    network = job_request(workspace, jobs, usual)
+    assert network.spec["out"] == str(home / "bundles" / "virtual toy.plush")
+    jobs.start(network.task, network.spec, network.title)
+    with pytest.raises(ConfigError, match="running already"):
+        job_request(workspace, jobs, usual)
 
 
 def test_names_and_grids(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,20 +177,21 @@ def job(task: str, reports: list[dict[str, Any]]) -> StudioJob:
 
 def test_curves_of_a_training() -> None:
     rows = [
-        {"stage": "training", "epoch": e, "train_loss": 1 / e, "validation_loss": None, "train_accuracy": 0.1 * e}
+        {"stage": "training", "epoch": e, "train_loss": 1 / e, "validation_loss": None, "accuracy": 0.1 * e}
         for e in (1, 2, 3)
     ]
     loss, accuracy = progress_charts(job("train", [{"stage": "reading"}, *rows, {"stage": "deciding", "epoch": 3}]))
     assert (loss.metric, loss.x, loss.lines[0]) == ("loss", [1.0, 2.0, 3.0], [1.0, 0.5, 1 / 3])
     assert loss.lines[1] == [None, None, None]
-    assert accuracy.lines[0] == pytest.approx([0.1, 0.2, 0.3])
+    # The accuracy of validation is the one that is counted like the score.
+    assert accuracy.lines == [[None] * 3, pytest.approx([0.1, 0.2, 0.3])]
 
 
 def test_curves_of_folds_and_of_a_search() -> None:
     folds = [{"fold": "a", "epoch": 1, "train_loss": 3.0}, {"fold": "b", "epoch": 1, "train_loss": 4.0}]
     folds += [{"fold": "a", "epoch": 2, "train_loss": 2.0}, {"fold": "a", "epoch": 0, "train_loss": None}]
-    loss, _ = progress_charts(job("evaluate", folds))
-    assert (loss.names, loss.x, loss.lines) == (("a", "b"), [1.0, 2.0], [[3.0, 2.0], [4.0, None]])
+    (loss,) = progress_charts(job("evaluate", folds))
+    assert (loss.x, loss.lines) == ([1.0, 2.0], [[3.5, 2.0]])
     at = [{"rung": 1, "done": 4, "best": None}, {"rung": 2, "done": 1, "best": {"macro_f1": 0.3}}]
     at += [{"rung": 2, "done": 2, "best": {"macro_f1": 0.3}}, {"rung": 3, "done": 1, "best": {"macro_f1": 0.5}}]
     (best,) = progress_charts(job("search", at))
@@ -217,7 +233,7 @@ def test_only_the_same_people_and_gestures_are_compared() -> None:
     rows = [replace(row(f"{i}", 100 + i, 0.5), kind=TRAINING, data="d", apart=("h", "S01")) for i in range(2)]
     rows += [replace(row(f"other {i}", 10, 0.9), kind=TRAINING, data="d", apart=("h", "S02")) for i in range(3)]
     rows += [replace(row("changed", 1, 1.0), kind=TRAINING, data="d", apart=("i", "S01"))]
-    found = comparable_groups(rows, str)
+    found = comparable_groups(Words("en"), rows)
     assert [sorted(r.id for r in several) for several in found.values()] == [
         ["0", "1"],
         ["other 0", "other 1", "other 2"],
@@ -233,14 +249,14 @@ def test_what_a_trials_spread_goes_over() -> None:
 
 def test_the_plot_labels_every_point_and_marks_leaky_ones() -> None:
     rows = [replace(row(f"net <{i}> 8/8 stream", 1000 * 3**i, 0.2 + 0.1 * i), leaky=i == 0) for i in range(4)]
-    bars, front, points = pareto_options(rows, x="Parameters", y="Macro-F1", leaky="leaky")["series"]
+    bars, front, points = pareto_options(Words("en"), rows)["series"]
     assert [p["name"] for p in points["data"]] == ["net <0> 8/8,  (leaky)", *(f"net <{i}> 8/8, " for i in range(1, 4))]
     assert [p["symbol"] for p in points["data"]] == ["diamond", "circle", "circle", "circle"]
     assert points["labelLayout"] == {"hideOverlap": True}
     assert front["data"] == [[r.parameters, r.macro_f1] for r in rows]
     assert bars["data"][:2] == [[1000, pytest.approx(0.19)], [1000, pytest.approx(0.21)]]
     # Points on one spot can be plotted as well.
-    assert len(pareto_options(rows[:1] * 3, x="", y="", leaky="")["series"][2]["data"]) == 3
+    assert len(pareto_options(Words("lv"), rows[:1] * 3)["series"][2]["data"]) == 3
     # The text alternative holds the same data and escapes it.
     table = pareto_table(Words("en"), rows)
     assert table.count("<tr>") == 5

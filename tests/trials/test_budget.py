@@ -71,7 +71,7 @@ def test_it_resumes_with_the_same_plan_and_trains_nothing_twice(
     with pytest.raises(KeyboardInterrupt):
         make_network(**made, progress=interrupt)
     first = (tmp_path / "n.plush").read_bytes()
-    assert set(stages) == {budget.TRAINING, budget.EVALUATING}
+    assert list(dict.fromkeys(stages)) == [budget.TRAINING, budget.DECIDING, budget.EVALUATING]
     # A slower computer would choose another plan; a resumed run keeps its own.
     monkeypatch.setattr(budget, "_measured", lambda *_: TrainingCost(1.0, 100))
     seen: list[budget.BudgetProgress] = []
@@ -81,6 +81,7 @@ def test_it_resumes_with_the_same_plan_and_trains_nothing_twice(
     assert {at.bundle for at in seen} == {str(tmp_path / "n.plush")}
     assert (tmp_path / "n.plush").read_bytes() == first
     assert done["plan"]["split"] == "leave-one-subject-out" and done["cut"] == []
+    assert done["plan"]["workers"] == 1, "processes of their own would take longer than the folds"
     stored = load_evaluation(done["evaluation"])
     assert stored["learning"] == done["learning"] and len(stored["learning"]["points"]) == 3
     # The last point of the curve is the score of the evaluation itself.

@@ -60,7 +60,7 @@ def lines(e: dict[str, Any]) -> list[str]:
     if units == "folds" and n > 1:
         out.append("an interval over so few folds is too narrow, and is not one over people")
     out += [f"{name:<16}{spread(e[key])}" for key, name in names.items()]
-    rest = e["nobody"]
+    rest = e["nobody"] if units == "subjects" else None
     if rest:
         out.append(f"without recordings at rest: {rest['recordings']} recordings, accuracy {figure(rest['accuracy'])}")
     for title, of in (("vote by recording", e["by_recording"]), ("pooled", e["pooled"])):

@@ -107,7 +107,9 @@ class GestureSet:
         if found is None:
             raise GestureError(
                 f"'{label}' is not in the gesture set '{self.name}', which has: {', '.join(self.labels)}."
-                f"{nearest(label, self.labels)}"
+                f"{nearest(label, self.labels)}",
+                reason="gesture_unknown",
+                gesture=label,
             )
         return found
 

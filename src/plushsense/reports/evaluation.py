@@ -95,6 +95,7 @@ def _evaluation(key: str, evaluation: Mapping[str, Any]) -> dict[str, Any]:
         "metrics": metric_table(evaluation),
         "contexts": context_table(evaluation),
         "deployed": deployed_values(evaluation),
+        "rest_apart": wording.averaged_over(evaluation) == "subjects",
         "nobody": nobody
         and {name: count(nobody.get(name)) for name in ("recordings", "windows")}
         | {"accuracy": number(nobody.get("accuracy"))},

@@ -68,7 +68,8 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("Folds", count(folds) + (f", {count(sum(sizes))} windows scored" if sizes else "")),
     ]
     if evaluation.get("nobody"):
-        rest = "Recordings of nobody (at rest) are spread over the folds by recording and reported apart."
+        how = "reported apart" if averaged_over(evaluation) == "subjects" else "counted like all others"
+        rest = f"Recordings of nobody (at rest) are spread over the folds by recording and {how}."
         answers.append(("At rest", rest))
     if not evaluation.get("leaky"):
         answers.insert(2, ("Leak", _NO_LEAK))
@@ -104,8 +105,9 @@ def describe_spread(evaluation: Mapping[str, Any]) -> str:
     """Return sentences on the units of mean, standard deviation and interval, and on the limits of the interval."""
     units = averaged_over(evaluation)
     number = count_of(evaluation, units)
-    rest = f", {REST_APART}" if evaluation.get("nobody") else ""
-    pooled = POOLED if evaluation.get("nobody") else "Pooled: over all windows at once."
+    apart = bool(evaluation.get("nobody")) and units == "subjects"
+    rest = f", {REST_APART}" if apart else ""
+    pooled = POOLED if apart else "Pooled: over all windows at once."
     if len(evaluation.get(units) or []) == 1:
         return f"Of {number}: there is no spread and no interval. {pooled}"
     sentences = (

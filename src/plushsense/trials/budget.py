@@ -35,7 +35,7 @@ from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.preparation import Warn, silent
 from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, evaluation_id, journal_of, name_of, write_report
 
-TRAINING, EVALUATING, LEARNING_CURVE = "training", "evaluating", "learning"
+TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
 MORE_PEOPLE = 2
 _KNOWN_PEOPLE = "by-recording:5"
 _FEWEST_FOLDS, _FOLDS = 3, (10, 5)
@@ -44,6 +44,8 @@ _FEWEST_EPOCHS = 10
 _PEOPLE_FOR_SPLIT = 3
 _PEOPLE_FOR_CURVE = 4
 _CURVE_SHARES = (1 / 3, 2 / 3)
+# Time below which processes of their own for the folds cost more than they save.
+_START_S = 15.0
 # Share of the time that a plan may use, because the computer may be busier later.
 _USED = 0.85
 
@@ -79,6 +81,7 @@ class BudgetPlan:
     """What is done: ``epochs`` of ``usual_epochs``, the ``split`` into ``folds``, and the sizes of the learning curve.
 
     ``sizes`` are numbers of people to train on, without that of the evaluation itself; none if nothing is measured.
+    ``workers`` is as in `EvaluationSpec`.
     """
 
     epochs: int
@@ -87,6 +90,7 @@ class BudgetPlan:
     folds: int
     people: int
     sizes: tuple[int, ...] = ()
+    workers: int = 0
 
     @property
     def trained_people(self) -> int:
@@ -170,9 +174,9 @@ class BudgetProgress:
     """Progress of `make_network`.
 
     Attributes:
-        stage: `TRAINING`, `EVALUATING` or `LEARNING_CURVE`.
+        stage: `TRAINING`, `DECIDING` (fitting decisions), `EVALUATING` or `LEARNING_CURVE`.
         share: share of the planned work that is done.
-        row: epoch, epochs and figures of the epoch while training; done and folds afterwards.
+        row: epoch, epochs and figures of the epoch while training; done and folds in an evaluation.
         bundle: path of the saved network; "" before it is saved.
     """
 
@@ -219,6 +223,8 @@ def make_network(
     if stored is None:
         cost = _measured(dataset, config, networks)
         plan = choose_plan(cost, _count_people(dataset), config.training.epochs, _USED * budget_s)
+        if cost.side_by_side * cost.evaluation_s(plan.epochs, plan.folds) < _START_S:
+            plan = replace(plan, workers=1)
         journal.save(key, {"plan": asdict(plan), "bundle": ""})
     else:
         plan = BudgetPlan(**{**stored["plan"], "sizes": tuple(stored["plan"]["sizes"])})
@@ -276,12 +282,8 @@ def _count_people(dataset: Dataset) -> int:
 
 def _measured(dataset: Dataset, config: RunConfig, networks: int) -> TrainingCost:
     split = "leave-one-subject-out" if _count_people(dataset) >= _PEOPLE_FOR_SPLIT else _KNOWN_PEOPLE
-    seen = preview_evaluation(dataset, _with_split(config, split))
+    seen = preview_evaluation(dataset, replace(config, evaluation=replace(config.evaluation, split=split)))
     return TrainingCost(seen["window_epoch_s"], seen["windows"], config.evaluation.processes, networks)
-
-
-def _with_split(config: RunConfig, split: str) -> RunConfig:
-    return replace(config, evaluation=replace(config.evaluation, split=split))
 
 
 def _planned(config: RunConfig, plan: BudgetPlan) -> RunConfig:
@@ -291,7 +293,9 @@ def _planned(config: RunConfig, plan: BudgetPlan) -> RunConfig:
         every = training.halve_every
         shorter = None if every is None else max(1, round(every * plan.epochs / plan.usual_epochs))
         training = replace(training, epochs=plan.epochs, halve_every=shorter)
-    return _with_split(replace(config, training=training), plan.split)
+    workers = plan.workers or config.evaluation.workers
+    evaluation = replace(config.evaluation, split=plan.split, workers=workers)
+    return replace(config, training=training, evaluation=evaluation)
 
 
 def _adjusted(plan: BudgetPlan, cost: TrainingCost, training_s: float, left_s: float) -> BudgetPlan:
@@ -301,7 +305,7 @@ def _adjusted(plan: BudgetPlan, cost: TrainingCost, training_s: float, left_s: f
     if plan_s(cost, plan) - trained_s <= left_s:
         return plan
     other = choose_plan(cost, plan.people, plan.epochs, left_s + trained_s)
-    return replace(other, epochs=plan.epochs, usual_epochs=plan.usual_epochs)
+    return replace(other, epochs=plan.epochs, usual_epochs=plan.usual_epochs, workers=plan.workers)
 
 
 def _is_saved(name: str, out: Path) -> bool:
@@ -326,6 +330,8 @@ def _train(
     def epoch_done(epoch: int, epochs: int, row: dict[str, Any]) -> None:
         done = epoch / epochs + (networks - 1 if "what" not in row else 0)
         progress(BudgetProgress(TRAINING, done / whole, row | {"epoch": epoch, "epochs": epochs}))
+        if epoch == epochs and "what" not in row:
+            progress(BudgetProgress(DECIDING, done / whole, {}))
 
     done = train(dataset, config, journal=unfinished(dataset), progress=epoch_done, warn=warn)
     return done.save(out), done.seconds

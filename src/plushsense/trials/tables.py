@@ -23,12 +23,14 @@ from plushsense.core.errors import need
 from plushsense.core.files import replacing_file, write_file
 from plushsense.core.version import __version__
 from plushsense.dataset.store import Dataset
+from plushsense.evaluation.scores import gather_predictions, write_predictions
+from plushsense.jobs.journal import Result
 from plushsense.models.arch import slashed
 from plushsense.reports.table import Column, Kind
 from plushsense.scoring.metrics import Counts, accuracy_complexity_ratio, class_rows, column_metrics
 from plushsense.trials.grid import CHOSEN
 from plushsense.trials.plan import CURVE, Plan, PlannedRun, PlannedTrial, Scored, TrainingOutcome, outcome
-from plushsense.workflow.reporting import machine
+from plushsense.workflow.reporting import PREDICTIONS, machine
 
 SUMMARY = "sweep.json"
 TRIALS, TRIALS_CSV, RUNS, CURVES = "trials.parquet", "trials.csv", "runs.parquet", "curves.parquet"
@@ -204,6 +206,7 @@ class Tables:
         self.resumed: set[str] = set()
         self.lost: dict[str, str] = {}
         self.best: dict[str, Any] | None = None
+        self.predicted: str | None = None
         self._of: dict[str, list[tuple[PlannedTrial, PlannedRun]]] = {}
         for planned in plan.trials:
             for run in planned.runs:
@@ -274,14 +277,35 @@ class Tables:
             "ranked_by": "accuracy",
             "best": best[:BEST],
             "best_on_validation": chosen,
+            "predicted": self.predicted,
             "confusions": {p.id: self._counts(p).tolist() for p in detailed},
             "per_class": {p.id: class_rows(self._counts(p), self.plan.gestures.labels) for p in detailed},
         }
 
-    def write(self) -> dict[str, Any]:
-        """Write all files, each by replacing it in one step, and return the summary."""
+    def write(self, results: Mapping[str, Result] | None = None) -> dict[str, Any]:
+        """Write all files, each by replacing it in one step, and return the summary.
+
+        Args:
+            results: those of all trainings by job; with them, the predictions of the best trial are written, too.
+        """
         with self._writing():
+            self.predicted = self._write_predictions(results) if results else None
             return self._write()
+
+    def _write_predictions(self, results: Mapping[str, Result]) -> str | None:
+        """Write what the best trial predicted with every seed and fold, as its confusions count it; return its id."""
+        best = next((t for t in self.plan.trials if self.best is not None and t.id == self.best["trial"]), None)
+        if best is None:
+            return None
+        runs = best.runs
+        tested = [(run.fold, self.plan.folds[run.span][run.fold_index].test) for run in runs]
+        parts = []
+        for run in runs:
+            result = results[run.job]
+            parts.append(result["probabilities"][list(result["epochs"]).index(best.trial.epochs)])
+        self.out.mkdir(parents=True, exist_ok=True)
+        write_predictions(self.out / PREDICTIONS, gather_predictions(self.plan.sets[runs[0].span], tested, parts))
+        return best.id
 
     def _write(self) -> dict[str, Any]:
         began = time.monotonic()

@@ -111,7 +111,8 @@ def check_place(out: Path, config: RunConfig, dataset: Dataset, *, replace: bool
     other = isinstance(data, Mapping) and data.get("hash") != dataset.hash
     raise ConfigError(
         f"'{out}' contains an evaluation of {'other data' if other else 'other settings'} "
-        f"({earlier.get('split')}, {earlier.get('title')}): choose another --out, or --force to replace it."
+        f"({earlier.get('split')}, {earlier.get('title')}): choose another --out, or --force to replace it.",
+        reason="other_results",
     )
 
 

@@ -68,7 +68,7 @@ def test_the_folder_holds_what_it_promises(dataset: Dataset, tmp_path: Path) -> 
     out = tmp_path / "o"
     found = sweep(dataset, epochs=(1, 3), seeds=(0, 1), split="by-subject:2", out=out, progress=seen.append, **SMALL)
     assert sorted(p.name for p in out.iterdir()) == [
-        "curves.parquet", "runs.parquet", "sweep.json", "trials.csv", "trials.parquet",
+        "curves.parquet", "predictions.parquet", "runs.parquet", "sweep.json", "trials.csv", "trials.parquet",
     ]  # fmt: skip
     trials, runs, curves = (frame(out, name) for name in ("trials", "runs", "curves"))
     assert (len(trials), len(runs), len(curves)) == (8, 8 * 4, 16 * 3)

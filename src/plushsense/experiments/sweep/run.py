@@ -155,7 +155,7 @@ def sweep(
 
     try:
         with reporter if display else nullcontext():
-            train_all(
+            results = train_all(
                 dataset,
                 planned,
                 planned.jobs,
@@ -171,7 +171,7 @@ def sweep(
         if len(tables.outcomes) > len(tables.resumed):
             tables.write()
         raise
-    return Sweep(place, tables.write())
+    return Sweep(place, tables.write(results))
 
 
 def default_place(dataset: Dataset, grid: GridSpec | str | os.PathLike[str], spec: GridSpec) -> Path:

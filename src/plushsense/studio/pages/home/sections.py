@@ -26,6 +26,7 @@ PAGE_OF = {
     "sweep": "train",
     "search": "train",
     "evaluate": "train",
+    "make": "train",
     "export": "export",
     "verify": "export",
     "publish": "publish",

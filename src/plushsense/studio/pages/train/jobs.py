@@ -210,6 +210,7 @@ class _Card:
                 self._curves(charts)
             elif any(len(chart.x) > 1 for chart in charts):
                 with tag(ui.expansion(w("train.curves"), icon="show_chart").classes("w-full"), "curves"):
+                    ui.label(w(f"train.curves_about.{job.task}")).classes("ps-dim")
                     self._curves(charts)
             self._warnings = ui.column().classes("w-full")
             self._buttons()
@@ -293,10 +294,11 @@ class _Card:
                 ui.label(w("train.cut.title")).classes("text-bold")
                 for sentence in cut:
                     ui.label(f"• {sentence}")
-        self._links()
-        if row is not None:
-            show = w("train.open_result")
-            button("open-result", show, lambda: self._jobs.open_result(identity), "flat dense", about=job.title)
+        with ui.row().classes("items-center"):
+            self._links()
+            if row is not None:
+                show = w("train.open_result")
+                button("open-result", show, lambda: self._jobs.open_result(identity), "flat dense", about=job.title)
 
     def _verdict(self, row: ResultRow) -> None:
         w = self._words
@@ -325,16 +327,16 @@ class _Card:
         bundle = _saved_bundle(self._job)
         if bundle:
             tag(ui.label(self._words("train.saved_already", name=Path(bundle).stem)), "saved")
-            self._links()
+            with ui.row():
+                self._links()
 
     def _links(self) -> None:
         job, w = self._job, self._words
         bundle = job.result.get("bundle") or _saved_bundle(job)
         if bundle and Path(bundle).is_file():
-            with ui.row():
-                for to in ("live", "export"):
-                    link = ui.link(w(f"train.to_{to}"), address(to, model=bundle)).classes("ps-link")
-                    tag(link, f"to-{to}")
+            for to in ("live", "export"):
+                link = ui.link(w(f"train.to_{to}"), address(to, model=bundle)).classes("ps-link")
+                tag(link, f"to-{to}")
 
 
 def _saved_bundle(job: StudioJob) -> str:

@@ -95,7 +95,7 @@ def job_request(workspace: Workspace, jobs: Jobs, form: Mapping[str, Any]) -> Jo
     elif kind == TRAIN:
         request = _train(workspace, dataset, given)
     elif kind == EVALUATE:
-        request = _evaluate(dataset, given)
+        request = _evaluate(workspace, dataset, given)
     else:
         request = _of_grid(workspace, kind, dataset, given)
     for job in jobs.all(kind):
@@ -130,11 +130,11 @@ def _train(workspace: Workspace, dataset: Path, given: Mapping[str, Any]) -> Job
     if given.get("fit_decisions") is False:
         spec["fit_decisions"] = False
         command.append("--no-fit-decisions")
-    title = f"{out.stem}: {workspace.title(dataset)}, {config.model.arch}, {config.windows.context}"
+    title = f"{out.stem}: {workspace.title(dataset)}" + (f", {config.model.arch}" if config.model.arch else "")
     return JobRequest(TRAIN, spec, title, shlex.join(command))
 
 
-def _evaluate(dataset: Path, given: Mapping[str, Any]) -> JobRequest:
+def _evaluate(workspace: Workspace, dataset: Path, given: Mapping[str, Any]) -> JobRequest:
     settings = {key: given[key] for key in (*_SETTINGS, "train_context") if key in given}
     config = _checked(settings)
     split = str(given.get("split", config.evaluation.split))
@@ -144,7 +144,7 @@ def _evaluate(dataset: Path, given: Mapping[str, Any]) -> JobRequest:
     if given.get("int8"):
         spec["int8"] = True
         command.append("--int8")
-    title = f"{dataset.name}: {split}, {config.model.arch}, {config.windows.context}"
+    title = workspace.title(dataset) + (f", {config.model.arch}" if config.model.arch else "")
     return JobRequest(EVALUATE, spec, title, shlex.join(command))
 
 
@@ -185,7 +185,7 @@ def _of_grid(workspace: Workspace, kind: str, dataset: Path, given: Mapping[str,
         spec["asked"] = limits
         command += _options(limits)
     name = PAPER if grid == PAPER else Path(grid).stem
-    title = f"{dataset.name}: {name}" + (f", {given['split']}" if "split" in given else "")
+    title = f"{workspace.title(dataset)}: {name}"
     return JobRequest(kind, spec, title, shlex.join(command))
 
 

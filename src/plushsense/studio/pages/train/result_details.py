@@ -34,10 +34,13 @@ from plushsense.studio.pages.train.results import (
     ResultRow,
     StoredResults,
     averaged_over,
+    context_text,
     counted,
     figure,
     score_labels,
     score_text,
+    split_text,
+    whole,
 )
 from plushsense.studio.pages.train.verdict import figures, headline, limits
 from plushsense.studio.widgets.elements import table_html
@@ -74,7 +77,7 @@ class ResultDetailsView:
         with self._place, ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap") as card:
             card.props(f'aria-label="{w("train.details")}"')
             with ui.row().classes("w-full items-center"):
-                title = f"{row.data} · {row.network} · {row.split} · {row.context}"
+                title = " · ".join((row.data, row.network, split_text(w, row.split), context_text(w, row.context)))
                 heading(title, 3).classes("text-bold", remove="text-lg")
                 html(score_labels(w, row.leaky, row.simulated))
                 ui.space()
@@ -85,6 +88,7 @@ class ResultDetailsView:
             for sentence in limits(w, row):
                 ui.label(sentence)
             tag(ui.label(figures(w, row)).classes("ps-dim"), "details-figures")
+            ui.label(w("train.size", parameters=whole(w, row.parameters), macs=whole(w, row.macs))).classes("ps-dim")
             if row.kind == TRAINING:
                 self._training(d)
             if d.by_gesture is not None:
@@ -228,7 +232,8 @@ class ResultDetailsView:
         keys = ("accuracy", "macro_f1", "by_recording_accuracy")
         cells = [(p["subject"], p["recordings"], p["windows"], *(figure(w, p[key]) for key in keys)) for p in d.people]
         with scroll_region(w("train.people")):
-            tag(html(table_html(head, cells, numbers=range(1, 6), row_heads=True)), "people")
+            table = html(table_html(head, cells, numbers=range(1, 6), row_heads=True)).classes("ps-people")
+            tag(table, "people")
 
 
 def confusion_table(w: Words, confusion: Confusion, by_affect: bool, clickable: bool) -> Markup:

@@ -72,6 +72,18 @@ def averaged_over(words: Words, kind: str, units: int) -> str:
     return words(f"train.over.{kind}", n=counted(words, _UNITS[kind], units))
 
 
+def split_text(words: Words, split: str) -> str:
+    """Describe in a few words how people, recordings or windows were left out."""
+    kind, _, k = split.partition(":")
+    text = words.get(f"train.split_short.{split}") or words.get(f"train.split_short.{kind}", split)
+    return text.format(k=k)
+
+
+def context_text(words: Words, context: str) -> str:
+    """Describe what comes before the scored gestures, and before those to train on if that differs."""
+    return " → ".join(words.get(f"train.context_short.{part}", part) for part in context.split(" → "))
+
+
 EVALUATION, TRIAL, TRAINING = "evaluation", "trial", "training"
 SUBJECTS, FOLDS, TRAININGS, HELD_BACK = "subjects", "folds", "trainings", "held_back"
 _UNITS = {SUBJECTS: "people", FOLDS: "folds", TRAININGS: "trainings", HELD_BACK: "people"}
@@ -93,7 +105,8 @@ class ResultRow:
         when_s: time of the result, in seconds since 1970.
         classes: number of gestures that the network tells apart.
         interval: 95 % interval of the mean accuracy.
-        people: accuracy of each person of an evaluation; ``rest`` is that of recordings at rest, scored apart.
+        people: accuracy of each person of an evaluation.
+        rest: accuracy of recordings at rest if they are scored apart, as where whole people are left out.
         learning: see `plushsense.trials.budget.learning_curve`.
         apart: further values that are equal in comparable results: hash of the data set, classes, held-back people.
     """
@@ -165,7 +178,7 @@ def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
             len(table["per_class"]),
             None if table["accuracy"]["ci95"] is None else tuple(table["accuracy"]["ci95"]),
             tuple((one["subject"], one["accuracy"]) for one in table["subjects"]),
-            (table["nobody"] or {}).get("accuracy"),
+            _rest(table["nobody"], table["over"] == SUBJECTS),
             table["learning"],
         )
     ]
@@ -252,9 +265,13 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
             path.stat().st_mtime,
             (str(origin.get("dataset_hash", ""))[:_HASH], *bundle.gestures.labels, *held_back),
             len(bundle.gestures),
-            rest=(scores.get("nobody") or {}).get("accuracy"),
+            rest=_rest(scores.get("nobody"), split == WHOLE_PEOPLE),
         )
     ]
+
+
+def _rest(nobody: Mapping[str, Any] | None, apart: bool) -> float | None:
+    return nobody["accuracy"] if nobody and apart else None
 
 
 def over_trainings(trial: Mapping[str, Any]) -> tuple[str, int]:

@@ -23,8 +23,10 @@ from plushsense.studio.pages.train.results import (
     ResultRow,
     StoredResults,
     averaged_over,
+    context_text,
     score_labels,
     score_text,
+    split_text,
     whole,
 )
 from plushsense.studio.widgets.elements import table_html
@@ -45,10 +47,9 @@ _SORTS: dict[str, Callable[[ResultRow], Any]] = {
     "accuracy": lambda r: _NONE if r.accuracy is None else r.accuracy,
     "macro_f1": lambda r: _NONE if r.macro_f1 is None else r.macro_f1,
     "parameters": lambda r: r.parameters,
-    "macs": lambda r: r.macs,
     "when": lambda r: r.when_s,
 }
-_NUMBERS = ("over", "accuracy", "macro_f1", "parameters", "macs")
+_NUMBERS = ("over", "accuracy", "macro_f1", "parameters")
 # Columns that the first click sorts in descending order.
 _DOWN = ("accuracy", "macro_f1", "when", "over")
 
@@ -158,14 +159,13 @@ class ResultsSection:
             "kind": w(f"train.rows.{row.kind}"),
             "network": row.network,
             "schedule": row.schedule,
-            "split": Markup("{} {}").format(row.split, score_labels(w, row.leaky, False)),
-            "context": row.context,
+            "split": Markup("{} {}").format(split_text(w, row.split), score_labels(w, row.leaky, False)),
+            "context": context_text(w, row.context),
             "seeds": row.seeds,
             "over": averaged_over(w, row.spread, row.units),
             "accuracy": score_text(w, row.accuracy, row.accuracy_sd),
             "macro_f1": score_text(w, row.macro_f1, row.macro_f1_sd),
             "parameters": whole(w, row.parameters),
-            "macs": whole(w, row.macs),
             "when": Markup(time.strftime('<span class="ps-nowrap">%Y-%m-%d</span> %H:%M', time.localtime(row.when_s))),
         }
         name = row.path.stem if row.kind == TRAINING else row.network
@@ -181,7 +181,7 @@ class ResultsSection:
             "</td>{columns}</tr>"
         ).format(
             id=row.id,
-            label=w("train.open_row", network=f"{name}, {row.split}"),
+            label=w("train.open_row", network=f"{name}, {split_text(w, row.split)}"),
             open=w("train.columns.open"),
             columns=columns,
         )
@@ -191,7 +191,7 @@ class ResultsSection:
     def _draw_pareto(self, rows: list[ResultRow]) -> None:
         """Plot one group of comparable results, with a field to choose the group."""
         w = self._words
-        groups = comparable_groups(rows, lambda kind: w(f"train.rows.{kind}"))
+        groups = comparable_groups(w, rows)
         self._pareto.clear()
         if not groups:
             return
@@ -226,11 +226,11 @@ class ResultsSection:
         draw()
 
 
-def comparable_groups(rows: Sequence[ResultRow], kind: Callable[[str], str]) -> dict[str, list[ResultRow]]:
+def comparable_groups(w: Words, rows: Sequence[ResultRow]) -> dict[str, list[ResultRow]]:
     """Group the results that can be compared; leave out groups with one member.
 
     Members have the same data, kind, split, context, classes and held-back people. Groups with the same name, such as
-    those of a data set before and after a change, are numbered. ``kind`` returns the text for a kind of result.
+    those of a data set before and after a change, are numbered.
     """
     comparable: dict[tuple[Any, ...], list[ResultRow]] = {}
     for row in rows:
@@ -241,7 +241,7 @@ def comparable_groups(rows: Sequence[ResultRow], kind: Callable[[str], str]) -> 
         if len(group) < 2:
             continue
         data, which, split, context = key[:4]
-        name = " · ".join((data, kind(which), split, context))
+        name = " · ".join((data, w(f"train.rows.{which}"), split_text(w, split), context_text(w, context)))
         numbered = (f"{name} ({number})" for number in itertools.count(2))
         groups[next(n for n in itertools.chain((name,), numbered) if n not in groups)] = group
     return groups
@@ -305,10 +305,7 @@ def pareto_options(w: Words, rows: Sequence[ResultRow]) -> dict[str, Any]:
         "yAxis": {
             "type": "value",
             "scale": True,
-            "axisLabel": {
-                ":formatter": f"(v) => v.toFixed(2).replace('.', '{w('shell.decimal_point')}')",
-                "color": _INK,
-            },
+            "axisLabel": {":formatter": _SCORE % w("shell.decimal_point"), "color": _INK},
             **_axis(w("train.pareto_y"), 48),
         },
         "series": [
@@ -341,7 +338,7 @@ def pareto_table(w: Words, rows: Sequence[ResultRow]) -> Markup:
     return table_html([*head, w("train.pareto_front")], cells, numbers=(2, 3))
 
 
-_SCORE = "(v) => v.toFixed(2).replace('.', '%s')"
+_SCORE = "(v) => v.toFixed(3).replace('.', '%s')"
 _SHORT = "(v) => v >= 1000 ? `${v / 1000}k` : `${v}`"
 
 
