@@ -193,7 +193,7 @@ def test_a_full_disk_ends_the_clip_with_a_sentence_and_the_toy_is_read_on(
     monkeypatch.setattr(writer.os, "fsync", full)
     until(lambda: not clips.recording)
     until(lambda: bool(clips.failed))
-    assert "No space left" in clips.failed
+    assert "No space left" in str(clips.failed)
     monkeypatch.undo()
     at = reader.now.t_s
     until(lambda: reader.now.t_s > at + 1.0)

@@ -146,8 +146,8 @@ def test_a_bundle_is_improved_beside_the_former_one(workspace: Workspace) -> Non
     report(workspace, 20.0, 21.0)
     marked(workspace, right=PULL)
     done = feedback.improve("S07")
-    assert (done.name, done.before) == ("one-for-S07", "one")
-    assert "probability of a wrong answer" in done.reason
+    assert (done.name, done.before.stem) == ("one-for-S07", "one")
+    assert done.marks is not None and done.marks.after < done.marks.before
     assert reader.choice.bundle == workspace.folder / "bundles" / "one-for-S07.plush"
     made = Bundle.load(reader.choice.bundle)
     assert made.adapted_to == "S07"
@@ -157,7 +157,9 @@ def test_a_bundle_is_improved_beside_the_former_one(workspace: Workspace) -> Non
     )
     # Again, with the improved one in use: another name, from the weights before.
     again = feedback.improve("S07")
-    assert (again.name, again.before) == ("one-for-S07-2", "one-for-S07")
+    assert (again.name, again.before.stem) == ("one-for-S07-2", "one-for-S07")
+    feedback.take_back(again)
+    assert reader.choice.bundle == again.before
     assert former.read_bytes() == before
     with pytest.raises(DatasetError, match=r"S08\.jsonl"):
         feedback.improve("S08")
@@ -174,12 +176,12 @@ def test_marks_that_do_not_help_change_nothing(workspace: Workspace, monkeypatch
     marked(workspace)
 
     def refuse(bundle: Bundle, corrections: list[Correction]) -> object:
-        return replace(correct(bundle, corrections), accepted=False, reason="they have nothing in common")
+        return replace(correct(bundle, corrections), accepted=False, refusal="nothing_in_common")
 
     monkeypatch.setattr("plushsense.studio.pages.live.feedback.correct", refuse)
     choice = reader.choice
     done = feedback.improve("S07")
-    assert (done.name, done.reason) == ("", "they have nothing in common")
+    assert done.name == "" and done.marks is not None and done.marks.refusal == "nothing_in_common"
     assert reader.choice == choice and len(workspace.bundles()) == 1
 
 

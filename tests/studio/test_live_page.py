@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
+import shutil
 import socket
 import subprocess
 import sys
@@ -14,9 +16,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import read_recording
 from plushsense.dataset.index import open_dataset
 from plushsense.live.feedback import read_corrections
+from plushsense.recording.plan import load_protocol
+from plushsense.recording.session import OpenSession
+from plushsense.recording.session_files import SessionHead
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.live.clips import Clips
 from support.browsing import DESK, TABLET, Look, Studio, axe, connected, marked
@@ -393,6 +399,19 @@ def test_the_server_is_killed_while_a_clip_is_recorded(studio: Fixture, look: Fi
     assert made.read_bytes().count(b"\n") == whole.count(b"\n") + 1
 
 
+def record_simulated(folder: Path) -> None:
+    """Write a session of a virtual person who made every gesture twice, as the recorder leaves it."""
+    from plushsense.recording.simulate import simulate
+
+    simulate(folder.parent / "made", 1, 5, 2, at_rest=0)
+    layout, protocol = load_layout("plush-15").to_dict(), load_protocol("plush-17").to_dict()
+    head = SessionHead(folder.parent.name, folder.name, 0, layout, protocol, simulated=True)
+    with contextlib.closing(OpenSession(folder, head)):
+        for file in (folder.parent / "made" / "P01").glob("*.csv"):
+            file.rename(folder / file.name)
+    shutil.rmtree(folder.parent / "made")
+
+
 def test_an_event_is_marked_as_wrong_and_the_network_improved(
     studio: Fixture, look: Fixture, shots: Fixture, home: Path
 ) -> None:
@@ -434,7 +453,8 @@ def test_an_event_is_marked_as_wrong_and_the_network_improved(
     marked(page, "message").get_by_text(f"Marked: {gesture} at {begin} was wrong. Marks of S07: 1.").wait_for()
     shots(page, "live-marked")
     marked(page, "improve").click()
-    marked(page, "message").get_by_text("Now in use for S07: little-for-S07 (the probability").wait_for()
+    marked(page, "message").get_by_text("Now in use for S07: little-for-S07.").wait_for()
+    marked(page, "message").get_by_text("The probability of a wrong answer falls from").wait_for()
     marked(page, "bundle").get_by_text("little-for-S07").wait_for()
     assert axe(page) == []
     assert no_sideways(page)
@@ -454,8 +474,58 @@ def test_an_event_is_marked_as_wrong_and_the_network_improved(
     import plushsense as ps
 
     assert ps.load(home / "bundles" / "little-for-S07.plush").adapted_to == "S07"
-    # The former network again, by its name.
+    # The former network again, by its name; it is adapted to recordings of the person, and that is undone.
     choose(page, "Network", "little")
+    record_simulated(home / "recordings" / "S08" / "1")
+    marked(page, "wrong-person").fill("S08")
+    page.wait_for_function("!document.querySelector('[data-test=adapt]').disabled")
+    marked(page, "adapt").click()
+    message = marked(page, "now").locator('[data-test="message"]')
+    message.get_by_text("Now in use for S08: little-for-S08.").wait_for()
+    assert "recordings, each left out once, it reads" in message.inner_text()
+    marked(page, "bundle").get_by_text("little-for-S08").wait_for()
+    message.get_by_role("button", name="Undo").click()
+    message.get_by_text("The network little is in use again.").wait_for()
+    assert ps.load(home / "bundles" / "little-for-S08.plush").adapted_to == "S08"
     marked(page, "start").click()
     situation(page, *READING)
+    assert browser.complaints == []
+
+
+def test_a_new_person_is_led_through_the_validation(studio: Fixture, look: Fixture, shots: Fixture, home: Path) -> None:
+    url = studio("--device", "virtual://?person=31", "--speed", "20", home=home).url
+    browser = look(PHONE, True, "lv", touch=True)
+    page = live(browser, url)
+    assert marked(page, "validate").is_disabled()
+    marked(page, "start").click()
+    situation(page, *READING)
+    marked(page, "validate").click()
+    page.get_by_role("alert").get_by_text("Vispirms norādiet").wait_for()
+    page.wait_for_function("document.activeElement.dataset.test === 'validation-person'")
+    page.keyboard.type("S31")
+    marked(page, "validate").click()
+    trial = "() => parseInt(document.querySelector('[data-test=validation-trial]').textContent.match(/[0-9]+/))"
+    page.wait_for_function(f"() => ({trial})() > 2")
+    marked(page, "validation-pause").click()
+    marked(page, "validation-prompt").get_by_text("Pauze. Nākamais: ").wait_for()
+    marked(page, "validation-trial").get_by_text("no 51").wait_for()
+    assert axe(page) == []
+    assert no_sideways(page)
+    shots(page, "live-validation-phone")
+    at = page.evaluate(trial)
+    marked(page, "validation-pause").click()
+    page.wait_for_function(f"(at) => ({trial})() > at", arg=at)
+    # The rest is left out.
+    marked(page, "validation-stop").click()
+    marked(page, "message").get_by_text("Pārbaude ir beigusies").wait_for()
+    table = marked(page, "validation-table").locator("table")
+    table.get_by_text("Visi žesti").wait_for()
+    assert "," in table.inner_text() and "." not in table.locator("tbody").inner_text()
+    assert axe(page) == []
+    assert no_sideways(page)
+    shots(page, "live-validated-phone")
+    with page.expect_download() as saved:
+        marked(page, "validation-trials").click()
+    rows = list(csv.DictReader(Path(saved.value.path()).read_text(encoding="utf-8").splitlines()))
+    assert {row["who"] for row in rows} == {"S31"} and {row["system"] for row in rows} >= {"rules", "cnn"}
     assert browser.complaints == []

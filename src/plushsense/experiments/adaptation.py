@@ -387,7 +387,8 @@ def _same_layout(bundle: Bundle, dataset: Dataset) -> None:
     if signature(one) != signature(other):
         raise DatasetError(
             f"'{dataset.head.name}' has the layout '{other.name}', the bundle '{one.name}': a bundle can only be "
-            "adapted to recordings of the sensors that it reads."
+            "adapted to recordings of the sensors that it reads.",
+            reason="other_sensors",
         )
 
 
@@ -409,7 +410,9 @@ def _recordings_of(dataset: Dataset, person: str, bundle: Bundle, warn: Warn) ->
     if not known:
         raise DatasetError(
             f"{person} has no recording of a gesture that the bundle knows, which are: "
-            f"{', '.join(bundle.gestures.labels)}."
+            f"{', '.join(bundle.gestures.labels)}.",
+            reason="no_known_recording",
+            subject=person,
         )
     return Dataset(dataset.path, dataset.head, known, dataset.streams), left_out
 

@@ -101,7 +101,8 @@ class Personal:
 
     ``before`` and ``after`` are scores on the person's recordings; ``after`` is cross-validated, with the best of the
     strengths, and therefore slightly optimistic. ``reason`` explains the decision as text. ``used`` and ``without`` are
-    the labels of gestures that were and were not used.
+    the labels of gestures that were and were not used. ``refusal`` is "" if it is accepted, else "inseparable" or
+    "no_gain".
     """
 
     bundle: Bundle
@@ -112,6 +113,7 @@ class Personal:
     after: RecordingScores
     used: tuple[str, ...]
     without: tuple[str, ...]
+    refusal: str = ""
 
 
 def personalise(
@@ -150,7 +152,13 @@ def personalise(
         raise BadInput(
             f"The recordings of {subject} are too few to adapt to: {needed} of the bundle's {len(labels)} gestures "
             f"with {spec.least} recordings each are needed, better all; there are {len(used)}. Record more of: "
-            f"{missing}."
+            f"{missing}.",
+            reason="too_few_recordings",
+            subject=subject,
+            needed=needed,
+            gestures=len(labels),
+            least=spec.least,
+            used=len(used),
         )
     own = judge(softmax(used_examples.features @ weight.T + bias), used_examples.y, used_examples.recording)
     tried = [(s, _cross_validate(weight, bias, used_examples, s)) for s in spec.strengths]
@@ -166,10 +174,10 @@ def personalise(
     guess = 1.0 / len(used)
     if after.right < (guess + (1.0 - guess) * spec.separation) * after.recordings:
         reason = f"the recordings cannot be told apart, so their labels or the sensors may be wrong: {figures}"
-        return Personal(bundle, False, reason, strength, before, after, used, without)
+        return Personal(bundle, False, reason, strength, before, after, used, without, "inseparable")
     if fell.mean() <= needed_fall or after.right <= before.right:
         reason = f"it would not clearly help: {figures}"
-        return Personal(bundle, False, reason, strength, before, after, used, without)
+        return Personal(bundle, False, reason, strength, before, after, used, without, "no_gain")
     dense = dict(zip(DENSE, fit_dense(weight, bias, used_examples, strength), strict=True))
     table = {
         "subject": subject,

@@ -124,12 +124,14 @@ def cut_correction(
     if right and right not in labels:
         raise BadInput(f"The bundle has no gesture '{right}': it has {', '.join(labels)}.{nearest(right, labels)}")
     if right == gesture:
-        raise BadInput(f"The event was reported as '{right}' already: choose what it really was.")
+        message = f"The event was reported as '{right}' already: choose what it really was."
+        raise BadInput(message, reason="mark_same", gesture=right)
     begun_s = min(begun_s, ended_s - 2 * bundle.arch.step * bundle.layout.period_us / 1e6)
     passed_s = row_times_us(frames, bundle.layout.period_us) / 1e6
     first, last = np.searchsorted(passed_s, (begun_s - LEAD_S, ended_s + 1e-6)).tolist()
     if first == last:
-        raise BadInput(f"The rows of the event '{gesture}' are not kept any more: mark an event soon after it.")
+        message = f"The rows of the event '{gesture}' are not kept any more: mark an event soon after it."
+        raise BadInput(message, reason="event_not_kept")
     zero_s = float(passed_s[first])
     return Correction(
         subject,
@@ -170,7 +172,8 @@ def read_corrections(path: str | os.PathLike[str]) -> list[Correction]:
     try:
         lines = Path(path).read_text(encoding="utf-8").split("\n")
     except (OSError, UnicodeDecodeError) as cause:
-        raise DatasetError(f"'{path}' cannot be read ({cause}): give a file that plushsense feedback wrote.") from None
+        message = f"'{path}' cannot be read ({cause}): give a file that plushsense feedback wrote."
+        raise DatasetError(message, reason="no_marks") from None
     found = []
     for number, line in enumerate(lines, 1):
         if not line.strip():
@@ -184,7 +187,8 @@ def read_corrections(path: str | os.PathLike[str]) -> list[Correction]:
                 f"'{path}' line {number} is no correction: give a file that plushsense feedback wrote."
             ) from None
     if not found:
-        raise DatasetError(f"'{path}' holds no correction: make some with plushsense feedback.")
+        message = f"'{path}' holds no correction: make some with plushsense feedback."
+        raise DatasetError(message, reason="no_marks")
     return found
 
 
@@ -212,7 +216,8 @@ class Corrected:
     """Result of `correct`: ``bundle`` is the corrected one, or the given one if ``accepted`` is false.
 
     ``before`` and ``after`` are the mean probability of a wrong answer in the events: of the reported gesture or, where
-    the right one was named, of any other. ``reason`` explains the decision as text.
+    the right one was named, of any other. ``reason`` explains the decision as text; ``refusal`` is "" if it is
+    accepted, else "no_fall", "nothing_in_common" or "fewer_right".
     """
 
     bundle: Bundle
@@ -221,10 +226,11 @@ class Corrected:
     corrections: int
     before: float
     after: float
+    refusal: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        return {key: value for key, value in vars(self).items() if key != "bundle"}
+        return {key: value for key, value in vars(self).items() if key not in ("bundle", "refusal")}
 
 
 def correct(
@@ -269,9 +275,9 @@ def correct(
         f"the probability of a wrong answer is {after:.2f} instead of {before:.2f} in {len(marks)} "
         f"event{'s' if len(marks) > 1 else ''} that {'were' if len(marks) > 1 else 'was'} corrected"
     )
-    refusal = ""
+    refusal = why = ""
     if after >= before:
-        refusal = "a wrong answer would not become less likely"
+        refusal, why = "a wrong answer would not become less likely", "no_fall"
     elif len(marks) > 1:
         others = [[n for n in everything if n != at] for at in everything]
         left_out = [
@@ -280,15 +286,16 @@ def correct(
         ]
         if np.mean(left_out) >= before:
             refusal = "the corrections have nothing in common: each becomes more likely if it is left out"
+            why = "nothing_in_common"
     if own is not None and not refusal:
         one, other = (
             judge(softmax(with_one(own.features) @ r.T), own.y, own.recording).scores for r in (layer, fitted)
         )
         figures += f"; of {one.recordings} own recordings {other.right} instead of {one.right} are read right"
         if other.right < one.right:
-            refusal = "fewer of the person's own recordings would be read right"
+            refusal, why = "fewer of the person's own recordings would be read right", "fewer_right"
     if refusal:
-        return Corrected(bundle, False, f"{refusal}: {figures}", len(marks), before, after)
+        return Corrected(bundle, False, f"{refusal}: {figures}", len(marks), before, after, why)
     dense = dict(zip(DENSE, (fitted[:, :-1], fitted[:, -1]), strict=True))
     table |= {"subject": subject, "corrections": len(marks), "uncorrected": start}
     table.setdefault("original", start)
@@ -303,7 +310,10 @@ def _subject_of(bundle: Bundle, corrections: Sequence[Correction]) -> str:
     if bundle.adapted_to not in (None, people[0]):
         raise BundleError(
             f"The bundle was adapted to {bundle.adapted_to}, the corrections are of {people[0]}: give a bundle that "
-            "was not adapted, or undo it first (plushsense adapt BUNDLE --undo)."
+            "was not adapted, or undo it first (plushsense adapt BUNDLE --undo).",
+            reason="adapted_to_other",
+            other=bundle.adapted_to,
+            subject=people[0],
         )
     for c in corrections:
         if c.channels != bundle.layout.names:

@@ -24,6 +24,7 @@ from plushsense.experiments.protocol.score import NOTES, RuleBaseline
 from plushsense.experiments.protocol.sittings import (
     FIRST_STRANGER,
     Progress,
+    Sitting,
     recorded_people,
     recorded_sittings,
     virtual_numbers,
@@ -137,6 +138,47 @@ def protocol(
     if place is not None:
         with nullcontext() if dataset is None else as_dataset(dataset).generation.writing():
             result["files"] = _write(result, place)
+    return result
+
+
+def live_protocol(
+    bundle: Bundle,
+    sittings: Sequence[Sitting],
+    *,
+    engine: str = "float",
+    tune_on: Dataset | None = None,
+    simulated: bool = False,
+    out: str | os.PathLike[str] | None = None,
+) -> dict[str, Any]:
+    """Score sittings in which people were prompted live, and write the same files as `protocol`.
+
+    Args:
+        tune_on: data set on whose people, except those of the sittings, the rule baseline is tuned; None leaves it out.
+        simulated: whether the toy was a virtual one.
+    """
+    people = list(dict.fromkeys(s.who for s in sittings))
+    baseline, tuned = None, NOTES["no_rules"]
+    if tune_on is not None:
+        baseline, tuned = recorded_rules(tune_on, bundle.gestures, people)
+    place = None if out is None else _place(Path(out))
+    made = scoring.run(sittings, integer_model(bundle) if engine == "int8" else bundle, baseline)
+    result = _with_notes(
+        made
+        | {
+            "heading": f"The paper's real-time protocol, led live{', SIMULATED' if simulated else ''}",
+            "simulated": simulated,
+            "codes": people,
+            "left": [],
+            "people_text": ", ".join(people),
+            "rules_text": tuned,
+            "aims": [],
+            "counted": [NOTES[key] for key in ("answered", "onset_live", "likelihood")],
+        },
+        bundle,
+        engine,
+    )
+    if place is not None:
+        result["files"] = _write(result, place)
     return result
 
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import BadInput, ConfigError, DatasetError
+from plushsense.core.errors import BadInput, ConfigError, DatasetError, PlushSenseError
 from plushsense.core.gestures import plain_label
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import STREAM_NAME, Frames, parse_name, read_stream, recording_filename
@@ -127,7 +128,8 @@ class _Running:
     receiver: FrameReceiver
     device: TappedDevice
     writer: BackgroundWriter | None = None
-    failed: str = ""
+    longest_s: float = LONGEST_S
+    failed: PlushSenseError | None = None
     ended: bool = False
     lock: Any = field(default_factory=threading.Lock)
 
@@ -144,7 +146,7 @@ class Clips:
         self._workspace = workspace
         self._lock = threading.RLock()
         self._running: _Running | None = None
-        self.failed = ""
+        self.failed: PlushSenseError | None = None
 
     # Recording ------------------------------------------------------------------------------------------------
 
@@ -169,7 +171,7 @@ class Clips:
         device, bundle = reader.device, reader.bundle
         frames = device.buffer.frames(seconds) if device is not None else []
         if device is None or bundle is None or not frames:
-            raise ConfigError("No data were received yet: start a toy first.")
+            raise ConfigError("No data were received yet: start a toy first.", reason="nothing_received")
         with self._lock:
             running = self._open(reader, device, bundle, subject)
         try:
@@ -184,8 +186,10 @@ class Clips:
         self.changed.notify()
         return running.key
 
-    def begin(self, reader: LiveReader, subject: str) -> str:
+    def begin(self, reader: LiveReader, subject: str, longest_s: float | None = None) -> str:
         """Start to record a clip and return its key; samples are on disk about half a second after they arrive.
+
+        Recording ends after ``longest_s`` (by default `LONGEST_S`) by the clock of the toy.
 
         Raises:
             ConfigError: if no toy is being read, or a clip is already being recorded. DatasetError: as for `keep`.
@@ -193,11 +197,13 @@ class Clips:
         with self._lock:
             device, bundle = reader.device, reader.bundle
             if self._running is not None:
-                raise ConfigError(f"The clip '{self.recording}' is being recorded already: end it first.")
+                message = f"The clip '{self.recording}' is being recorded already: end it first."
+                raise ConfigError(message, reason="clip_running", clip=self.recording)
             if device is None or bundle is None or not reader.now.running:
-                raise ConfigError("No toy is being read: start one first.")
-            self.failed = ""
+                raise ConfigError("No toy is being read: start one first.", reason="no_toy_read")
+            self.failed = None
             running = self._open(reader, device, bundle, subject)
+            running.longest_s = LONGEST_S if longest_s is None else longest_s
             try:
                 stream = StreamFile(running.session.folder / STREAM_NAME, running.session.layout)
             except OSError as cause:
@@ -247,12 +253,12 @@ class Clips:
             for gap in (r.gap for r in received):
                 if gap is not None:
                     running.writer.submit(new_event("gap", **gap))
-            running.ended = running.receiver.toy_ms >= 1000.0 * LONGEST_S
+            running.ended = running.receiver.toy_ms >= 1000.0 * running.longest_s
         if running.ended:
             threading.Thread(target=self.end, args=(running,), daemon=True).start()
 
     def _fail(self, running: _Running, cause: Exception) -> None:
-        running.failed = str(_write_error(running.session.folder, cause))
+        running.failed = _write_error(running.session.folder, cause)
         running.ended = True
         threading.Thread(target=self.end, args=(running,), daemon=True).start()
 
@@ -299,7 +305,8 @@ class Clips:
         """Return the clip with this key; raise ConfigError for an unknown key."""
         clip = read_clip(self._workspace.inside(self._workspace.recordings / key))
         if clip is None:
-            raise ConfigError(f"There is no clip '{key}': it may have been moved.")
+            message = f"There is no clip '{key}': it may have been moved."
+            raise ConfigError(message, reason="clip_gone", clip=key)
         return clip
 
     def rows(self, clip: Clip) -> Frames:
@@ -314,39 +321,28 @@ class Clips:
         Raises:
             ConfigError: for an invalid label or range of rows. DatasetError: if writing fails.
         """
+        return self.label_parts(key, [(gesture, first, last)])[0]
+
+    def label_parts(self, key: str, parts: Sequence[tuple[str, int, int]]) -> list[Label]:
+        """Save several parts of a clip (gesture, first row, last row exclusive) as recordings, see `label`."""
         clip = self.get(key)
         if key == self.recording:
-            raise ConfigError(f"The clip '{key}' is still being recorded: end it first.")
-        gesture = " ".join(gesture.split())
-        parsed = parse_name(recording_filename(gesture, 0, 0))
-        if not gesture or parsed is None or plain_label(parsed.label) != plain_label(gesture):
-            raise ConfigError(
-                f"'{gesture}' cannot be the label of a gesture: give a word or two without  \\ / : * ? \" < > | ( )  ."
-            )
+            message = f"The clip '{key}' is still being recorded: end it first."
+            raise ConfigError(message, reason="clip_running", clip=key)
         frames = self.rows(clip)
-        if not 0 <= first < last <= len(frames) or last - first < 2:
-            raise ConfigError(
-                f"Rows {first} to {last} are not a part of the clip '{key}', which has {len(frames)} rows: choose an "
-                "end after the start."
-            )
-        part = frames.slice(first, last)
-        host = part.host_ms if part.host_ms is not None else part.device_ms
-        as_frames = [
-            Frame(int(h), int(d), tuple(int(x) for x in v))
-            for h, d, v in zip(host, part.device_ms, part.values, strict=True)
-        ]
-        times = 1 + sum(plain_label(label.gesture) == plain_label(gesture) for label in clip.labels)
-        take = RecordingTake(Step(0, gesture, times, gesture), first, 0.0, Counters(), as_frames)
-        _count_losses(take, clip.layout)
+        labels = list(clip.labels)
         with contextlib.closing(OpenSession(clip.folder)) as session:
-            try:
-                file, _ = store_take(
-                    session, take, Counters(), "cut", now_ms(), "", device=clip.head.device, software=_SOFTWARE
-                )
-            except OSError as cause:
-                raise _write_error(clip.folder, cause) from None
+            for gesture, first, last in parts:
+                take = _take(clip, frames, gesture, first, last, labels)
+                try:
+                    file, _ = store_take(
+                        session, take, Counters(), "cut", now_ms(), "", device=clip.head.device, software=_SOFTWARE
+                    )
+                except OSError as cause:
+                    raise _write_error(clip.folder, cause) from None
+                labels.append(Label(file, take.step.gesture, first, last))
         self.changed.notify()
-        return Label(file, gesture, first, last)
+        return labels[len(clip.labels) :]
 
     def add(self, key: str, dataset: Path) -> ImportSummary:
         """Import the recordings of a clip into a data set, as ``plushsense import --add`` does.
@@ -356,12 +352,41 @@ class Clips:
         """
         clip = self.get(key)
         if not clip.labels:
-            raise ConfigError(f"The clip '{key}' has no label yet: choose a part of it and its gesture.")
+            message = f"The clip '{key}' has no label yet: choose a part of it and its gesture."
+            raise ConfigError(message, reason="clip_unlabelled")
         summary = import_recordings(clip.folder, self._workspace.inside(dataset), add_to=True)
         with contextlib.closing(OpenSession(clip.folder)) as session, contextlib.suppress(OSError):
             session.log.write([new_event("added", dataset=dataset.name, recordings=summary.added["recordings"])])
         self.changed.notify()
         return summary
+
+
+def _take(clip: Clip, frames: Frames, gesture: str, first: int, last: int, labels: Sequence[Label]) -> RecordingTake:
+    """Cut a recording from the rows of a clip; ``labels`` are those that it has already."""
+    gesture = " ".join(gesture.split())
+    parsed = parse_name(recording_filename(gesture, 0, 0))
+    if not gesture or parsed is None or plain_label(parsed.label) != plain_label(gesture):
+        raise ConfigError(
+            f"'{gesture}' cannot be the label of a gesture: give a word or two without  \\ / : * ? \" < > | ( )  .",
+            reason="label_bad",
+            label=gesture,
+        )
+    if not 0 <= first < last <= len(frames) or last - first < 2:
+        raise ConfigError(
+            f"Rows {first} to {last} are not a part of the clip '{clip.key}', which has {len(frames)} rows: choose an "
+            "end after the start.",
+            reason="clip_part_bad",
+        )
+    part = frames.slice(first, last)
+    host = part.host_ms if part.host_ms is not None else part.device_ms
+    as_frames = [
+        Frame(int(h), int(d), tuple(int(x) for x in v))
+        for h, d, v in zip(host, part.device_ms, part.values, strict=True)
+    ]
+    times = 1 + sum(plain_label(label.gesture) == plain_label(gesture) for label in labels)
+    take = RecordingTake(Step(0, gesture, times, gesture), first, 0.0, Counters(), as_frames)
+    _count_losses(take, clip.layout)
+    return take
 
 
 def _key(folder: Path) -> str:
@@ -404,4 +429,5 @@ def _count_losses(take: RecordingTake, layout: Layout) -> None:
 
 def _write_error(folder: Path, cause: Exception) -> DatasetError:
     why = getattr(cause, "strerror", None) or cause
-    return DatasetError(f"'{folder}' cannot be written ({why}): free some space; what was written before is kept.")
+    message = f"'{folder}' cannot be written ({why}): free some space; what was written before is kept."
+    return DatasetError(message, reason="clip_unwritable", folder=folder.name, why=why)

@@ -92,7 +92,7 @@ def _recording_controls(page: Page, reader: LiveReader, clips: Clips, people: Pe
         if key and not clips.failed:
             page.say(words("live.kept", clip=key), "good")
 
-    failed, updated_s = "", 0.0
+    failed, updated_s = clips.failed, 0.0
 
     def update() -> None:
         nonlocal failed
@@ -100,8 +100,8 @@ def _recording_controls(page: Page, reader: LiveReader, clips: Clips, people: Pe
         begin.set_enabled(reader.now.running)
         begin.set_visibility(not clips.recording)
         end.set_visibility(bool(clips.recording))
-        if clips.failed and failed != clips.failed:
-            page.say(clips.failed, "error")
+        if clips.failed is not None and failed is not clips.failed:
+            page.say(words.error(clips.failed), "error")
         failed = clips.failed
 
     def update_sometimes() -> None:

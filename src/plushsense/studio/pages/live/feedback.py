@@ -6,10 +6,13 @@ The corrections of a person are in ``feedback/<subject>.jsonl`` in the studio's 
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from plushsense.core.errors import ConfigError
+from plushsense.core.recorder_csv import parse_name
+from plushsense.experiments.adaptation import adapt
+from plushsense.live.adaptation import Personal
 from plushsense.live.feedback import (
     FOLDER,
     Corrected,
@@ -34,11 +37,19 @@ _SUFFIX = ".plush"
 
 @dataclass(frozen=True)
 class Improved:
-    """Result of `Feedback.improve`: ``name`` of the new bundle ("" if none was written), and of the one ``before``."""
+    """Result of `Feedback.improve` and `Feedback.adapt`.
+
+    Attributes:
+        name: name of the new bundle, "" if none was written.
+        before: the bundle in use before.
+        recordings: what the recordings of the person changed, if there were any.
+        marks: what the marks of the person changed, if there were any.
+    """
 
     name: str
-    before: str
-    reason: str
+    before: Path
+    recordings: Personal | None = None
+    marks: Corrected | None = None
 
 
 class Feedback:
@@ -90,9 +101,10 @@ class Feedback:
             path = self._path(subject)
             event = next((span for span in self._reader.spans() if span.number == number), None)
             if number in self._marked:
-                raise ConfigError("This event is marked already: wait for the next one.")
+                raise ConfigError("This event is marked already: wait for the next one.", reason="marked_already")
             if device is None or bundle is None or event is None or event.gesture is None or event.named_s is None:
-                raise ConfigError("This event is not kept any more: mark an event soon after it.")
+                message = "This event is not kept any more: mark an event soon after it."
+                raise ConfigError(message, reason="event_not_kept")
             first_s, frames = device.buffer.rows()
             ended_s = event.closed_s or event.end_s or self._reader.now.t_s
             times_s = max(event.named_s, ended_s - EVENT_S) - first_s, ended_s - first_s
@@ -128,23 +140,59 @@ class Feedback:
         with self._lock:
             path, choice = self._path(subject), self._reader.choice
             if choice.bundle is None:
-                raise ConfigError("No network is in use: start a toy first.")
+                raise _no_network()
             before = choice.bundle
             done = correct(Bundle.load(self._workspace.inside(before)), read_corrections(path))
-            if not done.accepted:
-                return Improved("", before.stem, done.reason)
-            out = self._save(done, before.stem, path.stem)
+            result = Improved("", before, marks=done)
+            return self._use(result, done.bundle, path.stem) if done.accepted else result
+
+    def sources(self, subject: str) -> list[Path]:
+        """Return the folders with recordings of a person: that of all sessions, if there are several, and each."""
+        person = self._workspace.inside(self._workspace.recordings / check_subject(subject))
+        sessions = [p for p in sorted(person.glob("*")) if any(parse_name(file.name) for file in p.glob("*.csv"))]
+        return [person, *sessions] if len(sessions) > 1 else sessions
+
+    def adapt(self, subject: str, recordings: Path) -> Improved:
+        """Adapt the bundle in use to a person, and use the result, which is written as a new bundle.
+
+        Args:
+            recordings: one of `sources`. The marks of the person are used, too.
+
+        Raises:
+            ConfigError: if no bundle is in use. BadInput: as `plushsense.experiments.adaptation.adapt`.
+        """
+        with self._lock:
+            path, choice = self._path(subject), self._reader.choice
+            if choice.bundle is None:
+                raise _no_network()
+            before = choice.bundle
+            bundle = Bundle.load(self._workspace.inside(before))
+            marks = path if self.count(subject) else None
+            place = self._workspace.inside(recordings)
+            done = adapt(bundle, place, subject=path.stem, feedback=marks)
+            result = Improved("", before, done.personal, done.corrected)
+            return self._use(result, done.bundle, path.stem) if done.accepted else result
+
+    def _use(self, result: Improved, bundle: Bundle, subject: str) -> Improved:
+        """Write a bundle under a new name in the studio's folder, and use it."""
+        out, choice = self._save(bundle, result.before.stem, subject), self._reader.choice
         self._reader.choose(out, choice.engine, choice.reactions)
         self.changed.notify()
-        return Improved(out.stem, before.stem, done.reason)
+        return replace(result, name=out.stem)
 
-    def _save(self, done: Corrected, stem: str, subject: str) -> Path:
-        """Write a corrected bundle under a new name in the studio's folder, and return its path."""
+    def take_back(self, result: Improved) -> None:
+        """Use the bundle before an improvement again; the improved one is kept."""
+        choice = self._reader.choice
+        self._reader.choose(result.before, choice.engine, choice.reactions)
+
+    def _save(self, bundle: Bundle, stem: str, subject: str) -> Path:
         base = stem.partition(f"-for-{subject}")[0]
         name = f"{plain_name(base, 'network')[:40]}-for-{subject}"
-        return done.bundle.save(
-            self._workspace.new(BUNDLES, self._workspace.free_name(BUNDLES, name, _SUFFIX) + _SUFFIX)
-        )
+        return bundle.save(self._workspace.new(BUNDLES, self._workspace.free_name(BUNDLES, name, _SUFFIX) + _SUFFIX))
 
     def _path(self, subject: str) -> Path:
         return self._workspace.inside(Path(FOLDER) / f"{check_subject(subject.strip())}.jsonl")
+
+
+def _no_network() -> ConfigError:
+    return ConfigError("No network is in use: start a toy first.", reason="no_network")

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 
 from nicegui import ui
 
-from plushsense.core.errors import BadInput
+from plushsense.core.errors import BadInput, PlushSenseError
 from plushsense.recording.session import check_subject
 from plushsense.studio.app.shell import Page, button, named, on_change, tag
-from plushsense.studio.pages.live.feedback import Feedback
+from plushsense.studio.app.words import Words
+from plushsense.studio.pages.live.clips import Clips
+from plushsense.studio.pages.live.feedback import Feedback, Improved
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.state import EventSpan
 
@@ -85,10 +88,15 @@ class _FeedbackPanel:
         with ui.row().classes("w-full items-center ps-small-gap"):
             self._improve = button("improve", words("live.improve"), self._fit, icon="auto_fix_high")
             self._undo = button("marks-undo", words("live.marks_undo"), self._remove, "flat", icon="undo")
+        with ui.row().classes("w-full items-center ps-small-gap"):
+            self._recordings = ui.select({}, label=words("live.adapt_from")).style("flex: 1 1 10rem; min-width: 0")
+            tag(self._recordings, "adapt-from")
+            self._adapt = button("adapt", words("live.adapt"), self._adapt_to_recordings, icon="person_add")
         # Messages are displayed here, because the top of the page may be out of view.
         self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))
         on_change(reader.changed, self._update_event)
         on_change(self._feedback.changed, self._update)
+        on_change(page.workspace.part(Clips).changed, self._update_marks)
         self._update()
 
     def _code(self) -> str:
@@ -113,23 +121,37 @@ class _FeedbackPanel:
                 self._page.say(self._words("live.marks_undone", subject=subject, n=n), "good")
 
     async def _fit(self) -> None:
-        words = self._words
+        await self._change_network(self._feedback.improve)
+
+    async def _adapt_to_recordings(self) -> None:
+        recordings = Path(str(self._recordings.value or ""))
+        await self._change_network(lambda subject: self._feedback.adapt(subject, recordings))
+
+    async def _change_network(self, work: Callable[[str], Improved]) -> None:
+        """Call ``work`` with the code of the person, and say what changed, with a button to undo it."""
         if self._busy or not (subject := self._code()):
             return
         self._busy = True
-        self._page.say(words("live.improving"))
+        self._page.say(self._words("live.improving"))
         self._update_marks()
         try:
             with self._page.show_errors():
-                done = await asyncio.to_thread(self._feedback.improve, subject)
+                done = await asyncio.to_thread(work, subject)
                 if done.name:
-                    values = {"name": done.name, "before": done.before, "subject": subject}
-                    self._page.say(words("live.improved", **values, reason=done.reason), "good")
+                    names = {"name": done.name, "before": done.before.stem, "subject": subject}
+                    message = " ".join([self._words("live.improved", **names), *_outcomes(self._words, done)])
+                    self._page.say(message, "good", lambda: self._take_back(done))
                 else:
-                    self._page.say(words("live.improve_refused", reason=done.reason), "warning")
+                    message = " ".join([self._words("live.improve_refused"), *_outcomes(self._words, done)])
+                    self._page.say(message, "warning")
         finally:
             self._busy = False
             self._update_marks()
+
+    async def _take_back(self, done: Improved) -> None:
+        with self._page.show_errors():
+            await asyncio.to_thread(self._feedback.take_back, done)
+            self._page.say(self._words("live.taken_back", name=done.before.stem), "good")
 
     def _begin(self, event: EventSpan) -> str:
         # 8.95 is written as 9.0, as in the list of events.
@@ -164,3 +186,22 @@ class _FeedbackPanel:
         self._count.set_text(self._words("live.marks", subject=subject, n=n) if n else "")
         for control in (self._undo, self._improve):
             control.set_enabled(n > 0 and not self._busy)
+        sources: list[Path] = []
+        if subject:
+            with contextlib.suppress(PlushSenseError, OSError):
+                sources = self._feedback.sources(subject)
+        everything = self._words("live.adapt_all", subject=subject)
+        options = {str(p): p.name if p.name != subject else everything for p in sources}
+        if options != self._recordings.options:
+            self._recordings.set_options(options, value=next(iter(options), None))
+        self._adapt.set_enabled(bool(options) and not self._busy)
+
+
+def _outcomes(words: Words, done: Improved) -> Iterator[str]:
+    """Yield a sentence on what the recordings changed, and one on what the marks did."""
+    if (own := done.recordings) is not None:
+        scores = {"n": own.before.recordings, "before": own.before.right, "after": own.after.right}
+        yield words(f"live.own_{own.refusal or 'gain'}", **scores)
+    if (marks := done.marks) is not None:
+        before, after = (words.number(100.0 * share) for share in (marks.before, marks.after))
+        yield words(f"live.marks_{marks.refusal or 'gain'}", n=marks.corrections, before=before, after=after)

@@ -16,13 +16,13 @@ from plushsense.recording.recorder import is_virtual
 from plushsense.studio.app.shell import Page, button, named, on_change, query, query_path, tag
 from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.workspace import VIRTUAL, Workspace
-from plushsense.studio.pages.live import clips_page, feedback_page
+from plushsense.studio.pages.live import clips_page, feedback_page, validation_page
 from plushsense.studio.pages.live.clips import Clips
 from plushsense.studio.pages.live.feed import PACE_S, RATES_HZ, Feed, LiveView, follow
 from plushsense.studio.pages.live.log import LogButtons
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.state import LiveChoice
-from plushsense.studio.widgets.elements import summary
+from plushsense.studio.widgets.elements import style, summary
 
 _GRID = "display: grid; grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); gap: 12px; margin-top: 8px"
 _OF_NETWORK = ("no_network", "no_common_gesture", "layouts_differ")
@@ -33,6 +33,7 @@ def show(page: Page) -> None:
     """Build the page."""
     reader = page.workspace.part(LiveReader)
     words = page.words
+    style()
     feed = Feed(reader, words.error)
     with ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap"):
         _Controls(page, reader, feed)
@@ -51,6 +52,7 @@ def show(page: Page) -> None:
         log = LogButtons(page, reader)
     follow(view, feed, reader)
     clips_page.show(page, reader, people)
+    validation_page.show(page, reader, people)
     log.add_sheet()
     clips = page.workspace.part(Clips)
     context.client.on_delete(reader.add_viewer(lambda: bool(clips.recording)))

@@ -1,0 +1,182 @@
+"""Build the section of the live page that leads through the paper's live validation and shows its results."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from nicegui import ui
+
+from plushsense.experiments.protocol.run import PAGE, TABLE, TRIALS
+from plushsense.studio.app.shell import Page, button, html, on_change, section, tag
+from plushsense.studio.app.words import Words
+from plushsense.studio.pages.live.feedback_page import PersonFields
+from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.validation import FOLDER, Validation
+from plushsense.studio.widgets.elements import notice, picture, scroll_to, summary, table
+
+_FILES = {"report": PAGE, "table": TABLE, "trials": TRIALS}
+
+
+def show(page: Page, reader: LiveReader, people: PersonFields) -> None:
+    """Build the section, whose content is folded until it is needed."""
+    with section(page.words("validation.title")) as box:
+        _ValidationPanel(page, reader, people)
+    tag(box, "validation")
+
+
+class _ValidationPanel:
+    """Form, prompts and results of the validation; every page of the studio shows the same prompts."""
+
+    def __init__(self, page: Page, reader: LiveReader, people: PersonFields) -> None:
+        self._reader, self._people, self._words = reader, people, page.words
+        self._validation = page.workspace.part(Validation)
+        self._workspace = page.workspace
+        words = page.words
+        ui.label(words("validation.about")).classes("ps-dim")
+        # Messages are displayed here, because the top of the page may be out of view.
+        self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))
+        self._form = ui.row().classes("w-full items-start ps-small-gap")
+        with self._form:
+            self._person = people.add("validation-person").classes("w-64")
+            times = {n: words("validation.times", n=n) if n > 1 else words("validation.once") for n in (3, 2, 1)}
+            self._repetitions = ui.select(times, value=3, label=words("validation.repetitions")).classes("w-36")
+            tag(self._repetitions, "validation-times")
+            datasets = {str(p): page.workspace.title(p) for p in page.workspace.datasets()}
+            rules = {"": words("validation.no_rules")} | datasets
+            first = next(iter(datasets), "")
+            self._rules = ui.select(rules, value=first, label=words("validation.rules")).classes("w-64")
+            tag(self._rules, "validation-rules")
+            self._begin = button("validate", words("validation.begin"), self._start, "unelevated", icon="playlist_play")
+        self._prompts = tag(ui.column().classes("w-full ps-card ps-next ps-small-gap"), "validation-prompts")
+        with self._prompts:
+            with ui.row().classes("w-full items-center no-wrap"):
+                self._picture = html().style("width: clamp(90px, 20vw, 200px); flex: none")
+                with ui.column().classes("ps-no-gap").style("min-width: 0"):
+                    prompt = ui.label("").style(
+                        "font-size: clamp(1.3rem, 3vw, 2rem); line-height: 1.25; font-weight: 600"
+                    )
+                    self._prompt = tag(prompt, "validation-prompt").props("role=status")
+                    self._left = tag(ui.label("").classes("text-lg"), "validation-left")
+                    self._trial = tag(ui.label("").classes("ps-dim"), "validation-trial")
+            with ui.row().classes("w-full ps-small-gap"):
+                self._pause = button("validation-pause", "", self._validation.pause, icon="pause")
+                self._skip = button(
+                    "validation-skip", words("validation.skip"), self._validation.skip, icon="skip_next"
+                )
+                button("validation-stop", words("validation.stop"), self._validation.stop, icon="stop")
+        with tag(ui.element("details").classes("w-full"), "validation-results") as self._past:
+            summary(words("validation.results"))
+            self._results = tag(
+                ui.select({}, label=words("validation.result")).classes("w-64 q-mt-sm"), "validation-result"
+            )
+            self._result = tag(ui.column().classes("w-full ps-small-gap"), "validation-table")
+        self._results.on_value_change(self._show_result)
+        self._drawn: tuple[Any, ...] = ()
+        on_change(self._validation.changed, self._update)
+        on_change(reader.changed, self._update_button)
+        self._update()
+
+    async def _start(self) -> None:
+        if not (subject := self._people.checked(self._person)):
+            return
+        self._page.say("")
+        tune_on = Path(self._rules.value) if self._rules.value else None
+        with self._page.show_errors():
+            await asyncio.to_thread(self._validation.begin, subject, int(self._repetitions.value), tune_on)
+            scroll_to("validation")
+
+    def _update_button(self) -> None:
+        self._begin.set_enabled(self._reader.now.running)
+
+    def _update(self) -> None:
+        status, words = self._validation.status, self._words
+        led = status.phase != ""
+        self._form.set_visibility(not led)
+        self._prompts.set_visibility(led)
+        self._update_button()
+        gesture = words.gesture(status.label)
+        self._prompt.set_text(words(f"validation.{status.phase}", gesture=gesture) if led else "")
+        self._left.set_text(f"{status.left_s} s" if status.left_s else "")
+        where = {"n": status.at + 1, "total": status.total, "repetition": status.repetition}
+        self._trial.set_text(words("validation.trial", **where) if led else "")
+        self._pause.set_text(words("validation.go_on" if status.phase == "paused" else "validation.pause"))
+        for control in (self._pause, self._skip):
+            control.set_enabled(status.phase in ("countdown", "doing", "paused"))
+        drawn = (status.label, status.result, status.failed)
+        if drawn == self._drawn:
+            return
+        last, self._drawn = self._drawn, drawn
+        if status.label:
+            self._picture.set_content(picture(status.label, gesture))
+        if status.failed is not None:
+            self._page.say(words.error(status.failed), "error")
+        if not last or status.result != last[1]:
+            self._update_results(str(status.result or ""))
+            if last and status.result is not None:
+                self._past.props("open")
+                self._page.say(words("validation.done", n=status.done, folder=f"{FOLDER}/{status.result.name}"), "good")
+
+    def _update_results(self, chosen: str) -> None:
+        found = self._validation.results()
+        when = {
+            str(p): f"{p.name}, {time.strftime('%Y-%m-%d %H:%M', time.localtime(p.stat().st_mtime))}" for p in found
+        }
+        self._past.set_visibility(bool(found))
+        self._results.set_options(when, value=chosen or next(iter(when), None))
+
+    async def _show_result(self) -> None:
+        self._result.clear()
+        if not self._results.value:
+            return
+        folder = Path(self._results.value)
+        with self._page.show_errors():
+            result = await asyncio.to_thread(self._validation.read, folder)
+            with self._result:
+                _result_table(self._words, result)
+                with ui.row().classes("ps-small-gap"):
+                    for key, name in _FILES.items():
+                        save = self._workspace.inside(folder / name)
+                        button(
+                            f"validation-{key}",
+                            self._words(f"validation.save_{key}"),
+                            lambda save=save: ui.download.content(save.read_bytes(), f"{save.parent.name}-{save.name}"),
+                            icon="download",
+                        )
+
+
+def _result_table(words: Words, result: Mapping[str, Any]) -> None:
+    """Add the table of a result: the trials of each gesture, as rules and network answered them."""
+    systems = [row["system"] for row in result["systems"]]
+    network = "hybrid" if "hybrid" in systems else "cnn"
+    by = {(row["gesture"], row["system"]): row for row in result["by_gesture"]}
+    everything = {row["system"]: row for row in result["rows"] if row["group"] == "all"}
+    labels = list(dict.fromkeys(row["gesture"] for row in result["by_gesture"]))
+    names = [*map(words.gesture, labels), words("validation.all")]
+    chosen = [*({s: by[label, s] for s in systems} for label in labels), everything]
+
+    def seconds(value: float | None) -> str:
+        return "–" if value is None else f"{words.number(value, 1)} s"
+
+    rows = []
+    for name, row in zip(names, chosen, strict=True):
+        one = row[network]
+        likelihood = "–" if one["likelihood"] is None else words.number(one["likelihood"], 2)
+        cells = [name]
+        if "rules" in systems:
+            rules = row["rules"]
+            cells += [f"{rules['activated']}/{rules['trials']}", seconds(rules["reaction_s"]["median"])]
+        cells += [f"{one['activated']}/{one['trials']}", seconds(one["reaction_s"]["median"])]
+        cells += [f"{one['named']}/{one['trials']}", seconds(one["gesture_s"]["median"]), likelihood]
+        rows.append(cells)
+    head = [words("log.gesture")]
+    head += [words("validation.rules_answered"), words("validation.rules_time")] if "rules" in systems else []
+    head += [words(f"validation.{key}") for key in ("answered", "answered_time", "named", "named_time", "likelihood")]
+    if result["simulated"]:
+        notice(words("shell.simulation"))
+    ui.label(words(f"validation.note_{network}")).classes("ps-dim ps-note")
+    table(words("validation.caption", people=", ".join(result["people"])), head, rows, range(1, len(head)))

@@ -1,0 +1,96 @@
+"""The paper's live validation on the page: prompts by the clock of the toy, trials kept as a clip, scores in files."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.gestures import load_gestures
+from plushsense.studio.app.workspace import Workspace
+from plushsense.studio.pages.live.clips import Clips
+from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.state import LiveChoice
+from plushsense.studio.pages.live.validation import GESTURE_S, Validation
+from support.bundles import odd_bundle
+from support.waiting import until
+
+GESTURES = ["At rest", "Ear scratch 1", "Tail pull"]
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Iterator[Workspace]:
+    """A studio's folder in which a virtual toy is read at twenty times the speed."""
+    bundle = odd_bundle(
+        tmp_path / "home" / "bundles" / "one.plush", gestures=load_gestures("plush-18").subset(GESTURES)
+    )
+    made = Workspace(tmp_path / "home", speed=20.0)
+    made.part(LiveReader).start(LiveChoice("virtual://?person=31", bundle))
+    yield made
+    made.close()
+
+
+def test_every_gesture_is_prompted_made_kept_and_scored(workspace: Workspace) -> None:
+    validation, clips, reader = (workspace.part(kind) for kind in (Validation, Clips, LiveReader))
+    with pytest.raises(DatasetError, match="no code"):
+        validation.begin("Anna", 1, None)
+    commands = [
+        (lambda status: status.done == 1, validation.pause),
+        # A trial that is skipped does not count.
+        (lambda status: (status.label, status.phase) == ("Tail pull", "countdown"), validation.skip),
+    ]
+
+    def command() -> None:
+        """Give the next command at once, in the thread of the reader: on a busy machine a test would be late."""
+        if commands and commands[0][0](validation.status):
+            commands.pop(0)[1]()
+
+    validation.changed = SimpleNamespace(notify=command)  # type: ignore[assignment]
+    validation.begin("S31", 2, None)
+    with pytest.raises(ConfigError, match="under way"):
+        validation.begin("S31", 2, None)
+    assert validation.status.total == 4
+    until(lambda: validation.status.phase == "paused")
+    at = reader.now.t_s
+    until(lambda: reader.now.t_s > at + 2.0 * GESTURE_S)
+    assert (validation.status.phase, validation.status.done) == ("paused", 1)
+    validation.pause()
+    until(lambda: validation.status.phase == "")
+    assert commands == []
+    assert validation.status.failed is None
+    assert validation.status.result == workspace.folder / "validations" / "S31"
+    result = validation.read(validation.status.result)
+    assert result["simulated"] is True and result["people"] == ["S31"]
+    trials = {(o["gesture"], o["repetition"]) for o in result["outcomes"]}
+    assert ("Tail pull", 1) not in trials and ("Tail pull", 2) in trials and ("Ear scratch 1", 1) in trials
+    (clip,) = clips.all()
+    assert (clip.labels[0].gesture, clip.labels[-1].gesture) == ("Ear scratch 1", "Tail pull")
+    assert all(label.last - label.first > 50 for label in clip.labels)
+    with (validation.status.result / "trials.csv").open(encoding="utf-8") as file:
+        assert {row["simulated"] for row in csv.DictReader(file)} == {"yes"}
+    # The person does as they like again.
+    made = len(reader.performed())
+    until(lambda: len(reader.performed()) > made)
+
+
+def test_a_validation_that_ends_early_keeps_what_was_made(workspace: Workspace) -> None:
+    validation, clips, reader = (workspace.part(kind) for kind in (Validation, Clips, LiveReader))
+    validation.begin("S31", 1, None)
+    validation.stop()
+    until(lambda: validation.status.phase == "")
+    assert (validation.status.result, validation.status.failed, clips.recording) == (None, None, "")
+    validation.begin("S31", 1, None)
+    until(lambda: validation.status.done)
+    clips.end()
+    until(lambda: validation.status.phase == "" and validation.status.result is not None)
+    assert validation.results() == [workspace.folder / "validations" / "S31"]
+    reader.stop()
+    with pytest.raises(ConfigError, match="No toy is being read"):
+        validation.begin("S31", 1, None)
+    (workspace.folder / "validations" / "S31" / "protocol.json").write_text("{", encoding="utf-8")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        validation.read(validation.results()[0])
