@@ -231,7 +231,8 @@ def english(page: Page) -> list[str]:
     """Return the lines of a page, and its labels for screen readers, that read as English."""
     texts: list[str] = page.evaluate(
         "() => [...document.body.innerText.split('\\n'), "
-        "...[...document.querySelectorAll('[aria-label], [placeholder], [title]')].flatMap(e => ['aria-label', 'placeholder', 'title'].map(k => e.getAttribute(k) || ''))]"
+        "...[...document.querySelectorAll('[aria-label], [placeholder], [title]')]"
+        ".flatMap(e => ['aria-label', 'placeholder', 'title'].map(k => e.getAttribute(k) || ''))]"
     )
     return sorted({text for text in texts if _ENGLISH.search(text)})
 

@@ -157,8 +157,8 @@ def zeroed(w: DatasetSummary) -> Iterator[Issue]:
         n = int(zeros.any(axis=1).sum())
         message = Sentence(
             f"{_channels(names, affected)} {'reads' if len(affected) == 1 else 'read'} exactly 0 in up to "
-            f"{percent:.1f} % of the rows ({n} of {len(zeros)} recordings) and never less than {limit}: the authors' recorder writes 0 for every value "
-            f"under {limit}, so that magnitude and direction are wrong there",
+            f"{percent:.1f} % of the rows ({n} of {len(zeros)} recordings) and never less than {limit}: the authors' "
+            f"recorder writes 0 for every value under {limit}, so that magnitude and direction are wrong there",
             "zeroed",
             channels=_names(names, affected),
             percent=percent,
