@@ -300,12 +300,9 @@ def run_publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         try:
             Path(key).parent.mkdir(parents=True, exist_ok=True)
         except OSError as cause:
-            raise DatasetError(
-                f"The key file '{key}' cannot be written: {cause.strerror or cause}.",
-                reason="key_not_written",
-                file=Path(key).name,
-                why=cause.strerror or str(cause),
-            ) from None
+            file, why = Path(key).name, cause.strerror or str(cause)
+            message = f"The key file '{key}' cannot be written: {why}."
+            raise DatasetError(message, reason="key_not_written", file=file, why=why) from None
     options = {name: value for name, value in spec.items() if name not in ("dataset", "place")}
     options |= {"columns": tuple(spec.get("columns", ())), "key": key}
     return publish_dataset(spec["dataset"], spec["place"], **options, progress=reporter.stage).to_dict()

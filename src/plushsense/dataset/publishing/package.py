@@ -320,7 +320,7 @@ def _warnings(source: Dataset, d: Description, people: dict[str, PersonInfo]) ->
         warnings.append(Sentence(message, "contact_is_creator"))
     if any(r.subject == UNKNOWN_SUBJECT for r in d.dataset.recordings):
         message = "the people of some recordings are not known, so they share one time shift"
-        warnings.append(Sentence(message, "people_share_shift"))
+        warnings.append(Sentence(message, "some_people_unknown"))
     if not {r.subject for r in d.dataset.recordings} - {NOBODY, UNKNOWN_SUBJECT}:
         warnings.append(Sentence("no recording has a known person", "nobody_known"))
     return warnings

@@ -97,7 +97,7 @@ class GestureOverlayView:
                 ui.label(words("review.no_outliers")).classes("ps-dim")
             for c in outliers[:_MAX_OUTLIERS]:
                 with ui.row().classes("items-center no-wrap w-full"):
-                    dash = ui.element("span").style("width: 22px; height: 4px; flex: none")
+                    dash = ui.element("span").classes("ps-dash").style("width: 22px; height: 4px; flex: none")
                     dash.style(f"background: {colours[c.recording]}")
                     text = f"{c.recording}: {', '.join(check_name(words, check) for check in c.why.split(', '))}"
                     name = button("", text, lambda c=c: desk.open(c.recording), "flat dense align=left")

@@ -87,6 +87,8 @@ export default {
       const p = this.p, ink = colour("--ps-ink"), grid = { stroke: colour("--ps-line"), width: 1 };
       const number = new Intl.NumberFormat(document.documentElement.lang || "en", { maximumFractionDigits: 4 });
       const values = (u, splits) => splits.map((v) => (v == null ? "" : number.format(v)));
+      // Dots are numbered, so only whole numbers are labelled.
+      const counts = p.series.some((s) => s.dots) ? { incrs: [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 10000] } : {};
       const y = { values, stroke: ink, grid, ticks: grid, label: p.y || undefined, labelSize: 22, size: 64 };
       if (p.lanes.length > 1) {
         y.splits = () => p.lanes.map((lane) => lane[0]);
@@ -102,7 +104,7 @@ export default {
         legend: { show: this.legend, live: false },
         cursor: { drag: { x: this.selects, y: false, setScale: false, dist: 4 }, points: { show: false } },
         scales: { x: { time: false }, y: p.range ? { range: p.range } : {} },
-        axes: [{ values, stroke: ink, grid, ticks: grid, label: p.xTitle, labelSize: 22, size: 44 }, y],
+        axes: [{ ...counts, values, stroke: ink, grid, ticks: grid, label: p.xTitle, labelSize: 22, size: 44 }, y],
         series: [{ label: p.xTitle }, ...p.series.map((s) => this.style(s))],
         hooks: { drawClear: [(u) => this.drawBehind(u)], draw: [(u) => this.drawMarks(u)], setSelect: [(u) => this.select(u)] },
       };
