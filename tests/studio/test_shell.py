@@ -58,9 +58,9 @@ def test_pages_open_without_complaint(empty: str, look: Fixture, shots: Fixture)
 
 def test_every_icon_is_drawn() -> None:
     folder = Path(shell.__file__).parent
-    drawn = set(re.findall(r"(?m)^  ([a-z_]+): \[", (folder / "icons.js").read_text(encoding="utf-8")))
+    drawn = set(re.findall(r"(?m)^  ([a-z0-9_]+): \[", (folder / "icons.js").read_text(encoding="utf-8")))
     source = "\n".join(path.read_text(encoding="utf-8") for path in folder.parent.rglob("*.py"))
-    named = set(re.findall(r'(?:icon=|ui\.icon\(|icon_button\(\s*)"([a-z_]+)"', source))
+    named = set(re.findall(r'(?:icon=|ui\.icon\(|icon_button\(\s*)"([a-z0-9_]+)"', source))
     assert len(named) > 20
     assert named - drawn == set()
 

@@ -309,10 +309,16 @@ def check_layout(sent: Layout, read: Layout) -> None:
     if sent.names != read.names:
         raise ConfigError(
             f"The device sends layout '{sent.name}' ({', '.join(sent.names)}), but the model reads "
-            f"'{read.name}' ({', '.join(read.names)}): {ask}."
+            f"'{read.name}' ({', '.join(read.names)}): {ask}.",
+            reason="layouts_differ",
+            sent=sent.name,
+            read=read.name,
         )
     other = next(a.name for a, b in zip(sent.channels, read.channels, strict=True) if a != b)
     raise ConfigError(
         f"The device sends layout '{sent.name}', in which channel '{other}' has another unit, scale, step or "
-        f"valid range than in the model's '{read.name}': {ask}."
+        f"valid range than in the model's '{read.name}': {ask}.",
+        reason="layouts_differ",
+        sent=sent.name,
+        read=read.name,
     )

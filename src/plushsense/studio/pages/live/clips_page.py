@@ -24,6 +24,7 @@ from plushsense.studio.widgets.elements import Plot
 
 _KEEP_S = (5, 10, 20, 40)
 _MAX_POINTS = 3000
+_MAX_NAMES = 4
 _START, _END = "#009E73", "#D55E00"
 
 
@@ -129,7 +130,9 @@ def _row(page: Page, clips: Clips, clip: Clip, edit: Callable[[], Awaitable[None
     elif not clip.labels:
         state = words("live.clip_unlabelled")
     else:
-        state = ", ".join(words.gesture(label.gesture) for label in clip.labels)
+        state = ", ".join(dict.fromkeys(words.gesture(label.gesture) for label in clip.labels[:_MAX_NAMES]))
+        if (more := len(clip.labels) - _MAX_NAMES) > 0:
+            state = words("live.clip_more", names=state, n=more)
         state += f"; {words('live.clip_added', names=', '.join(clip.added))}" if clip.added else ""
     with ui.row().classes("w-full items-center ps-small-gap").style("border-bottom: 1px solid var(--ps-line)") as row:
         tag(row, f"clip-{clip.key}")

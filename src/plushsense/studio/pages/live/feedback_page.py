@@ -91,7 +91,7 @@ class _FeedbackPanel:
         with ui.row().classes("w-full items-center ps-small-gap"):
             self._recordings = ui.select({}, label=words("live.adapt_from")).style("flex: 1 1 10rem; min-width: 0")
             tag(self._recordings, "adapt-from")
-            self._adapt = button("adapt", words("live.adapt"), self._adapt_to_recordings, icon="person_add")
+            self._adapt = button("adapt", words("live.adapt"), self._adapt_to_recordings, icon="auto_fix_high")
         # Messages are displayed here, because the top of the page may be out of view.
         self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))
         on_change(reader.changed, self._update_event)

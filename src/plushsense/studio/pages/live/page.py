@@ -87,12 +87,10 @@ def _person_panel(page: Page, reader: LiveReader) -> None:
                 button(f"do-{label}", words.gesture(label), lambda label=label: direct(label), "outline dense").classes(
                     "ps-note"
                 )
-            button(
-                "do-nothing", words("live.person_stop"), lambda: direct(""), "outline dense", icon="front_hand"
-            ).classes("ps-note")
-            button("do-own", words("live.person_own"), lambda: direct(None), "flat dense", icon="shuffle").classes(
+            button("do-nothing", words("live.person_stop"), lambda: direct(""), "outline dense", icon="stop").classes(
                 "ps-note"
             )
+            button("do-own", words("live.person_own"), lambda: direct(None), "flat dense").classes("ps-note")
 
     on_change(reader.changed, update)
     update()

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import ConfigError, DatasetError, DeviceError, PlushSenseError
+from plushsense.core.errors import ArchError, BundleError, ConfigError, DatasetError, DeviceError, PlushSenseError
 from plushsense.dataset.importing.sources import is_simulation
 from plushsense.deploy.quantize import classifier_of
 from plushsense.devices.opening import open_device, parse_url
@@ -95,7 +95,7 @@ class LiveReader:
         with self._changing:
             if choice.bundle is None:
                 raise _no_bundle()
-            bundle = Bundle.load(self._workspace.inside(choice.bundle))
+            bundle = _load(self._workspace.inside(choice.bundle))
             classifier = _classifier(bundle, choice.engine)
             reactor = _reactor(choice.reactions, bundle)
             url = with_speed(choice.toy, self._workspace.speed)
@@ -146,7 +146,7 @@ class LiveReader:
                 raise _no_bundle()
             fresh = before
             if bundle != self.choice.bundle:
-                fresh = Bundle.load(self._workspace.inside(bundle))
+                fresh = _load(self._workspace.inside(bundle))
                 _refuse_strange(fresh, before)
             reactor = _reactor(reactions, fresh)
             bundle_run = _BundleRun(fresh, run_on(device, _classifier(fresh, engine)), reactor)
@@ -479,8 +479,19 @@ def _simulated(url: str) -> bool:
     return head.simulated if head is not None else is_simulation(place, [])
 
 
+def _load(path: Path) -> Bundle:
+    """Read a bundle; an error has a reason, so that pages in other languages can say it."""
+    try:
+        return Bundle.load(path)
+    except BundleError as cause:
+        raise BundleError(str(cause), reason=cause.reason or "network_unreadable", name=path.stem) from None
+
+
 def _classifier(bundle: Bundle, engine: str) -> Any:
-    return classifier_of(bundle, DecideSpec.from_dict(bundle.decision), engine)
+    try:
+        return classifier_of(bundle, DecideSpec.from_dict(bundle.decision), engine)
+    except (BundleError, ArchError) as cause:
+        raise BundleError(str(cause), reason=cause.reason or "engine_unfit") from None
 
 
 def _reactor(reactions: str, bundle: Bundle) -> Reactor | None:
@@ -493,5 +504,7 @@ def _refuse_strange(fresh: Bundle, running: Bundle) -> None:
         new, current = ", ".join(fresh.gestures.labels[:4]), ", ".join(running.gestures.labels[:4])
         raise ConfigError(
             f"The gesture set of this bundle, '{fresh.gestures.name}' ({new}, …), has no gesture in common with the "
-            f"one in use, '{running.gestures.name}' ({current}, …): stop the toy before you choose this bundle."
+            f"one in use, '{running.gestures.name}' ({current}, …): stop the toy before you choose this bundle.",
+            reason="no_common_gesture",
+            name=fresh.gestures.name,
         )

@@ -51,7 +51,7 @@ class _ValidationPanel:
             first = next(iter(datasets), "")
             self._rules = ui.select(rules, value=first, label=words("validation.rules")).classes("w-64")
             tag(self._rules, "validation-rules")
-            self._begin = button("validate", words("validation.begin"), self._start, "unelevated", icon="playlist_play")
+            self._begin = button("validate", words("validation.begin"), self._start, "unelevated", icon="play_arrow")
         self._prompts = tag(ui.column().classes("w-full ps-card ps-next ps-small-gap"), "validation-prompts")
         with self._prompts:
             with ui.row().classes("w-full items-center no-wrap"):
@@ -177,6 +177,6 @@ def _result_table(words: Words, result: Mapping[str, Any]) -> None:
     head += [words("validation.rules_answered"), words("validation.rules_time")] if "rules" in systems else []
     head += [words(f"validation.{key}") for key in ("answered", "answered_time", "named", "named_time", "likelihood")]
     if result["simulated"]:
-        notice(words("shell.simulation"))
+        notice(words("shell.simulation")).style("box-sizing: border-box")
     ui.label(words(f"validation.note_{network}")).classes("ps-dim ps-note")
     table(words("validation.caption", people=", ".join(result["people"])), head, rows, range(1, len(head)))
