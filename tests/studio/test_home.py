@@ -62,11 +62,10 @@ def test_sessions_become_a_data_set_and_what_is_new_is_added(studio: Fixture, lo
     browser = look(TABLET)
     page = browser.open(url)
     assert "Some sessions are not in a data set yet: 1" in marked(page, "next-sentence").inner_text()
-    marked(page, "make").click()
-    marked(page, "message").get_by_text("cannot be a name").wait_for()
+    assert marked(page, "new-name").input_value() == "recordings"
     marked(page, "new-name").fill("autumn & co")
     marked(page, "make").click()
-    marked(page, "message").get_by_text("cannot be a name").wait_for()
+    marked(page, "sessions").get_by_role("alert").get_by_text("cannot be a name").wait_for()
     assert axe(page) == []
     marked(page, "new-name").fill("autumn")
     marked(page, "make").click()

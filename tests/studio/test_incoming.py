@@ -87,8 +87,8 @@ def test_the_person_of_loose_files_and_of_folders_of_gestures_can_be_given(furni
     for path in list(loose.iterdir()):
         (loose / path.name.split("_")[0]).mkdir(exist_ok=True)
         path.rename(loose / path.name.split("_")[0] / path.name)
-    assert inspect(tmp_path / "D", loose)["people"] == {"unknown": 3}
-    assert inspect(tmp_path / "D", loose, person="S01")["people"] == {"S01": 3}
+    assert inspect(tmp_path / "E", loose)["people"] == {"unknown": 3}
+    assert inspect(tmp_path / "F", loose, person="S01")["people"] == {"S01": 3}
 
 
 def test_files_and_a_folder_are_chosen(studio: Fixture, look: Fixture, furniture: Path, tmp_path: Path) -> None:

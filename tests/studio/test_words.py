@@ -16,6 +16,7 @@ import pytest
 from plushsense.core import errors
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import load_gestures
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.quality.checking import CHECKS
 from plushsense.studio.app.words import LANGUAGES, Words
 
@@ -67,6 +68,18 @@ def test_an_error_is_worded_in_the_language_of_the_page() -> None:
     other = ConfigError("Use --subject.")
     assert Words("en").error(other) == "Use --subject."
     assert Words("lv").error(other) == "Tas neizdevās. Programmas ziņa angliski: Use --subject."
+
+
+def test_a_note_is_worded_in_the_language_of_the_page_also_after_json() -> None:
+    inner = Sentence("not a recording", reason="file_no_recording")
+    note = Sentence("a.txt: not a recording", reason="about_file", file="a.txt", note=inner)
+    stored = {"message": "", "reason": note.reason, "values": {"file": "a.txt", "note": vars(inner) | {"message": ""}}}
+    for form in (note, stored):
+        assert Words("en").sentence(form) == "a.txt: no recording"
+        assert Words("lv").sentence(form) == "a.txt: nav ieraksts"
+    assert Words("lv").sentence("something") == "(Angliski:) something"
+    assert (Words("en").count(12345), Words("lv").count(12345)) == ("12,345", "12\u00a0345")
+    assert (Words("en").significant(0.1234, 2), Words("lv").significant(0.1234, 2)) == ("0.12", "0,12")
 
 
 def made() -> Iterator[tuple[str, str, dict[str | None, ast.expr]]]:

@@ -17,6 +17,7 @@ from urllib.parse import unquote
 
 from plushsense.core.errors import ConfigError, DeviceError, need
 from plushsense.core.layouts import Layout
+from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Device, Frame, now_ms
 from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
 from plushsense.devices.wire import LineParser
@@ -285,13 +286,15 @@ def search_bluetooth(scan_s: float, backends: BleBackends | None = None) -> Devi
     for device in seen:
         uart = UART_SERVICE in device.services
         if uart or any(word in device.name.lower() for word in _TOY_WORDS):
-            about = f"{device.rssi} dBm, {'Nordic UART service' if uart else 'advertises no Nordic UART service'}"
+            message = f"{device.rssi} dBm, {'Nordic UART service' if uart else 'advertises no Nordic UART service'}"
+            about = Sentence(message, reason="ble_about" if uart else "ble_about_other", dbm=device.rssi)
             toys.append(DeviceInfo(f"ble://{device.address}", "ble", device.name or device.address, about))
     others = len(seen) - len(toys)
     if not others:
         return DeviceListing(toys)
     who = "1 more device advertises" if others == 1 else f"{others} more devices advertise"
-    return DeviceListing(toys, [f"Bluetooth: {who}, by name and service no toy; ble://ADDRESS opens any."])
+    message = f"Bluetooth: {who}, by name and service no toy; ble://ADDRESS opens any."
+    return DeviceListing(toys, [Sentence(message, reason="ble_others", n=others)])
 
 
 def _scanner(bleak: ModuleType, backends: BleBackends, advertised: Callable[[Any, Any], None]) -> Any:

@@ -16,6 +16,7 @@ from urllib.parse import quote, unquote
 
 from plushsense.core.errors import ConfigError, DeviceError, need
 from plushsense.core.layouts import DEVICE_MS, Layout, StreamColumns
+from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Device, Frame, LossCounter, now_ms
 from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
 from plushsense.devices.virtual.server import ToyCounters, ToyServer
@@ -205,7 +206,13 @@ def search_streams(scan_s: float) -> DeviceListing:
             stream_url(s, unique_name=names[s.name()] == 1),
             "lsl",
             s.name(),
-            f"{s.type() or 'no type'}, {s.channel_count()} channels, {s.nominal_srate():g} Hz, on {s.hostname()}",
+            Sentence(
+                f"{s.type() or 'no type'}, {s.channel_count()} channels, {s.nominal_srate():g} Hz, on {s.hostname()}",
+                reason="lsl_about",
+                n=s.channel_count(),
+                hz=f"{s.nominal_srate():g}",
+                host=s.hostname(),
+            ),
         )
         for s in streams
     ]

@@ -181,7 +181,6 @@ def run_inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     `import_recordings`. A single backup is restored.
     """
     dest, sources = Path(spec["dest"]), [Path(source) for source in spec["sources"]]
-    shutil.rmtree(dest, ignore_errors=True)
     notes: list[str] = []
     rejected: list[dict[str, str]] = []
     refusals: list[PlushSenseError] = []

@@ -13,6 +13,7 @@ from plushsense.core.errors import ConfigError
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, write_recording
 from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.importing.proposals import readable_layouts
 from plushsense.dataset.index import open_dataset
 
 ACCEL = load_layout("accel-3")
@@ -88,3 +89,17 @@ def test_headers_that_fit_no_layout_or_several(tmp_path: Path, cli: Callable[...
         import_recordings(tmp_path / "R", tmp_path / "DS")
     ran = cli("import", tmp_path / "R", tmp_path / "DS", "--add", "--adopt")
     assert ran.status == 2
+
+
+def test_the_layout_is_guessed_by_what_the_files_hold(tmp_path: Path) -> None:
+    header = load_layout("plush-15").csv.header
+    clock = [[*list(range(13)), 1700000000000 + 10 * i, 5000 + 10 * i] for i in range(40)]
+    delays = [[*row[:-1], 9 + i % 3] for i, row in enumerate(clock)]
+    for name, rows, first in (("clock", clock, "plush-15"), ("delays", delays, "plush-14")):
+        lines = ["; ".join(header), *("; ".join(map(str, row)) for row in rows)]
+        for number, text in enumerate((lines, lines[1:])):
+            path = tmp_path / name / f"Tail pull_170000000000{number}_40.csv"
+            path.parent.mkdir(exist_ok=True)
+            path.write_text("\n".join(text) + "\n")
+            assert readable_layouts([path])[0].name == first
+    assert readable_layouts([tmp_path / "other.txt"]) == []

@@ -377,7 +377,7 @@ def common_layout(sessions: Sessions, given: Layout | None, of: str) -> Layout |
             raise DatasetError(
                 f"Session '{place.name}' was recorded with the layout {other}, but {of} is '{agreed.name}': "
                 "a data set has one layout, so import them apart.",
-                reason="layouts_differ",
+                reason="sessions_differ",
                 session=place.name,
                 layout=own.name,
                 other=agreed.name,

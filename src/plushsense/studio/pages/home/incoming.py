@@ -55,7 +55,7 @@ class Incoming:
         self.bundles: list[str] = []
         """Names of the networks that were added."""
         self._names: list[str] = []
-        self._count = self._bytes = 0
+        self._count = self._bytes = self._tries = 0
 
     @property
     def sources(self) -> list[Path]:
@@ -67,6 +67,12 @@ class Incoming:
     def name(self) -> str:
         """The name of the first archive, file or folder that was uploaded."""
         return self._names[0] if self._names else ""
+
+    def new_dataset(self) -> Path:
+        """Return the folder for a new try to make the data set; an earlier one may still be in use by its job."""
+        self._tries += 1
+        self.dataset = self.folder / f"dataset-{self._tries}"
+        return self.dataset
 
     async def store(self, file: FileUpload) -> None:
         """Store an uploaded file; a network is checked and added to the networks at once.
@@ -236,7 +242,7 @@ class IncomingSection:
             self._jobs.stop(self._job.id)
         spec = {
             "sources": [str(path) for path in self._incoming.sources],
-            "dest": str(self._incoming.dataset),
+            "dest": str(self._incoming.new_dataset()),
             "layout": self._layout,
             "person": self._person,
             "dry": True,

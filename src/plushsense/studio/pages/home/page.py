@@ -73,7 +73,7 @@ def invitation(page: Page) -> None:
             place.clear()
             with place:
                 address_of_device = invite()
-                text = ui.input(words("home.invite_address"), value=address_of_device).props("readonly")
+                text = ui.textarea(words("home.invite_address"), value=address_of_device).props("readonly autogrow")
                 tag(text.classes("w-full ps-mono"), "invitation")
                 with page.show_errors():
                     code = need("segno", "studio").make(address_of_device, error="m")

@@ -14,7 +14,7 @@ from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, St
 from plushsense.studio.app.shell import Page, address, button, html, moment, named, on_page, tag
 from plushsense.studio.app.workspace import BACKUPS, DATASETS, DISCARDED
 from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
-from plushsense.studio.widgets.elements import ask, change_files, item_menu, summary, title_of
+from plushsense.studio.widgets.elements import ask, change_files, errors_beside, item_menu, summary, title_of
 
 SMALL = 'outline padding="4px 12px"'
 """Quasar properties of the buttons inside rows of a list."""
@@ -179,9 +179,10 @@ class SessionSection:
                     box = ui.checkbox(self._describe(entry), value=str(entry.path) in self._chosen)
                     box.on_value_change(lambda e, entry=entry: self._choose(entry, bool(e.value)))
                     box.set_enabled(not entry.active)
-            with ui.row().classes("items-end ps-small-gap w-full"):
-                name = tag(ui.input(words("home.name")).classes("ps-wide"), "new-name")
-                button("make", words("home.make"), lambda: self._make(batch, str(name.value or "")), "unelevated")
+            with ui.row().classes("items-start ps-small-gap w-full"):
+                free = page.workspace.free_name(DATASETS, words("home.new_dataset"))
+                name = tag(ui.input(words("home.name"), value=free).classes("ps-wide"), "new-name")
+                button("make", words("home.make"), lambda: self._make(batch, name), "unelevated")
             first = batch[0]
             fitting = [d for d in datasets if (d.simulated, d.layout) == (first.simulated, first.layout)]
             if fitting:
@@ -208,9 +209,9 @@ class SessionSection:
     def _choose(self, entry: SessionEntry, chosen: bool) -> None:
         (self._chosen.add if chosen else self._chosen.discard)(str(entry.path))
 
-    def _make(self, batch: tuple[SessionEntry, ...], name: str) -> None:
-        with self._page.show_errors():
-            place = self._page.workspace.new(DATASETS, name)
+    def _make(self, batch: tuple[SessionEntry, ...], name: ui.input) -> None:
+        with errors_beside(self._page, name):
+            place = self._page.workspace.new(DATASETS, str(name.value or ""))
             self._start(batch, place, place.name)
 
     def _add(self, batch: tuple[SessionEntry, ...], dataset: str) -> None:

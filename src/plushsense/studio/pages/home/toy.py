@@ -5,6 +5,7 @@ from __future__ import annotations
 from nicegui import ui
 
 from plushsense.core.errors import PlushSenseError
+from plushsense.core.sentences import Sentence
 from plushsense.studio.app.shell import Page, button, on_change, on_page, tag
 from plushsense.studio.app.toys import PERSONS, Toys, ToyTrial, with_layout
 from plushsense.studio.pages.home.sections import SMALL, simulation_badge, titled_card
@@ -108,7 +109,9 @@ class ToySection:
         words, toys = self._words, self._toys
         self._others.clear()
         given = [(url, "", words("home.given")) for url in self._page.workspace.devices]
-        listed = [(d.url, d.name, d.description) for d in toys.listing.devices if d.kind != "virtual"]
+        found = [d for d in toys.listing.devices if d.kind != "virtual"]
+        # The description of a serial port is that of the system.
+        listed = [(d.url, d.name, words.sentence(a) if isinstance(a := d.description, Sentence) else a) for d in found]
         with self._others:
             for url, name, about in [*given, *listed]:
                 with ui.row().classes("ps-row items-center justify-between w-full no-wrap"):
