@@ -11,7 +11,9 @@ from plushsense.core.recorder_csv import parse_name
 from plushsense.dataset.importing.build import ImportSummary, group_flags
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.importing.truncation import CHOICES
+from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import BY_HAND, read_marks
+from plushsense.dataset.privacy.pseudonymise import pseudonymise
 from plushsense.dataset.quality.checking import check
 from support import paper_scripts as scripts
 
@@ -138,6 +140,18 @@ def test_choices_that_cannot_be_used(labelled: Path, tmp_path: Path) -> None:
     assert any("1 do not fit" in w for w in kinds(done))
 
 
+def test_pseudonyms_shift_the_time_in_such_a_name_and_keep_its_mark(labelled: Path, tmp_path: Path) -> None:
+    (odd,) = (labelled / scripts.LABELLED).rglob("* (1).csv")
+    scripts.choose(labelled, every=1)
+    imported(labelled, tmp_path / "DS")
+    pseudonymise(tmp_path / "DS", tmp_path / "OUT", key=tmp_path / "key.csv")
+    done = open_dataset(tmp_path / "OUT")
+    (found,) = (r for r in done.recordings if r.id.endswith(" (1)"))
+    assert Path(found.file).name != odd.name
+    assert (found.gesture, found.start) == ("Tail pull", 40)
+    assert "plushsense import" in (tmp_path / "OUT" / "marks.jsonl").read_text()
+
+
 def test_flags_of_one_kind_are_one_warning() -> None:
     flags = [
         ("a", "3 gaps over 50 ms, the longest 120 ms (after row 7)"),
@@ -164,3 +178,17 @@ def test_zeros_of_the_accelerometer_that_stand_for_low_values_are_found(tmp_path
     # They are neither faults of the sensor nor a centre of the sphere of gravity.
     assert not [f for f in checked.findings_of("flat", "stuck", "saturated") if set(f.channels) & {10, 11}]
     assert not [p for p in done.proposals if p["key"] == "offset"]
+
+
+def test_recordings_at_rest_that_the_script_leaves_do_not_make_gestures_people(tmp_path: Path) -> None:
+    """The script moves 17 gestures and no stream; "At rest" stays in its folder."""
+    root = tmp_path / "study"
+    scripts.record(root, at_rest=2)
+    rest = root / scripts.SESSIONS / "none"
+    rest.rename(tmp_path / "rest")
+    scripts.move_by_label(root)
+    (tmp_path / "rest").rename(rest)
+    done = imported(root, tmp_path / "DS")
+    assert (done.recordings, done.subjects, done.streams) == (RECORDINGS + 2, 0, 0)
+    assert {r.subject for r in done.dataset.recordings} == {"unknown", "none"}
+    assert {e["reason"] for e in done.rejected} == {"a session stream whose person is not known"}

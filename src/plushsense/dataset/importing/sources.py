@@ -213,15 +213,22 @@ def classify_gesture_recorder(
     """Classify the files in the folders of the GestureRecorder.
 
     ``subjects`` maps file names (or paths below ``source``) to people; without it the nearest folder is the person,
-    or nobody if all its recordings are of the toy at rest. ``person`` is as in `import_recordings`.
+    or nobody if all its recordings are of the toy at rest. A folder is a gesture, and its people are not known, if the
+    label of every recording in it is its name. ``person`` is as in `import_recordings`.
     """
-    # Folders are gestures, not people, if the label of every recording is the name of its folder.
-    named = [(path, name) for path in files if (name := parse_name(path.name)) is not None]
-    named = [(path, name) for path, name in named if path.parent != source] or named
-    by_label = subjects is None and bool(named)
-    by_label &= all(plain_label(n.label) == plain_label(p.parent.resolve().name) for p, n in named)
+    labels: dict[Path, set[str]] = {}
+    for path in files if subjects is None else ():
+        if (name := parse_name(path.name)) is not None:
+            labels.setdefault(path.parent, set()).add(plain_label(name.label))
     nobodys = _nobodys_folders(files, gestures)
+    gesture_folders = {place for place, mine in labels.items() if mine == {plain_label(place.resolve().name)}}
+    left_behind: set[Path] = set()
+    if gesture_folders - nobodys:
+        # Streams that the anonymising step has left behind belong to recordings that no longer name their person, and
+        # the folder of all gestures is no person either.
+        left_behind = {path.parent for path in files} - (set(labels) - nobodys) | {source}
     for path in files:
+        by_label = path.parent in gesture_folders or path.parent in left_behind
         if subjects is not None:
             # A mapping need not list recordings of the untouched toy.
             subject = _mapped(path, source, subjects) or (NOBODY if path.parent in nobodys else None)

@@ -20,6 +20,8 @@ from plushsense.dataset.store import RecordingInfo, read_csv_rows
 
 CHOICES = "truncate_choices.csv"
 _BACKUP = re.compile(r"training data - backup \d{4}-\d\d-\d\d_\d{6}", re.IGNORECASE)
+# The author of the choices is not in the file.
+_WHO = "plushsense import"
 _COLUMNS = ("filename", "fullpath", "length", "truncaten")
 
 
@@ -122,11 +124,11 @@ def truncation_marks(
             results["cut off everything, which the script skips too: left out"] += 1
         elif info.rows == choice.rows:
             why = f"{CHOICES}: the first {choice.cut} of {choice.rows} rows cut off"
-            marks.append(Mark(info.id, "trim", CHOICES, why, start=choice.cut, how=BY_HAND))
+            marks.append(Mark(info.id, "trim", _WHO, why, start=choice.cut, how=BY_HAND))
             results["trim their recordings by a mark"] += 1
         elif info.rows == choice.rows - choice.cut:
             why = f"{CHOICES}: the first {choice.cut} of {choice.rows} rows were cut off before the import"
-            marks.append(Mark(info.id, "trim", CHOICES, why, how=BY_HAND))
+            marks.append(Mark(info.id, "trim", _WHO, why, how=BY_HAND))
             results["were carried out before the import"] += 1
         else:
             results["do not fit, because the recording has another number of rows: left out"] += 1

@@ -103,7 +103,9 @@ PROSE = frozenset({"why", "text", "note", "notes", "comment", "comments", "said"
 _SECONDS = ("_s", "timestamp", "epoch")
 # Marks can be signed by programs, whose names identify nobody.
 _PROGRAMS = re.compile(r"plushsense.*|recorder", re.IGNORECASE | re.DOTALL)
-_FILE = re.compile(r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12}(?:\.\w+)?(?:#.*)?)$", re.DOTALL)
+_FILE = re.compile(
+    r"^(?P<label>.+)_(?P<epoch>\d{1,18})_(?P<rows>\d{1,12}(?: \(\d{1,4}\))?(?:\.\w+)?(?:#.*)?)$", re.DOTALL
+)
 
 
 @dataclass
