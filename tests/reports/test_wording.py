@@ -58,3 +58,11 @@ def test_recordings_at_rest_are_named_apart_only_where_they_are() -> None:
     assert "recordings at rest" not in wording.describe_spread(folds)
     answers = [dict(wording.describe_protocol(one))["At rest"] for one in (people, folds)]
     assert [answer.rpartition(" and ")[2] for answer in answers] == ["reported apart.", "counted like all others."]
+
+
+def test_what_more_people_would_add_stands_in_the_protocol_if_it_was_measured() -> None:
+    assert "More people" not in dict(wording.describe_protocol({"split": "by-subject:5", "learning": None}))
+    points = [{"people": m, "accuracy": 0.4} for m in (7, 13, 20)]
+    learning = {"points": points, "more": 2, "gain": 0.012, "ci95": [-0.004, 0.031]}
+    answer = dict(wording.describe_protocol({"split": "by-subject:5", "learning": learning}))["More people"]
+    assert "by +0.012 (95 % interval -0.004 to +0.031)" in answer and "over 7, 13, 20 people" in answer

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-import plushsense as ps
 from plushsense.dataset.store import Dataset
 from plushsense.trials import budget
 from plushsense.trials.budget import TrainingCost, choose_plan, curve_sizes, learning_curve, make_network, plan_s
@@ -86,4 +86,7 @@ def test_it_resumes_with_the_same_plan_and_trains_nothing_twice(
     assert stored["learning"] == done["learning"] and len(stored["learning"]["points"]) == 3
     # The last point of the curve is the score of the evaluation itself.
     assert stored["learning"]["points"][-1]["accuracy"] == pytest.approx(stored["accuracy"]["mean"])
-    ps.load(tmp_path / "n.plush")
+    # A further network of the same name does not replace it.
+    other = make_network(**made | {"config": replace(config, training=replace(config.training, seed=1))})
+    assert Path(other["bundle"]).name == "n 2.plush"
+    assert (tmp_path / "n.plush").read_bytes() == first

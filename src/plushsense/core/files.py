@@ -134,3 +134,12 @@ def new_folder(dest: Path, error: type[BadInput], last: str = "") -> Iterator[Pa
     finally:
         if scratch is not None:
             shutil.rmtree(scratch, ignore_errors=True)
+
+
+def free_path(path: Path, content: bytes) -> Path:
+    """Return ``path``, or a numbered path next to it if a file with other content exists there."""
+    number, free = 2, path
+    while free.exists() and not (free.is_file() and free.read_bytes() == content):
+        free = path.with_stem(f"{path.stem} {number}")
+        number += 1
+    return free

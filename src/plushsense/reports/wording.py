@@ -71,6 +71,15 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
         how = "reported apart" if averaged_over(evaluation) == "subjects" else "counted like all others"
         rest = f"Recordings of nobody (at rest) are spread over the folds by recording and {how}."
         answers.append(("At rest", rest))
+    learning = evaluation.get("learning")
+    if learning and learning.get("ci95"):
+        low, high = learning["ci95"]
+        people = ", ".join(str(point["people"]) for point in learning["points"])
+        more = (
+            f"Training with {learning['more']} more people would change the accuracy by {learning['gain']:+.3f} (95 % "
+            f"interval {low:+.3f} to {high:+.3f}), by a learning curve over {people} people to train on."
+        )
+        answers.append(("More people", more))
     if not evaluation.get("leaky"):
         answers.insert(2, ("Leak", _NO_LEAK))
     if audit := evaluation.get("leakage"):

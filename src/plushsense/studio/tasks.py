@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import ConfigError, DatasetError, PlushSenseError, ToolError
-from plushsense.core.files import write_file
+from plushsense.core.files import free_path, write_file
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.backup import backup, is_backup, restore
 from plushsense.dataset.importing.archives import UnpackLimits
@@ -347,7 +347,7 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         progress=epoch,
         warn=reporter.warn,
     )
-    bundle = done.save(_free_path(out, done.bundle.to_bytes()))
+    bundle = done.save(free_path(out, done.bundle.to_bytes()))
     return {
         "bundle": str(bundle),
         "scores": done.scores,
@@ -397,15 +397,6 @@ def _evaluation(table: dict[str, Any]) -> dict[str, Any]:
         "people": people,
         "nobody": table["nobody"],
     }
-
-
-def _free_path(path: Path, content: bytes) -> Path:
-    """Return ``path``, or a numbered path next to it if a file with other content exists there."""
-    number, free = 2, path
-    while free.exists() and not (free.is_file() and free.read_bytes() == content):
-        free = path.with_stem(f"{path.stem} {number}")
-        number += 1
-    return free
 
 
 def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from plushsense.core.errors import PlushSenseError
-from plushsense.core.files import write_file
+from plushsense.core.files import free_path, write_file
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
@@ -200,6 +200,8 @@ def make_network(
 ) -> dict[str, Any]:
     """Train a network, save it as the bundle ``out``, and evaluate it on people left out, in about ``budget_s``.
 
+    If there is another file ``out``, the bundle gets a number.
+
     By default it is trained for live use (context "anywhere") if the data set has sessions, and with the defaults of
     the preset "people" otherwise. With fewer than three people, recordings are left out instead.
 
@@ -230,7 +232,7 @@ def make_network(
         plan = BudgetPlan(**{**stored["plan"], "sizes": tuple(stored["plan"]["sizes"])})
     config = _planned(config, plan)
     whole = sum(_work(plan, networks))
-    bundle = out if stored is not None and _is_saved(stored["bundle"], out) else None
+    bundle = _saved_bundle(out.parent, stored["bundle"]) if stored is not None else None
     if bundle is None:
         bundle, training_s = _train(dataset, config, out, whole, networks, progress, warn)
         if cost is not None:
@@ -308,14 +310,13 @@ def _adjusted(plan: BudgetPlan, cost: TrainingCost, training_s: float, left_s: f
     return replace(other, epochs=plan.epochs, usual_epochs=plan.usual_epochs, workers=plan.workers)
 
 
-def _is_saved(name: str, out: Path) -> bool:
-    if not name or not out.is_file():
-        return False
+def _saved_bundle(folder: Path, name: str) -> Path | None:
+    """Return the path of the network that an interrupted run has saved; None if there is none."""
     try:
-        Bundle.load(out)
+        Bundle.load(folder / name)
     except PlushSenseError:
-        return False
-    return True
+        return None
+    return folder / name
 
 
 def _work(plan: BudgetPlan, networks: int) -> list[float]:
@@ -334,7 +335,7 @@ def _train(
             progress(BudgetProgress(DECIDING, done / whole, {}))
 
     done = train(dataset, config, journal=unfinished(dataset), progress=epoch_done, warn=warn)
-    return done.save(out), done.seconds
+    return done.save(free_path(out, done.bundle.to_bytes())), done.seconds
 
 
 def _folds(

@@ -112,7 +112,7 @@ class JobsSection:
         return [job for job in self._jobs.all(MAKE, *KINDS) if not job.spec.get("dry")]
 
     def refresh(self) -> bool:
-        """Update the section, and return whether a job finished since the last call."""
+        """Update the section, and return whether a job ended since the last call, which may have saved something."""
         jobs = self._all()
         running = {job.id for job in jobs if job.state == RUNNING}
         self._open |= running - self._closed
@@ -125,7 +125,7 @@ class JobsSection:
         else:
             for card in self._cards.values():
                 card.update()
-        done = {job.id for job in jobs if job.state == DONE}
+        done = {job.id for job in jobs if job.state in (DONE, STOPPED)}
         finished, self._done = bool(done - self._done), done
         return finished
 
