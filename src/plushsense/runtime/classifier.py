@@ -310,7 +310,7 @@ def check_layout(sent: Layout, read: Layout) -> None:
         raise ConfigError(
             f"The device sends layout '{sent.name}' ({', '.join(sent.names)}), but the model reads "
             f"'{read.name}' ({', '.join(read.names)}): {ask}.",
-            reason="layouts_differ",
+            reason="toy_layout_differs",
             sent=sent.name,
             read=read.name,
         )
@@ -318,7 +318,7 @@ def check_layout(sent: Layout, read: Layout) -> None:
     raise ConfigError(
         f"The device sends layout '{sent.name}', in which channel '{other}' has another unit, scale, step or "
         f"valid range than in the model's '{read.name}': {ask}.",
-        reason="layouts_differ",
+        reason="toy_layout_differs",
         sent=sent.name,
         read=read.name,
     )

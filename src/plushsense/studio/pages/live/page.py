@@ -25,7 +25,7 @@ from plushsense.studio.pages.live.state import LiveChoice
 from plushsense.studio.widgets.elements import style, summary
 
 _GRID = "display: grid; grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); gap: 12px; margin-top: 8px"
-_OF_NETWORK = ("no_network", "no_common_gesture", "layouts_differ")
+_OF_NETWORK = ("no_network", "no_common_gesture", "toy_layout_differs")
 """Reasons of errors that belong to the field of the network."""
 
 

@@ -274,7 +274,9 @@ class LiveReader:
             ended = cause
         except Exception as cause:  # noqa: BLE001, RUF100
             what = f"{type(cause).__name__}: {cause}"
-            ended = DeviceError(f"Reading the toy failed ({what}): start it again.", reason="reading_failed", what=what)
+            ended = DeviceError(
+                f"Reading the toy failed ({what}): start it again.", reason="live_reading_failed", what=what
+            )
         with contextlib.suppress(Exception):
             device.close()
         with self._lock:
