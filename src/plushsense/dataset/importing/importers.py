@@ -59,7 +59,7 @@ from plushsense.dataset.importing.sources import (
     split_regular_files,
 )
 from plushsense.dataset.importing.tables import STREAM_ROLE, check_roles, read_table
-from plushsense.dataset.importing.truncation import CHOICES, Choice, read_choices, split_backups, truncation_marks
+from plushsense.dataset.importing.truncation import CHOSEN, choices_of, original_of, split_backups, truncation_marks
 from plushsense.dataset.importing.xdf import person_and_session, read_xdf
 from plushsense.dataset.index import open_dataset, rebuild_index
 from plushsense.dataset.marks import MARKS, Mark, append_marks, read_marks
@@ -280,10 +280,10 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     simulated = is_simulation(around or source, all_files)
     files, refused = split_regular_files(f for f in all_files if f.name != SIMULATION_MARK)
     files, originals = split_backups(source, files)
-    choices, of_choices, unread = _choices(source, files)
+    choices, of_choices, unread = choices_of(source, files)
     files = [f for f in files if f not in of_choices]
-    refused += [SourceFile(f, LEFT_OUT, reason=_ORIGINAL.format(backup)) for f, backup in originals.items()]
-    refused += of_choices.values()
+    refused += [SourceFile(f, LEFT_OUT, reason=original_of(backup)) for f, backup in originals.items()]
+    refused += [SourceFile(f, "" if why else LEFT_OUT, reason=why or CHOSEN) for f, why in of_choices.items()]
     sessions = read_sessions(files)
     layout, notes = options.known_layout(common_layout(sessions, options.layout, options.layout_origin), files)
     gestures = options.known_gestures(layout)
@@ -321,36 +321,6 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
             search.notes.append(f"files that the mapping names do not exist ({len(missing)}): {listed}")
     search.simulated = simulated or any(not isinstance(h, str) and h.simulated for h in sessions.values())
     return search
-
-
-_ORIGINAL = (
-    "the uncut original, in '{}', of a recording that is imported: import that folder alone to have all its rows"
-)
-_CHOSEN = "no recording: its choices become marks of the recordings"
-
-
-def _choices(source: Path, files: Iterable[Path]) -> tuple[list[Choice], dict[Path, SourceFile], list[str]]:
-    """Read the choices of the truncation script in ``source``, or beside it, where the script writes them.
-
-    Returns:
-        The choices, the result for each such file in ``source``, and a note if the one beside it cannot be read.
-    """
-    inside = [f for f in files if f.name.casefold() == CHOICES]
-    beside = source.resolve().parent / CHOICES
-    choices: list[Choice] = []
-    results: dict[Path, SourceFile] = {}
-    notes: list[str] = []
-    for path in inside or ([beside] if beside.is_file() else []):
-        try:
-            choices += read_choices(path)
-            reason, kind = _CHOSEN, LEFT_OUT
-        except DatasetError as cause:
-            reason, kind = str(cause), ""
-        if path in inside:
-            results[path] = SourceFile(path, kind, reason=reason)
-        elif not kind:
-            notes.append(f"no trims are taken from the file beside the folder: {reason}")
-    return choices, results, notes
 
 
 def scan_zip(path: Path, options: ImportOptions) -> SourceScan:

@@ -15,6 +15,7 @@ from pathlib import Path, PureWindowsPath
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.recorder_csv import parse_name
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.marks import BY_HAND, Mark, MarkState
 from plushsense.dataset.store import RecordingInfo, read_csv_rows
 
@@ -22,6 +23,7 @@ CHOICES = "truncate_choices.csv"
 _BACKUP = re.compile(r"training data - backup \d{4}-\d\d-\d\d_\d{6}", re.IGNORECASE)
 # The author of the choices is not in the file.
 _WHO = "plushsense import"
+CHOSEN = Sentence("no recording: its choices become marks of the recordings", "choices_read")
 _COLUMNS = ("filename", "fullpath", "length", "truncaten")
 
 
@@ -139,3 +141,37 @@ def _notes(results: Mapping[str, int]) -> Iterator[str]:
     if results:
         parts = "; ".join(f"{count} {result}" for result, count in results.items())
         yield f"choices of {CHOICES}, how many rows to cut off at the beginning: {parts}"
+
+
+def original_of(backup: str) -> Sentence:
+    """Return why a recording in the folder ``backup`` is left out."""
+    return Sentence(
+        f"the uncut original, in '{backup}', of a recording that is imported: import that folder alone to have all its "
+        "rows",
+        "uncut_original",
+        folder=backup,
+    )
+
+
+def choices_of(source: Path, files: Iterable[Path]) -> tuple[list[Choice], dict[Path, Sentence | None], list[Sentence]]:
+    """Read the choices of the truncation script in ``source``, or beside it, where the script writes them.
+
+    Returns:
+        The choices; for each such file in ``source`` why it cannot be read, None if it can; a note if the one beside
+        ``source`` cannot be read.
+    """
+    inside = [f for f in files if f.name.casefold() == CHOICES]
+    beside = source.resolve().parent / CHOICES
+    choices: list[Choice] = []
+    read: dict[Path, Sentence | None] = dict.fromkeys(inside)
+    notes: list[Sentence] = []
+    for path in inside or ([beside] if beside.is_file() else []):
+        try:
+            choices += read_choices(path)
+        except DatasetError as cause:
+            if path in read:
+                read[path] = Sentence.of(cause)
+            else:
+                message = f"no trims are taken from the file beside the folder: {cause}"
+                notes.append(Sentence(message, "choices_unread", file=path.name))
+    return choices, read, notes
