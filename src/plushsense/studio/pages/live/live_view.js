@@ -56,6 +56,7 @@ const CSS = `
 .lv-list { max-height: 168px; overflow-y: auto; } .lv-list li { display: flex; gap: 2px 10px; flex-wrap: wrap; padding: 3px 0; border-bottom: 1px solid var(--ps-line); }
 .lv-list li > :nth-child(1) { min-width: 5.2em; font-variant-numeric: tabular-nums; color: var(--ps-dim); }
 .lv-dim { color: var(--ps-dim); } .lv-hidden { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); white-space: nowrap; }
+body.body--dark { --q-negative: #ffb59a !important; }
 @media (max-width: 900px) { .lv, .lv-now { grid-template-columns: minmax(0, 1fr); } .lv { gap: 12px; } }
 @media (max-width: 500px) { .lv > section { padding: 10px; } .lv-top { gap: 12px; } .lv-face { width: 116px; } }
 @media (prefers-reduced-motion: no-preference) {
