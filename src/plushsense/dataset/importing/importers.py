@@ -299,7 +299,7 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     )
     classified = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in classified]
     people, more = people_of(sessions)
-    notes += more + unread
+    notes += [*more, *unread]
     search = SourceScan(
         layout, gestures, shape if rest else "sessions", classified, people, notes=notes, choices=choices
     )
