@@ -505,8 +505,8 @@ def test_each_fold_is_deployed_with_ranges_of_its_own_training_windows(dataset: 
 
 def test_fine_tuning_is_told_from_training(capsys: pytest.CaptureFixture[str]) -> None:
     show = report_epochs()
-    show(1, 1, {"train_loss": 1.5, "validation_accuracy": 0.5})
-    show(1, 1, {"train_loss": 0.0002, "validation_accuracy": None, "what": "fine-tuning for 8 bits"})
+    show(1, 1, {"train_loss": 1.5, "accuracy": 0.5})
+    show(1, 1, {"train_loss": 0.0002, "accuracy": None, "what": "fine-tuning for 8 bits"})
     said = capsys.readouterr().err.splitlines()
     assert said == [
         "training: 1 of 1 epochs, 100%, 0 s, loss 1.500, validation accuracy 0.500",
