@@ -168,6 +168,9 @@ class _Controls:
             except PlushSenseError as refusal:
                 of_network = isinstance(refusal, BundleError) or refusal.reason in _OF_NETWORK
                 field = self._bundle if of_network else self._toy
+                if self._reader.now.running:
+                    # First, because a change of its value clears the error of a field.
+                    self._follow()
                 field.error = self._page.words.error(refusal)
                 self._fields.props("open")
                 field.run_method("focus")
@@ -191,8 +194,8 @@ class _Controls:
         now = self._reader.choice
         path = Path(self._bundle.value) if self._bundle.value else None
         chosen = (path, self._engine.value, self._reactions.value)
-        if chosen != (now.bundle, now.engine, now.reactions) and not await self._run(self._reader.choose, *chosen):
-            self._follow()
+        if chosen != (now.bundle, now.engine, now.reactions):
+            await self._run(self._reader.choose, *chosen)
 
     def _follow(self) -> None:
         """Display the current choice, which may have been made in another tab."""
