@@ -83,7 +83,7 @@ class _FeedbackPanel:
             self._wrong = button("wrong", words("live.wrong"), self._mark, "unelevated", icon="thumb_down")
             nothing = {"": words("live.wrong_nothing")}
             self._right = ui.select(nothing, value="", label=words("live.wrong_really"))
-            tag(self._right, "wrong-really").style("flex: 1 1 10rem; min-width: 0")
+            tag(self._right, "wrong-really").style("flex: 1 1 15rem; min-width: 0")
             self._person = people.add("wrong-person", self._update_marks).style("flex: 1 1 9rem")
         with ui.row().classes("w-full items-center ps-small-gap"):
             self._improve = button("improve", words("live.improve"), self._fit, icon="auto_fix_high")
