@@ -212,6 +212,7 @@ class LiveView(Element, component="live_view.js"):
         self._props.update(
             words=words.table("live"),
             gestures=words.table("gestures"),
+            names=words.table("channels"),
             affects={key: words.affect(key) for key in AFFECT_COLOURS},
             signs=dict(AFFECT_SIGNS),
             colours=dict(AFFECT_COLOURS),

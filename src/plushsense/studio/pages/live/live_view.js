@@ -56,7 +56,6 @@ const CSS = `
 .lv-list { max-height: 168px; overflow-y: auto; } .lv-list li { display: flex; gap: 2px 10px; flex-wrap: wrap; padding: 3px 0; border-bottom: 1px solid var(--ps-line); }
 .lv-list li > :nth-child(1) { min-width: 5.2em; font-variant-numeric: tabular-nums; color: var(--ps-dim); }
 .lv-dim { color: var(--ps-dim); } .lv-hidden { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); white-space: nowrap; }
-body.body--dark { --q-negative: #ffb59a !important; }
 @media (max-width: 900px) { .lv, .lv-now { grid-template-columns: minmax(0, 1fr); } .lv { gap: 12px; } }
 @media (max-width: 500px) { .lv > section { padding: 10px; } .lv-top { gap: 12px; } .lv-face { width: 116px; } }
 @media (prefers-reduced-motion: no-preference) {
@@ -67,7 +66,7 @@ body.body--dark { --q-negative: #ffb59a !important; }
 export default {
   // The slots are moved beside the current event, and below the time line.
   template: '<div><div ref="beside"><slot></slot></div><div ref="log"><slot name="log"></slot></div></div>',
-  props: { words: Object, gestures: Object, affects: Object, signs: Object, colours: Object, lines: Array, locale: String, sameClock: Boolean, start: Object },
+  props: { words: Object, gestures: Object, names: Object, affects: Object, signs: Object, colours: Object, lines: Array, locale: String, sameClock: Boolean, start: Object },
   mounted() {
     if (!document.getElementById("lv-css")) {
       const css = el("style", "", CSS);
@@ -359,7 +358,7 @@ export default {
         }
         c.textAlign = "left";
         c.fillStyle = k.ink;
-        c.fillText(channel.name, 0, mid - 3);
+        c.fillText(this.names[channel.name] || channel.name, 0, mid - 3);
         if (low > high) return;
         const value = (ys[ys.length - 1] * channel.step - channel.offset) * channel.scale;
         c.fillStyle = k.dim;

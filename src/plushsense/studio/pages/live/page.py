@@ -84,9 +84,9 @@ def _person_panel(page: Page, reader: LiveReader) -> None:
         buttons.clear()
         with buttons:
             for label in now:
-                button(f"do-{label}", words.gesture(label), lambda label=label: direct(label), "outline dense").classes(
-                    "ps-note"
-                )
+                button(
+                    f"do-{label}", words.gesture(label), lambda label=label: direct(label), 'outline padding="3px 8px"'
+                ).classes("ps-note")
             button("do-nothing", words("live.person_stop"), lambda: direct(""), "outline dense", icon="stop").classes(
                 "ps-note"
             )

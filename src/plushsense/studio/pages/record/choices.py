@@ -70,7 +70,8 @@ class ToyChoice:
         options = {u: toy_name(words, u) for u in dict.fromkeys(self._urls)}
         options |= {d.url: f"{d.name} · {d.url}" for d in listing.devices if d.url not in options}
         self._list.set_options(options, value=self._list.value)
-        self._page.say(" ".join([words("record.found", n=len(options)), *listing.notes]))
+        notes = [words.sentence(note) for note in listing.notes]
+        self._page.say(" ".join([words("record.found", n=len(options)), *notes]))
 
 
 _GESTURES = "plush-18"
