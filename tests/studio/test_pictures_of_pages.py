@@ -1,4 +1,4 @@
-"""Every page in both lights, at a desk and on a tablet, in both languages: whole, legible, and nothing foreign.
+"""Every page in both lights, on four sizes of screens, in both languages: whole, legible, and nothing foreign.
 
 With ``PLUSHSENSE_SHOTS=docs/pictures/studio`` the pictures are kept, small, for the README. A page's scene is one
 function in `SCENES`: it gets the open page, has something happen on it, and returns when that is to be seen.
@@ -19,7 +19,7 @@ import pytest
 import plushsense as ps
 from plushsense.studio.app.shell import PAGES
 from plushsense.studio.app.workspace import Workspace
-from support.browsing import DESK, TABLET, Look, Studio, axe, connected, marked
+from support.browsing import DESK, PHONE, TABLET, Look, Studio, axe, connected, english, marked
 from support.recorded import record
 from support.recording_pages import begun, sat, showing
 from support.requirements import missing
@@ -42,9 +42,9 @@ class View:
 
 VIEWS = (
     View("desk-light-en", DESK, False, "en"),
-    View("desk-dark-lv", DESK, True, "lv"),
+    View("wide-dark-en", (1920, 1080), True, "en"),
     View("tablet-light-lv", TABLET, False, "lv"),
-    View("tablet-dark-en", TABLET, True, "en"),
+    View("phone-dark-lv", PHONE, True, "lv"),
 )
 
 
@@ -204,13 +204,14 @@ def test_every_page_has_a_scene() -> None:
 # A recording and a live view go on after their pictures and would slow down the other pages.
 @pytest.mark.parametrize("name", sorted(SCENES, key=lambda name: name in ("record", "live")))
 def test_a_page_reads_well(name: str, view: View, furnished: Studio, look: Fixture) -> None:
-    browser: Look = look(view.size, view.dark, view.language, touch=view.size == TABLET)
+    browser: Look = look(view.size, view.dark, view.language, touch=view.size in (TABLET, PHONE))
     page = browser.open(_address(name, view, furnished))
     SCENES[name](page, furnished)
     page.evaluate("document.fonts.ready")
     assert axe(page) == []
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), "the page is wider than the screen"
     assert page.evaluate(_CUT) == []
+    assert view.language == "en" or english(page) == []
     assert page.evaluate("document.body.classList.contains('body--dark')") is view.dark
     assert page.evaluate("document.documentElement.lang")[:2] == view.language
     page.evaluate("scrollTo(0, 0)")
@@ -223,7 +224,7 @@ def test_a_page_reads_well(name: str, view: View, furnished: Studio, look: Fixtu
         marked(page, "start").wait_for()
     assert browser.complaints == []
     if KEPT:
-        kept = small(png, 960 if view.size == DESK else 615)
+        kept = small(png, 960 if view.size[0] > view.size[1] else 615 if view.size == TABLET else 390)
         assert len(kept) <= MOST_BYTES, f"{name}-{view.name}.png has {len(kept)} bytes"
         Path(KEPT).mkdir(parents=True, exist_ok=True)
         (Path(KEPT) / f"{name}-{view.name}.png").write_bytes(kept)
