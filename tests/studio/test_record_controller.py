@@ -268,7 +268,7 @@ def test_a_toy_is_tried_first_and_exchanged(controller: RecordController, tmp_pa
         for url, reason in (
             (f"virtual://?person=7&seed=2&lost=0&garbled=0&glitch=0&speed={SPEED + 1:g}", "other_speed"),
             (f"{CALM}&seed=2", "same_toy"),
-            ("virtual://?persons=7", "url_bad"),
+            ("virtual://?persons=7", "toy_setting"),
         ):
             with pytest.raises(PlushSenseError) as refused:
                 controller.exchange("S01/1", url)

@@ -140,7 +140,7 @@ def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, tmp
     marked(page, "change-toy").click()
     marked(page, "exchange-other_toy").fill("tcp://127.0.0.1:9")
     marked(page, "exchange-go").click()
-    said(page, "tcp://127.0.0.1:9 cannot be reached")
+    said(page, "The device 127.0.0.1 does not answer on port 9")
     marked(page, "exchange-other_toy").fill(CALM)
     marked(page, "exchange-go").click()
     said(page, "was begun with a real toy")

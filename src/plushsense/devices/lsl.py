@@ -102,7 +102,7 @@ class LslDevice(Device):
         if found:
             sources = ", ".join(f"'{s.source_id()}' on {s.hostname()}" for s in found.values())
             message = f"'{self.url}' fits {len(found)} streams, of {sources}: name one by lsl://source:ID."
-            raise DeviceError(message, reason="url_bad", url=self.url)
+            raise DeviceError(message, reason="toy_several_streams", url=self.url)
         there = ", ".join(f"{s.name()} ({s.type() or 'no type'})" for s in self._pylsl.resolve_streams(0.5))
         raise DeviceError(
             f"'{self.url}': no LSL stream has the {key} '{value}' within {find_s:g} s; "

@@ -24,7 +24,7 @@ from plushsense.studio.widgets.elements import ask, change_files, item_menu, sum
 _LISTED = 8
 _CODE_ERRORS = ("no_person", "code_bad", "session_unfinished", "session_in_use")
 _PROTOCOL_ERRORS = ("protocol_bad", "protocol_unknown")
-_TOY_ERRORS = ("url_bad", "no_toy", "toy_is_file", "session_of_real_toy")
+_TOY_ERRORS = ("no_toy", "session_of_real_toy", "layout_bad")
 
 
 async def show(page: Page) -> None:
@@ -195,7 +195,9 @@ class _SessionLists:
 
 
 def _is_of_toy(error: PlushSenseError) -> bool:
-    return isinstance(error, DeviceError | LayoutError) or error.reason in _TOY_ERRORS
+    return (
+        isinstance(error, DeviceError | LayoutError) or error.reason.startswith("toy_") or error.reason in _TOY_ERRORS
+    )
 
 
 async def _open_session(
