@@ -146,7 +146,7 @@ def test_each_refusal_is_a_sentence(studio: Fixture, look: Fixture, shots: Fixtu
     (home / "exports").write_text("")
     marked(page, "name").fill("nowhere")
     marked(page, "do").click()
-    page.get_by_text("The computer refused").first.wait_for(timeout=300_000)
+    page.get_by_text("“nowhere” cannot be created").first.wait_for(timeout=300_000)
     page.goto(f"{url}/export?name=nothing")
     connected(page)
     marked(page, "detail").get_by_text("There is no export").wait_for()

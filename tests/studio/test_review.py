@@ -431,6 +431,7 @@ def test_durations_with_an_adjustable_band(waves: Path, studio: Fixture, look: F
     marked(page, "chosen").get_by_text("Selected: 1").wait_for()
     marked(page, "view").get_by_role("button", name="Durations").click()
     over = page.locator("[data-test=durations-plot] .u-over")
+    over.wait_for()
     box = over.bounding_box()
     assert box is not None
     # The longest was recorded last.
