@@ -29,6 +29,8 @@ W = Words("lv")
 SPEED = 20
 NAME = "Viss pa reizei"
 KILLED, CLOSED = 5, 9
+PATIENT = bool(os.environ.get("PLUSHSENSE_SHOTS"))
+"""Whether she waits for the test on people left out, which takes the minute that she gives it."""
 
 
 class Therapist:
@@ -150,8 +152,14 @@ def test_a_therapist_can_do_it_alone(studio: Fixture, look: Fixture, shots: Fixt
         connected(t.page)
         t.fill(W("train.minutes"), "1")
         t.press(W("train.make"))
-        marked(t.page, "verdict").first.wait_for(timeout=240_000)
-        assert marked(t.page, "verdict").first.inner_text()
+        if PATIENT:
+            marked(t.page, "verdict").first.wait_for(timeout=300_000)
+            assert marked(t.page, "verdict").first.inner_text()
+        else:
+            # She saves time: the network is kept before it is tested on people left out.
+            marked(t.page, "at").get_by_text(W("train.stages.evaluating")).wait_for(timeout=240_000)
+            t.press(W("train.stop"))
+            marked(t.page, "saved").wait_for()
 
     with t.step("live"):
         t.press(W("pages.live"))

@@ -228,13 +228,13 @@ _ENGLISH = re.compile(r"\b(the|of|and|with|this|are|has|have|was|were|from|your|
 
 
 def english(page: Page) -> list[str]:
-    """Return the lines of a page, and its labels for screen readers, that read as English."""
+    """Return the lines of a page, and its labels for screen readers, that read as English; paths do not count."""
     texts: list[str] = page.evaluate(
         "() => [...document.body.innerText.split('\\n'), "
         "...[...document.querySelectorAll('[aria-label], [placeholder], [title]')]"
         ".flatMap(e => ['aria-label', 'placeholder', 'title'].map(k => e.getAttribute(k) || ''))]"
     )
-    return sorted({text for text in texts if _ENGLISH.search(text)})
+    return sorted({text for text in texts if _ENGLISH.search(re.sub(r"\S*/\S*", "", text))})
 
 
 def marked(page: Page, name: str) -> Any:

@@ -88,7 +88,8 @@ PAGES = {
 
 To add a page, add a line here and a folder ``pages/<name>`` with a module ``page``, whose function ``show(page)`` adds
 the content below the title. Put its texts in ``pages/<name>/<language>.toml`` for each of `LANGUAGES`, or in
-``app/words``. The texts ``pages.<name>`` (for the navigation bar) and ``<name>.title`` are required.
+``app/words``. The texts ``pages.<name>`` (for the navigation bar) and ``<name>.title`` are required, ``help.<name>`` and
+``tour.<name>`` are not.
 """
 
 TOUR = "tour"
@@ -191,12 +192,13 @@ def frame(workspace: Workspace, name: str) -> Iterator[Page]:
         # On a phone, the link may be outside the visible part of the bar.
         ui.run_javascript("document.querySelector('.ps-bar [aria-current]')?.scrollIntoView({inline: 'center'})")
         ui.space()
-        _help(words, name)
+        if words.get(f"help.{name}"):
+            _help(words, name)
         _choices(words, dark)
     with ui.element("div").classes("ps-main column no-wrap items-start").props('id="content" tabindex="-1"'):
         if name != "record":
             _recording_bar(page)
-        if TOUR in query():
+        if TOUR in query() and words.get(f"tour.{name}"):
             _tour(words, name)
         tag(html(words(f"{name}.title"), "h1"), "title")
         page._messages = ui.column().classes("w-full ps-messages")
@@ -239,7 +241,7 @@ def _help(words: Words, name: str) -> None:
 
 def _tour(words: Words, name: str) -> None:
     """Add the sentences of the tour about the page ``name``, with buttons to the next and the former page."""
-    pages = list(PAGES)
+    pages = [page for page in PAGES if words.get(f"tour.{page}")]
     at = pages.index(name)
 
     def go(key: str, look: str, label: str, place: str) -> None:
