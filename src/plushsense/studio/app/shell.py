@@ -88,8 +88,8 @@ PAGES = {
 
 To add a page, add a line here and a folder ``pages/<name>`` with a module ``page``, whose function ``show(page)`` adds
 the content below the title. Put its texts in ``pages/<name>/<language>.toml`` for each of `LANGUAGES`, or in
-``app/words``. The texts ``pages.<name>`` (for the navigation bar) and ``<name>.title`` are required; ``help.<name>`` and
-``tour.<name>`` are optional.
+``app/words``. The texts ``pages.<name>`` (for the navigation bar) and ``<name>.title`` are required; ``help.<name>``
+and ``tour.<name>`` are optional.
 """
 
 TOUR = "tour"
