@@ -44,6 +44,7 @@ _START_S = 60.0
 _WAIT_MS = 60_000
 _SETTLE_MS = 200
 _POLL_MS = 25
+_LOOKS = 4
 DESK, TABLET, PHONE = (1280, 800), (820, 1180), (390, 844)
 
 
@@ -210,17 +211,26 @@ def is_own(url: str) -> bool:
 
 
 def axe(page: Page) -> list[str]:
-    """Serious and critical findings of axe-core, a line each."""
+    """Serious and critical findings of axe-core, a line each, that are still there after a moment.
+
+    A field that is just being enabled, or a label that is moving, may be found in between.
+    """
     # Evaluated, not added as a script: the page's own policy stands. Once a page, as that takes as long as looking.
     if not page.evaluate("() => 'axe' in window"):
         page.evaluate(AXE.read_text(encoding="utf-8"))
-    found: dict[str, Any] = page.evaluate("() => axe.run(document, {resultTypes: ['violations']})")
-    return [
-        f"{v['id']} ({v['impact']}): {v['help']}: {node['html'][:160]}"
-        for v in found["violations"]
-        if v["impact"] in ("serious", "critical")
-        for node in v["nodes"]
-    ]
+    findings: list[str] = []
+    for _ in range(_LOOKS):
+        found: dict[str, Any] = page.evaluate("() => axe.run(document, {resultTypes: ['violations']})")
+        findings = [
+            f"{v['id']} ({v['impact']}): {v['help']}: {node['html'][:160]}"
+            for v in found["violations"]
+            if v["impact"] in ("serious", "critical")
+            for node in v["nodes"]
+        ]
+        if not findings:
+            break
+        page.wait_for_timeout(_SETTLE_MS * 2)
+    return findings
 
 
 # Words that no Latvian sentence has.
