@@ -52,7 +52,7 @@ _USED = 0.85
 
 @dataclass(frozen=True)
 class TrainingCost:
-    """What trainings cost on this computer.
+    """Measured cost of trainings on this computer.
 
     Attributes:
         window_epoch_s: seconds to train on one window for one epoch.
@@ -78,7 +78,7 @@ class TrainingCost:
 
 @dataclass(frozen=True)
 class BudgetPlan:
-    """What is done: ``epochs`` of ``usual_epochs``, the ``split`` into ``folds``, and the sizes of the learning curve.
+    """Plan of a run: ``epochs`` of ``usual_epochs``, the ``split`` into ``folds``, and the sizes of the learning curve.
 
     ``sizes`` are numbers of people to train on, without that of the evaluation itself; none if nothing is measured.
     ``workers`` is as in `EvaluationSpec`.

@@ -100,7 +100,7 @@ class Performed:
 
 @dataclass(frozen=True)
 class Situation:
-    """What is going on now, computed once for everything that is displayed, announced and drawn.
+    """Present state of toy and touch, computed once for everything that is displayed, announced and drawn.
 
     Attributes:
         kind: the situation. In "unsure" and "unknown" somebody touches the toy but no event has begun.
