@@ -141,7 +141,7 @@ def _without_clients() -> Iterator[None]:
 
 
 def _limit_heaps() -> None:
-    """Let all threads share two heaps where the C library is glibc, whose heap for each thread costs 20 MB in all."""
+    """Let all threads share two heaps where the C library is glibc, whose heap for each thread cost 16 MB in all."""
     with contextlib.suppress(OSError, AttributeError, TypeError):
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(_M_ARENA_MAX, 2)
