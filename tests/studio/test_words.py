@@ -78,6 +78,8 @@ def test_a_note_is_worded_in_the_language_of_the_page_also_after_json() -> None:
         assert Words("en").sentence(form) == "a.txt: no recording"
         assert Words("lv").sentence(form) == "a.txt: nav ieraksts"
     assert Words("lv").sentence("something") == "(Angliski:) something"
+    older = {"message": "a.txt is left out", "reason": "about_file", "values": {}}
+    assert Words("lv").sentence(older) == "(Angliski:) a.txt is left out"
     assert (Words("en").count(12345), Words("lv").count(12345)) == ("12,345", "12\u00a0345")
     assert (Words("en").significant(0.1234, 2), Words("lv").significant(0.1234, 2)) == ("0.12", "0,12")
 

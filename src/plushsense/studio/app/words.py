@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import cache
 from importlib import import_module, resources
 from pathlib import Path
@@ -69,9 +70,12 @@ class Words:
         elif isinstance(sentence, str):
             sentence = {"message": sentence}
         text = self._texts.get(f"sentences.{sentence.get('reason')}")
-        if not text:
-            return self._texts["sentences.note"].format(message=sentence["message"]) if sentence["message"] else ""
-        return text.format(**{key: self._value(key, value) for key, value in sentence["values"].items()})
+        if text:
+            values = {key: self._value(key, value) for key, value in sentence.get("values", {}).items()}
+            # A stored job of another version may lack a value.
+            with suppress(KeyError):
+                return text.format(**values)
+        return self._texts["sentences.note"].format(message=sentence["message"]) if sentence["message"] else ""
 
     def _value(self, key: str, value: object) -> str:
         if isinstance(value, list | tuple):
