@@ -21,7 +21,8 @@ from plushsense.core.recorder_csv import STREAM_NAME
 from plushsense.studio.app import guard
 from plushsense.studio.app.guard import ConnectionLimits, Guard, Visitors, limited_protocol, peer_of
 from support.browsing import connected
-from support.recording_pages import CALM, begun, files, showing, take, until
+from support.recording_pages import CALM, begun, files, showing, take
+from support.waiting import until
 
 Fixture = Callable[..., Any]
 HALF = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Half: "

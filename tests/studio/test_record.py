@@ -12,7 +12,8 @@ import pytest
 from plushsense.recording.session import is_finished
 from plushsense.recording.session_files import SessionHead
 from support.browsing import DESK, PHONE, TABLET, axe, connected, marked
-from support.recording_pages import CALM, begun, choose, events, files, heard, sat, showing, take, until, whats
+from support.recording_pages import CALM, begun, choose, events, files, heard, sat, showing, take, whats
+from support.waiting import until
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page, WebSocketRoute

@@ -22,7 +22,8 @@ from plushsense.studio.app import toys
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.record.controller import MARKERS, NO_CONSENT, PSEUDO, ActiveSession, RecordController
 from plushsense.studio.pages.record.result import measure_result
-from support.recording_pages import CALM, tcp_toy, until
+from support.recording_pages import CALM, tcp_toy
+from support.waiting import until
 
 SPEED = 30.0
 QUICK = SessionRequest(CALM, "S01", "quick", speed=SPEED)

@@ -16,6 +16,7 @@ from plushsense.recording.session_files import SESSION_LOG, SessionHead, read_ev
 from support.browsing import connected, marked
 from support.pty_toys import check_whole, pty_toy, recordings
 from support.recording_pages import showing
+from support.waiting import until
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -31,6 +32,11 @@ def begin(page: Page, number: int) -> None:
     showing(page, f"idle.{number}.")
     page.keyboard.press("Space")
     showing(page, f"recording.{number}.")
+
+
+def recording_begun(folder: Path) -> bool:
+    """Whether the last line of the log says that a recording began."""
+    return [e.kind for e in read_events(folder)][-1] == "start"
 
 
 def test_51_recordings_by_the_space_bar(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:
@@ -54,6 +60,8 @@ def test_51_recordings_by_the_space_bar(studio: Fixture, look: Fixture, shots: F
                 if showing(page, "recording.", "idle.").startswith("idle."):
                     continue
             elif number == KILLED:
+                # The page shows the recording before the background thread has written its start to the log.
+                until(lambda: recording_begun(folder))
                 server.kill()
                 server.start()
                 # The page comes back by itself and offers to go on.

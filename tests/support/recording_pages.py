@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -110,11 +109,3 @@ def files(home: Path, name: str = "S01/1") -> list[dict[str, Any]]:
     folder = home / "recordings" / name
     beside = [json.loads(p.with_suffix(".json").read_text("utf-8")) for p in folder.glob("*_*_*.csv")]
     return sorted(beside, key=lambda b: int(b["stream_row"]))
-
-
-def until(true: Callable[[], bool], limit_s: float = 20.0) -> None:
-    """Wait for something outside the page."""
-    end = time.monotonic() + limit_s
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.02)
