@@ -28,9 +28,9 @@ from support.recording_pages import (
     showing,
     take,
     tcp_toy,
-    until,
     whats,
 )
+from support.waiting import until
 
 Fixture = Callable[..., Any]
 
