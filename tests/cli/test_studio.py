@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
 import json
 import os
@@ -149,3 +150,20 @@ def test_over_ipv6_and_under_another_name(tmp_path: Path) -> None:
         with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=20) as answer:
             assert answer.status == 200
     assert one.end()[0] == 130
+
+
+def test_the_memory_of_pages_that_were_left_is_freed_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    collected: list[int] = []
+    monkeypatch.setattr(serve, "_COLLECT_S", 0.0)
+    monkeypatch.setattr(serve.gc, "collect", lambda: collected.append(1))
+
+    async def leave(pages: int) -> None:
+        release = serve._release_memory()
+        for left in range(2):
+            for _ in range(pages):
+                release()
+            while len(collected) <= left:
+                await asyncio.sleep(0)
+
+    asyncio.run(leave(3))
+    assert collected == [1, 1]
