@@ -1,0 +1,82 @@
+"""The page on the paper: every row has a verdict and a command, and every command runs, on small data."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import runpy
+import shlex
+from pathlib import Path
+
+import pytest
+
+from plushsense.cli.main import main
+from plushsense.studio.app import serve
+from support.archive import make_archive
+
+PAGE = Path(__file__).parents[2] / "docs" / "paper.md"
+VERDICTS = ("better", "equal", "not possible here", "weaker")
+
+# What makes a command small: three people instead of 25, and one epoch.
+SMALL = {
+    "simulate": {"--people": "3", "--repetitions": "1"},
+    "train": {"--epochs": "1"},
+    "evaluate": {"--epochs": "1"},
+    "baselines": {"--epochs": "1"},
+    "stream-eval": {"--epochs": "1"},
+    "sweep": {
+        "--architectures": "14d1_39d2_41d4,19d1_19d2_19d4_17d8",
+        "--filters": "4/6/8/8",
+        "--epochs": "1",
+        "--batches": "64",
+    },
+}
+# A check has findings, which is no error; a network of one epoch is too bad to be adapted, which is refused.
+STATUS = {"check": (0, 1), "adapt": (0, 1)}
+
+
+def commands() -> list[str]:
+    """The commands of the page, in order, each once."""
+    text = PAGE.read_text("utf-8")
+    blocks = [line for block in re.findall(r"```sh\n(.*?)```", text, re.S) for line in block.splitlines()]
+    return list(dict.fromkeys([*blocks, *(cells[-1].strip("`") for cells in rows())]))
+
+
+def rows() -> list[list[str]]:
+    """The rows of the tables of verdicts."""
+    tables = PAGE.read_text("utf-8").split("## The verdicts", 1)[1]
+    lines = [line.strip("| ") for line in tables.splitlines() if line.startswith("|")]
+    return [row for row in ([cell.strip() for cell in line.split(" | ")] for line in lines) if row[-1].startswith("`")]
+
+
+def test_every_row_has_a_verdict_and_a_command() -> None:
+    assert len(rows()) >= 50
+    for row in rows():
+        assert row[1] in VERDICTS, row
+        assert row[-1].startswith(("`plushsense ", "`python examples/paper.py ")), row
+
+
+def run(command: str) -> tuple[int, str]:
+    """Run a command of the page in this process; its exit status, and what it printed."""
+    program, *words = shlex.split(command)
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        if program == "python":
+            examples = runpy.run_path(str(PAGE.parents[1] / words[0]), run_name="paper")
+            return examples["main"](words[1:]), said.getvalue()
+        small = SMALL.get(words[0], {})
+        status = main([*words, *(part for option in small.items() if option[0] not in words for part in option)])
+    return status, said.getvalue()
+
+
+@pytest.mark.usefixtures("publish_tools", "c_compiler")
+def test_every_command_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    make_archive(tmp_path / "made").rename(tmp_path / "ARCHIVE")
+    served: list[object] = []
+    monkeypatch.setattr(serve, "run", lambda *given, **options: served.append(given))
+    for command in commands():
+        status, said = run(command)
+        assert status in STATUS.get(shlex.split(command)[1], (0,)), f"{command}: exit status {status}\n{said}"
+    assert served
