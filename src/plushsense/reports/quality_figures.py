@@ -130,20 +130,21 @@ def durations(bands: Sequence[DurationBand]) -> Figure:
     axes = figure.add_subplot()
     end = 1.05 * max(min(max(band.high_s, band.statistics.max), 4 * band.mean_s) for band in bands)
     for y, band in enumerate(bands):
-        first = {"label": None} if y else {}
-        axes.barh(y, band.high_s - band.low_s, 0.8, band.low_s, color=BAND, **{"label": "band around the mean"} | first)
+        # matplotlib leaves names that begin with "_" out of the legend.
+        hidden = "_" if y else ""
+        axes.barh(y, band.high_s - band.low_s, 0.8, band.low_s, color=BAND, label=f"{hidden}band around the mean")
         outliers = set(band.outliers)
         for name, colour, marker, odd in (("in the band", GREY, "o", False), ("outside", MARK, "D", True)):
             there = [s for i, s in band.seconds.items() if (i in outliers) is odd]
             # Fixed vertical offsets separate the dots and always give the same picture.
             at = y + 0.22 * (2 * ((np.arange(len(there)) * 0.618) % 1.0) - 1)
-            label = {"label": f"recording {name}"} | first
-            axes.plot(np.minimum(there, 0.99 * end), at, marker, color=colour, markersize=3.2, **label)
+            label = f"{hidden}recording {name}"
+            axes.plot(np.minimum(there, 0.99 * end), at, marker, color=colour, markersize=3.2, label=label)
         sd = (band.statistics.variance or 0.0) ** 0.5
-        spread = {"label": "mean ± standard deviation"} | first
-        axes.errorbar(band.mean_s, y, xerr=sd, fmt="|", color=COLOURS[1], markersize=16, capsize=3, **spread)
-        median = {"label": "median"} | first
-        axes.plot(band.statistics.median, y, "x", color="#000000", markersize=6, zorder=4, **median)
+        spread = f"{hidden}mean ± standard deviation"
+        axes.errorbar(band.mean_s, y, xerr=sd, fmt="|", color=COLOURS[1], markersize=16, capsize=3, label=spread)
+        median = band.statistics.median
+        axes.plot(median, y, "x", color="#000000", markersize=6, zorder=4, label=f"{hidden}median")
     axes.set_yticks(range(len(bands)), [f"{b.gesture} ({len(b.seconds)})" for b in bands], parse_math=False)
     axes.set_ylim(len(bands) - 0.4, -0.6)
     axes.set_xlim(0, end)
@@ -186,8 +187,8 @@ def windows(dataset: Dataset, info: RecordingInfo, spec: WindowSpec) -> tuple[Fi
     top.plot(seconds[:own], y[:own], color=COLOURS[1], linewidth=1.2, label="recording")
     if looped:
         top.plot(seconds[own - 1 :], y[own - 1 :], "--", color=MARK, linewidth=1.0, label="repeated from its start")
-        for begin in range(own, len(y), own):
-            top.axvline(begin / layout.rate_hz, color=GREY, linestyle=":", linewidth=1.2)
+        for again in range(own, len(y), own):
+            top.axvline(again / layout.rate_hz, color=GREY, linestyle=":", linewidth=1.2)
     top.set_ylabel(f"{name}\n({unit})", fontsize=9)
     for number, cut in enumerate(cuts, 1):
         begin = cut.begin / layout.rate_hz

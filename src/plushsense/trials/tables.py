@@ -239,7 +239,7 @@ def _network(planned: PlannedTrial) -> Network:
 
 
 def prediction_files(summary: Mapping[str, Any]) -> dict[str, str]:
-    """Return the names of the files of predictions by trial; folders of earlier versions have that of the best trial."""
+    """Return the names of the files of predictions by trial; in folders of earlier versions only the best has one."""
     files = summary.get("predictions")
     if isinstance(files, Mapping):
         return {str(trial): str(name) for trial, name in files.items()}

@@ -94,8 +94,8 @@ def test_the_folder_holds_what_it_promises(dataset: Dataset, tmp_path: Path) -> 
     assert summary["best"][0]["accuracy"] == trials["accuracy"].max()
     assert not summary["leaky"] and not summary["simulated"]
     tested = sum(len(fold) for fold in _tested(dataset))
-    for confusion in summary["confusions"].values():
-        assert sum(map(sum, confusion)) == 2 * tested, "two seeds, each window once a seed"
+    for counts in summary["confusions"].values():
+        assert sum(map(sum, counts)) == 2 * tested, "two seeds, each window once a seed"
     for rows in summary["per_class"].values():
         assert [row["label"] for row in rows] == summary["labels"]
     assert (seen[-1].done, seen[-1].total) == (16, 16) and seen[-1].share == pytest.approx(1.0)

@@ -94,7 +94,8 @@ def score_label(sweep: SweepResults, measure: str) -> str:
 def by_architecture(sweep: SweepResults) -> Figure:
     """Draw the paper's Figure 7: highest and mean accuracy of each architecture, and its size with the most filters."""
     rows = _bars(architectures(sweep))
-    figure = _figure(sweep, 9.2, 1.9 + 0.42 * len(rows), f"{LIKE.format(7)}: accuracy of each architecture, and its size")
+    title = f"{LIKE.format(7)}: accuracy of each architecture, and its size"
+    figure = _figure(sweep, 9.2, 1.9 + 0.42 * len(rows), title)
     axes = figure.add_subplot()
     _accuracy_bars(axes, rows, "epochs, batch and filters")
     axes.set_xlabel(score_label(sweep, "Accuracy (% of test windows)"), fontsize=9)
