@@ -386,7 +386,15 @@ def _template_values(sweep: SweepResults, section: Section, pictures: Mapping[st
         "scores": section.scores and bool(section.tables or section.drawings),
         "dropped": section.dropped,
         "tables": [replace(table, leaky=sweep.leaky, simulated=sweep.simulated) for table in section.tables],
-        "drawings": [{"src": svg_uri(pictures[d.name]), "alt": d.alt, "name": d.name} for d in section.drawings],
+        "drawings": [
+            {
+                "src": svg_uri(pictures[d.name]),
+                "alt": d.alt,
+                "name": d.name,
+                "csv": any(table.name == d.name for table in section.files),
+            }
+            for d in section.drawings
+        ],
     }
 
 

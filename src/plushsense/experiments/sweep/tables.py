@@ -390,22 +390,21 @@ def table4(sweep: SweepResults, *, threshold: float = PAPER_THRESHOLD, top: int 
         Column("rank", "Rank in its class", "count"),
         Column("parameters", "Parameters", "count"),
         Column("accuracy", "Highest accuracy", "percent", score=True),
-        Column("schedule", "by (epochs, batch)"),
+        Column("paper_accuracy", "Paper: highest", "percent"),
         Column("mean_accuracy", "Mean accuracy", "percent", score=True),
-        Column("trials", "over trials", "count"),
+        Column("paper_mean", "Paper: mean", "percent"),
         Column("acr", "ACR", "percent", score=True),
+        Column("paper_acr", "Paper: ACR", "percent"),
+        Column("above", f"above {100 * threshold:g} %"),
         *_metric_columns(without="accuracy"),
         Column("validated_accuracy", "Accuracy, chosen by validation", "percent", score=True),
-        Column("above", f"above {100 * threshold:g} %"),
+        Column("schedule", "by (epochs, batch)"),
+        Column("trials", "over trials", "count"),
+        Column("paper_parameters", "Paper: parameters"),
+        Column("paper_split", "Paper: split of the authors' script"),
     ]
-    if beside:
-        columns += [
-            Column("paper_parameters", "Paper: parameters"),
-            Column("paper_accuracy", "Paper: highest", "percent"),
-            Column("paper_mean", "Paper: mean", "percent"),
-            Column("paper_acr", "Paper: ACR", "percent"),
-            Column("paper_split", "Paper: split of the authors' script"),
-        ]
+    if not beside:
+        columns = [c for c in columns if not c.key.startswith("paper_")]
     scored = sum(bool(n.done) for n in sweep.networks)
     words = [
         f"The best {top} of each size class (a filter set), by their highest accuracy over epochs and batch; the mean "
