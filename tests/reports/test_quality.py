@@ -134,10 +134,13 @@ def test_the_place_is_marked_in_rows_of_the_file(result: CheckReport) -> None:
 def test_the_durations_are_those_of_the_review_page(result: CheckReport, page: str) -> None:
     bands = duration_bands(result.dataset)
     axes = quality_figures.durations(bands).axes[0]
-    drawn = [[float(x) for x in line.get_xdata()] for line in axes.lines if line.get_marker() in ("o", "D")]
+    drawn = [[float(x) for x in line.get_xdata()] for line in axes.lines if line.get_marker() in ("o", "D", ">")]
     assert sum(map(len, drawn)) == len(result.dataset.used)
-    outside = [x for line in axes.lines if line.get_marker() == "D" for x in line.get_xdata()]
+    outside = [x for line in axes.lines if line.get_marker() in ("D", ">") for x in line.get_xdata()]
     assert len(outside) == sum(len(b.outliers) for b in bands) >= 1
+    assert max(outside) == pytest.approx(axes.get_xlim()[1], rel=0.01) and max(outside) < max(
+        b.statistics.max for b in bands
+    ), "never stopped: at the edge"
     assert [t.get_text() for t in axes.get_yticklabels()] == [f"{b.gesture} ({len(b.seconds)})" for b in bands]
     boxes = [(p.get_x(), p.get_x() + p.get_width()) for p in axes.patches]
     assert boxes == [(pytest.approx(b.low_s), pytest.approx(b.high_s)) for b in bands]

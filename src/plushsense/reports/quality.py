@@ -140,8 +140,13 @@ def duration_rows(bands: Sequence[DurationBand]) -> Table:
 
 
 def example_recordings(dataset: Dataset, spec: WindowSpec) -> list[RecordingInfo]:
-    """Return the first recording that is shorter than a window and the first that gives several windows, if any."""
-    lasting = [(r, (r.stop - r.start) / r.rate_hz) for r in dataset.used if r.rate_hz > 0]
+    """Return the first recording that is shorter than a window and the first that gives several windows, if any.
+
+    Recordings at rest are the last choice.
+    """
+    idle = {g.label for g in dataset.gestures.gestures if g.idle or g.nobody}
+    touched_first = sorted(dataset.used, key=lambda r: r.gesture in idle)
+    lasting = [(r, (r.stop - r.start) / r.rate_hz) for r in touched_first if r.rate_hz > 0]
     several = (spec.window_s + 2 * spec.step_s, spec.window_s + 20 * spec.step_s)
     short = next((r for r, s in lasting if 0 < s < spec.window_s - 0.1), None)
     long = next((r for r, s in lasting if several[0] < s < several[1]), None)

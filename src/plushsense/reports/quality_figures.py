@@ -123,8 +123,8 @@ def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float
 def durations(bands: Sequence[DurationBand]) -> Figure:
     """Draw how long the recordings of each gesture last, with mean, median, standard deviation and the band.
 
-    It corresponds to the paper's Figure 3. Recordings outside the band have another shape and colour; those that last
-    longer than four times the mean stand at the right edge.
+    It corresponds to the paper's Figure 3. Recordings outside the band have another shape and colour; those that were
+    never stopped may stand as an arrow at the right edge, and widen the standard deviation.
     """
     figure = new_figure(9.2, 1.5 + 0.36 * len(bands))
     axes = figure.add_subplot()
@@ -134,12 +134,16 @@ def durations(bands: Sequence[DurationBand]) -> Figure:
         hidden = "_" if y else ""
         axes.barh(y, band.high_s - band.low_s, 0.8, band.low_s, color=BAND, label=f"{hidden}band around the mean")
         outliers = set(band.outliers)
-        for name, colour, marker, odd in (("in the band", GREY, "o", False), ("outside", MARK, "D", True)):
-            there = [s for i, s in band.seconds.items() if (i in outliers) is odd]
+        inside = [s for i, s in band.seconds.items() if i not in outliers]
+        outside = [band.seconds[i] for i in band.outliers]
+        for there, marker, colour, name in (
+            (inside, "o", GREY, f"{hidden}recording in the band"),
+            ([s for s in outside if s <= end], "D", MARK, f"{hidden}recording outside"),
+            ([0.992 * end for s in outside if s > end], ">", MARK, "_beyond the edge"),
+        ):
             # Fixed vertical offsets separate the dots and always give the same picture.
             at = y + 0.22 * (2 * ((np.arange(len(there)) * 0.618) % 1.0) - 1)
-            label = f"{hidden}recording {name}"
-            axes.plot(np.minimum(there, 0.99 * end), at, marker, color=colour, markersize=3.2, label=label)
+            axes.plot(there, at, marker, color=colour, markersize=3.2, label=name)
         sd = (band.statistics.variance or 0.0) ** 0.5
         spread = f"{hidden}mean ± standard deviation"
         axes.errorbar(band.mean_s, y, xerr=sd, fmt="|", color=COLOURS[1], markersize=16, capsize=3, label=spread)
