@@ -34,6 +34,29 @@ def test_subset_keeps_the_order_of_the_set() -> None:
     assert load_gestures("plush-18").subset(["Tail pull", "At rest"]).labels == ("At rest", "Tail pull")
 
 
+def test_similar_gestures_are_merged_by_family_affect_or_a_set() -> None:
+    plush = load_gestures("plush-18")
+    family, affect, named = (plush.merged_by(name) for name in ("family", "affect", "plush-13"))
+    assert len(family) == 11 and family.get("Tail hit 2").label == "Tail hit" and family.get("Tail hit 1").energetic
+    assert affect.labels == ("neutral", "positive", "negative") and affect.get("Hold strong").affect == "positive"
+    assert not affect.get("At rest").idle, "holding it in the hands is no idleness"
+    # The clusters of the paper's section 4.3, and nothing else; affects and the other gestures are those of Table 2.
+    assert named.labels[5] == "Head stroke" and [len(g.labels) for g in named.gestures if g.labels] == [2, 2, 4]
+    assert [len(group) for group in plush.groups_of(named) if len(group) > 1] == [2, 2, 4]
+    for merged in (family, affect, named):
+        for gesture in plush.gestures:
+            found = merged.get(gesture.label)
+            assert found.affect == gesture.affect and (found.labels or found.idle == gesture.idle)
+    plain = GestureSet("x", (Gesture("A"), Gesture("B"), Gesture("C", "positive")))
+    assert plain.merged_by("affect").labels == ("A", "B", "positive"), "what is unknown is not merged"
+    with pytest.raises(GestureError, match="have no affect"):
+        plain.subset(["A", "B"]).merged_by("affect")
+    with pytest.raises(GestureError, match="accepted are family, affect, plush-13, and .* Did you mean 'family'"):
+        plush.merged_by("familiy")
+    with pytest.raises(GestureError, match="There is no gesture set file"):
+        plush.merged_by("none.toml")
+
+
 def test_wrong_sets_are_refused() -> None:
     with pytest.raises(GestureError, match=r"affect 'postive'.*Did you mean 'positive'"):
         Gesture("x", affect="postive")

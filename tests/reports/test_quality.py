@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,11 @@ from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.quality.checking import CheckReport, check
+from plushsense.dataset.statistics import duration_bands
 from plushsense.dataset.trimming import suggest_trims
 from plushsense.reports import figures, quality, quality_figures
 from plushsense.reports.quality_figures import trim_page
+from plushsense.windows.cut import WindowSpec, cut_windows
 
 ACCEL = load_layout("accel-3")
 
@@ -126,6 +129,62 @@ def test_the_place_is_marked_in_rows_of_the_file(result: CheckReport) -> None:
     assert [line.get_label() for line in axes.lines if not line.get_label().startswith("_")] == ["y"]
     (span,) = axes.patches
     assert (span.get_x(), span.get_x() + span.get_width()) == (31, 190)
+
+
+def test_the_durations_are_those_of_the_review_page(result: CheckReport, page: str) -> None:
+    bands = duration_bands(result.dataset)
+    axes = quality_figures.durations(bands).axes[0]
+    drawn = [[float(x) for x in line.get_xdata()] for line in axes.lines if line.get_marker() in ("o", "D", ">")]
+    assert sum(map(len, drawn)) == len(result.dataset.used)
+    outside = [x for line in axes.lines if line.get_marker() in ("D", ">") for x in line.get_xdata()]
+    assert len(outside) == sum(len(b.outliers) for b in bands) >= 1
+    assert max(outside) == pytest.approx(axes.get_xlim()[1], rel=0.01) and max(outside) < max(
+        b.statistics.max for b in bands
+    ), "never stopped: at the edge"
+    assert [t.get_text() for t in axes.get_yticklabels()] == [f"{b.gesture} ({len(b.seconds)})" for b in bands]
+    boxes = [(p.get_x(), p.get_x() + p.get_width()) for p in axes.patches]
+    assert boxes == [(pytest.approx(b.low_s), pytest.approx(b.high_s)) for b in bands]
+    assert "duration" in axes.get_xlabel() and axes.get_xlabel().endswith("(s)")
+    for row, band in zip(quality.duration_rows(bands).rows, bands, strict=True):
+        assert (row["mean"], row["median"]) == (band.mean_s, band.statistics.median)
+        assert (row["low"], row["high"], row["outside"]) == (band.low_s, band.high_s, len(band.outliers))
+    assert page.count("<h2>Durations</h2>") == 1
+
+
+def test_a_short_recording_is_drawn_as_it_is_looped_and_a_long_one_as_it_is_cut(result: CheckReport) -> None:
+    dataset, spec = result.dataset, WindowSpec(context="loop")
+    (short,) = quality.example_recordings(dataset, spec)
+    figure, said = quality_figures.windows(dataset, short, spec)
+    top, rows = figure.axes
+    (own, again, edge) = top.lines
+    windows = cut_windows(dataset, spec)
+    (mine,) = np.flatnonzero(windows.recording == windows.recording_ids.index(short.id))
+    assert [*own.get_ydata(), *list(again.get_ydata())[1:]] == windows.x[mine, 0].tolist(), "what is trained on"
+    samples = len(own.get_xdata())
+    assert edge.get_xdata()[0] == samples / 100 and len(rows.patches) == 1
+    assert f"{samples} samples at 100 Hz give 1 window of 250 samples, filled by repeating" in said
+    assert "count" in top.get_ylabel() and rows.get_xlabel() == "seconds since the start of the recording"
+
+    long = max(dataset.used, key=lambda r: r.rows)
+    figure, said = quality_figures.windows(dataset, long, spec)
+    all_windows = cut_windows(dataset, replace(spec, longest_factor=0.0))
+    number = int((all_windows.recording == all_windows.recording_ids.index(long.id)).sum())
+    bars = figure.axes[1].patches
+    assert len(bars) == number == 56 and f"give {number} windows of 250 samples, one every 50 samples" in said
+    assert [(bar.get_x(), bar.get_width()) for bar in bars] == [(pytest.approx(i / 2), 2.5) for i in range(number)]
+
+
+def test_the_report_of_a_data_set_shows_durations_and_windows(cli: Any, result: CheckReport, tmp_path: Path) -> None:
+    path = result.dataset.path
+    assert cli("report", tmp_path / "r.html", "--dataset", path).status == 0
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "the paper&#39;s Figure 3" in page or "the paper's Figure 3" in page
+    assert page.count("filled by repeating the recording") == 1 and "<script" not in page
+    longest = max(result.dataset.used, key=lambda r: r.rows).id
+    assert cli("report", tmp_path / "r.html", "--dataset", path, "--recording", longest).status == 0
+    assert "give 56 windows" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    wrong = cli("report", tmp_path / "r.html", "--dataset", path, "--recording", "P1/none")
+    assert wrong.status == 2 and "P1/none" in wrong.err
 
 
 def test_the_same_data_give_the_same_bytes(result: CheckReport) -> None:

@@ -21,6 +21,7 @@ from plushsense.studio.pages.train.result_details import confusion_table, worst_
 from plushsense.studio.pages.train.results import (
     EVALUATION,
     TRAINING,
+    TRIAL,
     Confusion,
     ResultRow,
     StoredResults,
@@ -113,6 +114,31 @@ def test_a_training_has_the_same_figure_everywhere(home: Path, capsys: pytest.Ca
     with pytest.raises(DatasetError) as changed:
         StoredResults(Workspace(home)).with_predictions(details)
     assert changed.value.reason == "data_changed"
+
+
+def test_every_network_whose_predictions_a_sweep_kept_leads_to_its_recordings(
+    home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network = ["--architectures", "9,5", "--filters", "2", "--epochs", "1", "--batches", "64", "--workers", "1"]
+    folder = home / "datasets" / "virtual"
+    assert main(["sweep", str(folder), *network, "--keep-predictions", "all", "--json"]) == 0
+    out = Path(json.loads(capsys.readouterr().out)["out"])
+    results = StoredResults(Workspace(home))
+    rows = [row for row in results.rows() if row.kind == TRIAL and row.path == out]
+    assert len(rows) == 2
+    for row in rows:
+        details = results.details(row)
+        assert details.clickable and details.by_gesture is not None
+        counts = np.array(details.by_gesture.counts)
+        i, j = (int(n) for n in np.argwhere(counts * (1 - np.eye(len(counts), dtype=int)))[0])
+        labels = details.by_gesture.labels
+        assert sum(r.windows for r in results.misread(row, [labels[i]], [labels[j]])) == counts[i, j]
+    # Folders of earlier versions name the trial of the only file.
+    summary = json.loads((out / "sweep.json").read_text(encoding="utf-8"))
+    best = summary["best"][0]["trial"]
+    del summary["predictions"]
+    (out / "sweep.json").write_text(json.dumps(summary | {"predicted": best}), encoding="utf-8")
+    assert {row.trial: results.details(row).clickable for row in rows} == {row.trial: row.trial == best for row in rows}
 
 
 def test_a_verdict_names_its_limits(home: Path) -> None:

@@ -106,7 +106,9 @@ def run_report(args: argparse.Namespace) -> int:
         )
     folder = Path(args.dataset) / "evaluations"
     evaluations = args.evaluation or [str(p.parent) for p in sorted(folder.glob("*/evaluation.json"))]
-    path = write_report(args.out, args.dataset, evaluations, args.model, args.title)
+    path = write_report(
+        args.out, args.dataset, evaluations, args.model, args.title, recordings=True, recording=args.recording
+    )
     emit(args, {"report": str(path), "evaluations": len(evaluations), "models": len(args.model)}, str(path))
     return 0
 
@@ -114,9 +116,9 @@ def run_report(args: argparse.Namespace) -> int:
 def _sweep_report(args: argparse.Namespace) -> int:
     from plushsense.experiments.sweep.report import write_sweep_report
 
-    if args.dataset or args.evaluation or args.model:
+    if args.dataset or args.evaluation or args.model or args.recording:
         raise ConfigError(
-            f"'{args.out}' is a sweep: --dataset, --evaluation and --model are for a page of evaluations."
+            f"'{args.out}' is a sweep: --dataset, --evaluation, --model and --recording are for a page of evaluations."
         )
     done = write_sweep_report(args.out, args.page, title=args.title, mlflow=args.mlflow)
     emit(args, done, [f"{done['report']}: {done['done']} of {done['trials']} trials", *done["said"]])

@@ -14,6 +14,7 @@ _LISTS = {
     "checks": ("plushsense.dataset.quality.checking", "CHECKS"),
     "layouts": ("plushsense.core.layouts", "layout_names"),
     "gesture_sets": ("plushsense.core.gestures", "gesture_set_names"),
+    "merges": ("plushsense.core.gestures", "merge_names"),
     "targets": ("plushsense.deploy.targets", "TARGETS"),
 }
 _TYPES = {"int": int, "float": float}

@@ -66,7 +66,7 @@ def run_compare(args: argparse.Namespace) -> int:
 def run_merge(args: argparse.Namespace) -> int:
     from plushsense.experiments.people.merging import propose_merges
 
-    result = propose_merges(args.dataset, args.evaluation, merges=args.merges, out=args.out)
+    result = propose_merges(args.dataset, args.evaluation, merges=args.merges, groups=args.groups, out=args.out)
     if args.out:
         say(f"written: {args.out}; train and evaluate with  --classes {args.out}")
     emit(args, result, _merge_lines(result))
@@ -98,7 +98,27 @@ def _merge_lines(result: dict[str, Any]) -> list[str]:
         "largest class: the share of windows that a program gets right which always names that class. Fewer classes",
         "are easier, so a higher score alone is no gain. cross-fitted: each person is scored with the merges that all",
         "others choose.",
+        *_grouping_lines(result),
     ]
+
+
+def _grouping_lines(result: dict[str, Any]) -> list[str]:
+    """Format the merges that are named beforehand as text, one row for each."""
+    from plushsense.scoring.metrics import column_metrics
+
+    metrics = column_metrics()
+    rows = [
+        (
+            g["name"],
+            g["classes"],
+            figure(g["largest"]),
+            *(figure(g["scores"][key]["mean"]) for key in metrics),
+            "; ".join(" + ".join(group) for group in g["merged"]),
+        )
+        for g in result["groupings"]
+    ]
+    heads = ("named", "classes", "largest class", *(metric.name for metric in metrics.values()), "merged")
+    return ["", "named beforehand, so nothing is chosen on these people:", "", table(heads, rows)] if rows else []
 
 
 def run_explain(args: argparse.Namespace) -> int:

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, plural, say, table, warn
 from plushsense.cli.settings import grid_changes, marks, work_options
 from plushsense.jobs.progress import ProgressReporter
@@ -19,7 +20,7 @@ _SEARCH_OPTIONS = ("rungs", "folds", "share", "eta", "max_parameters", "max_stat
 def run_sweep(args: argparse.Namespace) -> int:
     from plushsense.experiments.sweep.run import preview, sweep
 
-    changes = grid_changes(args, "split", "epochs")
+    changes = grid_changes(args, "split", "epochs") | options(args, "keep_predictions")
     if args.dry_run:
         plan = preview(args.dataset, args.grid, warn=warn, **changes)
         emit(args, plan, _sweep_plan_lines(plan))

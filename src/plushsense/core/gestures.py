@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from plushsense.core.toml import builtin_names, load_table, read_named
 
 AFFECTS = ("positive", "neutral", "negative", "none")
 NOBODY = "none"
+FAMILY, AFFECT = "family", "affect"
 
 
 def plain_label(label: str) -> str:
@@ -122,6 +123,69 @@ class GestureSet:
         chosen = {self.get(label) for label in labels}
         return GestureSet(self.name, tuple(g for g in self.gestures if g in chosen), self.inferred)
 
+    def merged(self, groups: Sequence[Sequence[int]], labels: Mapping[int, str] | None = None) -> GestureSet:
+        """Return the set in which the gestures of each group of class indices are one.
+
+        Args:
+            labels: label by the first index of a group; by default that of the family if the group is the whole family,
+                otherwise the labels of its members joined by "+".
+        """
+        made = []
+        for group in groups:
+            members = [self.gestures[k] for k in group]
+            first = members[0]
+            if len(members) == 1 and group[0] not in (labels or {}):
+                made.append(first)
+                continue
+            family = {g.label for g in self.gestures if g.family == first.family}
+            whole = family == {g.label for g in members}
+            label = (labels or {}).get(group[0]) or (first.family if whole else " + ".join(g.label for g in members))
+            made.append(
+                Gesture(
+                    label,
+                    first.affect,
+                    family=label,
+                    nobody=all(g.nobody for g in members),
+                    idle=all(g.idle for g in members),
+                    energetic=all(g.energetic for g in members),
+                    description="; ".join(g.description for g in members if g.description),
+                    labels=tuple(name for g in members for name in (g.label, *g.labels) if name != label),
+                )
+            )
+        return GestureSet(f"{self.name}, {len(groups)} classes", tuple(made))
+
+    def merged_by(self, choice: str) -> GestureSet:
+        """Return the set in which similar gestures are one.
+
+        Args:
+            choice: "family": gestures of one family, as on the table and in the hands; "affect": those of one affect,
+                but not those of an unknown one; the name of a built-in merge, or the path of the TOML file of a
+                gesture set, which may have other gestures than this one.
+
+        Raises:
+            GestureError: for an unknown name, a file that cannot be read, or "affect" without any affect.
+        """
+        if choice == FAMILY:
+            return self.merged(_groups(self.families))
+        if choice == AFFECT:
+            if not self.has_affect:
+                raise GestureError(f"The gestures of '{self.name}' have no affect: merge them by family or a file.")
+            known = [a if a != "none" else f"\0{k}" for k, a in enumerate(self.affects)]
+            groups = _groups(known)
+            return self.merged(groups, {g[0]: self.affects[g[0]] for g in groups if self.affects[g[0]] != "none"})
+        if choice not in builtin_names("merges") and not choice.endswith(".toml"):
+            raise GestureError(
+                f"Unknown set of merged gestures '{choice}': accepted are {', '.join(merge_names())}, and the path of "
+                f"a TOML file.{nearest(choice, merge_names())}"
+            )
+        table, source = read_named(choice, "merges", "gesture set", GestureError)
+        return GestureSet.from_dict(table, f"gesture set '{source}'")
+
+    def groups_of(self, merged: GestureSet) -> tuple[tuple[int, ...], ...]:
+        """Return the class indices that are one gesture of ``merged``; gestures that it does not contain stay alone."""
+        found = (merged.find(label) for label in self.labels)
+        return _groups(g.label if g else f"\0{k}" for k, g in enumerate(found))
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
         table = asdict(self)
@@ -152,6 +216,19 @@ class GestureSet:
             spellings.setdefault(plain_label(label), label)
         gestures = tuple(Gesture(s, free_choice=plain_label(s) == "custom") for s in sorted(spellings.values()))
         return cls(name, gestures, inferred=True)
+
+
+def _groups(names: Iterable[str]) -> tuple[tuple[int, ...], ...]:
+    """Return the indices of equal names, in the order of their first ones."""
+    groups: dict[str, list[int]] = {}
+    for k, name in enumerate(names):
+        groups.setdefault(name, []).append(k)
+    return tuple(map(tuple, groups.values()))
+
+
+def merge_names() -> tuple[str, ...]:
+    """Return the choices of `GestureSet.merged_by` besides files."""
+    return (FAMILY, AFFECT, *builtin_names("merges"))
 
 
 def gesture_set_names() -> tuple[str, ...]:

@@ -40,6 +40,7 @@ def render(
     evaluations: Sequence[Mapping[str, Any]],
     models: Sequence[Mapping[str, Any]],
     simulated: bool,
+    recordings: Mapping[str, Any] | None = None,
 ) -> str:
     """Return the report as HTML. Any key of the mappings may be missing; the report then shows a dash.
 
@@ -49,6 +50,7 @@ def render(
         evaluations: ``Evaluation.to_dict()`` of each, optionally with ``title`` and ``model`` as its name, and
             ``simulated`` and ``dataset`` (name, hash) for its data.
         models: a model card of each (symbol, filters, …, provenance, optional ``title``).
+        recordings: pictures of the recordings, from `plushsense.reports.quality.describe_recordings`.
         simulated: whether the data set is a simulation. The page has a banner if the data set, an evaluation or a model
             is simulated.
     """
@@ -72,6 +74,7 @@ def render(
         wholly_simulated=wholly,
         any_leaky=any(evaluation.get("leaky") for evaluation in named),
         dataset=dataset_rows(dataset),
+        recordings=recordings,
         metrics=column_metrics(),
         comparison=comparison_rows(named),
         subjects=subject_rows(named),

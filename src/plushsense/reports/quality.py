@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,11 +17,14 @@ from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.quality.checking import CHECKS, CheckReport
 from plushsense.dataset.quality.findings import SEVERITIES, Finding
 from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, duration_s, summarize
+from plushsense.dataset.statistics import DurationBand, duration_bands
 from plushsense.dataset.store import Dataset, RecordingInfo
+from plushsense.dataset.trimming import find_recordings
 from plushsense.reports import quality_figures as figures
-from plushsense.reports.figures import png
+from plushsense.reports.figures import data_uri, png
 from plushsense.reports.page import check_page_path, render_page, write_page
-from plushsense.reports.table import count
+from plushsense.reports.table import Column, Table, count
+from plushsense.windows.cut import WindowSpec
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,6 +44,15 @@ _SIGNAL_CHECKS = (
     *("garbage", "blank-rows", "spikes", "flat", "stuck", "saturated"),
 )
 _DRAWN_ROWS = 3
+_DURATIONS = {
+    "mean": "Mean",
+    "median": "Median",
+    "sd": "Standard deviation",
+    "min": "Shortest",
+    "max": "Longest",
+    "low": "Band from",
+    "high": "Band to",
+}
 _SEVERITY = {"error": "to decide", "warning": "to look at", "info": "good to know"}
 
 
@@ -102,6 +114,67 @@ class _Pictures:
         return "data:image/png;base64," + base64.b64encode(data).decode("ascii")
 
 
+def duration_rows(bands: Sequence[DurationBand]) -> Table:
+    """Return the numbers of `quality_figures.durations`, in seconds."""
+    columns = (
+        Column("gesture", "Gesture"),
+        *(Column(key, head, "count") for key, head in (("recordings", "Recordings"), ("outside", "Outside the band"))),
+        *(Column(key, head, "share") for key, head in _DURATIONS.items()),
+    )
+    rows = tuple(
+        {
+            "gesture": band.gesture,
+            "recordings": len(band.seconds),
+            "outside": len(band.outliers),
+            "mean": band.mean_s,
+            "median": band.statistics.median,
+            "sd": None if band.statistics.variance is None else band.statistics.variance**0.5,
+            "min": band.statistics.min,
+            "max": band.statistics.max,
+            "low": band.low_s,
+            "high": band.high_s,
+        }
+        for band in bands
+    )
+    return Table("durations", "Durations (s)", columns, rows)
+
+
+def example_recordings(dataset: Dataset, spec: WindowSpec) -> list[RecordingInfo]:
+    """Return the first recording that is shorter than a window and the first that gives several windows, if any.
+
+    Recordings at rest are the last choice.
+    """
+    idle = {g.label for g in dataset.gestures.gestures if g.idle or g.nobody}
+    touched_first = sorted(dataset.used, key=lambda r: r.gesture in idle)
+    lasting = [(r, (r.stop - r.start) / r.rate_hz) for r in touched_first if r.rate_hz > 0]
+    several = (spec.window_s + 2 * spec.step_s, spec.window_s + 20 * spec.step_s)
+    short = next((r for r, s in lasting if 0 < s < spec.window_s - 0.1), None)
+    long = next((r for r, s in lasting if several[0] < s < several[1]), None)
+    return [r for r in (short, long) if r is not None]
+
+
+def describe_recordings(dataset: Dataset, recording: str | None = None) -> dict[str, Any]:
+    """Return pictures of the durations and of how recordings are cut, for the template of a report.
+
+    Args:
+        recording: id of the recording to show cut into windows (default: `example_recordings`).
+
+    Raises:
+        DatasetError: for an unknown recording, or one without a valid sample.
+    """
+    spec = WindowSpec()
+    shown = example_recordings(dataset, spec) if recording is None else find_recordings(dataset, recording)[:1]
+    bands = duration_bands(dataset)
+    cut = [figures.windows(dataset, info, spec) for info in shown]
+    return {
+        "durations": data_uri(figures.durations(bands)) if bands else None,
+        "table": duration_rows(bands),
+        "window_s": spec.window_s,
+        "step_s": spec.step_s,
+        "windows": [{"src": data_uri(figure), "alt": sentence} for figure, sentence in cut],
+    }
+
+
 def write_report(path: Path, result: CheckReport, progress: Progress | None = None) -> Path:
     """Write the report of ``result`` as a page; of existing files only an earlier report is replaced.
 
@@ -122,6 +195,7 @@ def render(result: CheckReport, progress: Progress | None = None) -> str:
     by_check = {name: findings for name, findings in by_check.items() if findings}
     scale = scale_of(dataset)
     plotter = _Plotter(dataset, scale)
+    bands = duration_bands(dataset, result.limits.duration)
     report = progress or (lambda done, total: None)
     total = len(by_check) + len(gestures)
     # Add plots of findings first, because overlays are the less important pictures to leave out.
@@ -149,6 +223,7 @@ def render(result: CheckReport, progress: Progress | None = None) -> str:
         ],
         undecided=[_row(f) for f in result.undecided],
         sections=sections,
+        durations=pictures.add(figures.durations(bands)) if bands else None,
         overlays=overlays,
         named=NAMED,
         tolerance=f"{100 * result.limits.duration:.0f}",

@@ -1,4 +1,4 @@
-"""Draw overlays of a gesture's recordings, the places of findings, and trims."""
+"""Draw overlays of a gesture's recordings, durations, windows of a recording, the places of findings, and trims."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError, need
+from plushsense.core.errors import ConfigError, DatasetError, need
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.quality.measurements import LEVEL_KINDS
-from plushsense.dataset.store import Dataset
+from plushsense.dataset.statistics import DurationBand
+from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.dataset.trimming import Trim
 from plushsense.reports.figures import new_figure, png
+from plushsense.windows.clock import resample
+from plushsense.windows.cut import WindowSpec, from_recording
+from plushsense.windows.features import network_inputs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,6 +34,7 @@ _POINTS = 1500
 _LINE_POINTS = 160
 _CHANNELS = 13
 _FEW = 40
+_NUMBERED = 40
 
 
 @dataclass(frozen=True)
@@ -113,6 +118,107 @@ def overlay(gesture: str, lines: Sequence[Line], mean_s: float, tolerance: float
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=8)
     return figure
+
+
+def durations(bands: Sequence[DurationBand]) -> Figure:
+    """Draw how long the recordings of each gesture last, with mean, median, standard deviation and the band.
+
+    It corresponds to the paper's Figure 3. Recordings outside the band have another shape and colour; those that were
+    never stopped may stand as an arrow at the right edge, and widen the standard deviation.
+    """
+    figure = new_figure(9.2, 1.5 + 0.36 * len(bands))
+    axes = figure.add_subplot()
+    end = 1.05 * max(min(max(band.high_s, band.statistics.max), 4 * band.mean_s) for band in bands)
+    for y, band in enumerate(bands):
+        # matplotlib leaves names that begin with "_" out of the legend.
+        hidden = "_" if y else ""
+        axes.barh(y, band.high_s - band.low_s, 0.8, band.low_s, color=BAND, label=f"{hidden}band around the mean")
+        outliers = set(band.outliers)
+        inside = [s for i, s in band.seconds.items() if i not in outliers]
+        outside = [band.seconds[i] for i in band.outliers]
+        for there, marker, colour, name in (
+            (inside, "o", GREY, f"{hidden}recording in the band"),
+            ([s for s in outside if s <= end], "D", MARK, f"{hidden}recording outside"),
+            ([0.992 * end for s in outside if s > end], ">", MARK, "_beyond the edge"),
+        ):
+            # Fixed vertical offsets separate the dots and always give the same picture.
+            at = y + 0.22 * (2 * ((np.arange(len(there)) * 0.618) % 1.0) - 1)
+            axes.plot(there, at, marker, color=colour, markersize=3.2, label=name)
+        sd = (band.statistics.variance or 0.0) ** 0.5
+        spread = f"{hidden}mean ± standard deviation"
+        axes.errorbar(band.mean_s, y, xerr=sd, fmt="|", color=COLOURS[1], markersize=16, capsize=3, label=spread)
+        median = band.statistics.median
+        axes.plot(median, y, "x", color="#000000", markersize=6, zorder=4, label=f"{hidden}median")
+    axes.set_yticks(range(len(bands)), [f"{b.gesture} ({len(b.seconds)})" for b in bands], parse_math=False)
+    axes.set_ylim(len(bands) - 0.4, -0.6)
+    axes.set_xlim(0, end)
+    axes.set_xlabel("duration of a recording after trimming (s)", fontsize=9)
+    axes.tick_params(labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    percent = 100 * (bands[0].high_s / bands[0].mean_s - 1)
+    figure.suptitle(f"As the paper's Figure 3: durations, and the band of ±{percent:.0f} %", fontsize=10)
+    figure.legend(loc="outside lower center", ncols=5, fontsize=7.5, frameon=False)
+    return figure
+
+
+def windows(dataset: Dataset, info: RecordingInfo, spec: WindowSpec) -> tuple[Figure, str]:
+    """Draw how a recording is cut into windows (as the paper's Figure 5); return the figure and a sentence.
+
+    The windows are those that training cuts with the context "loop". The signal is the first measured input of the
+    network. Of a recording that a gap divides, the longest part is drawn.
+
+    Raises:
+        DatasetError: if the recording has no valid sample.
+    """
+    layout = dataset.layout
+    window, step = layout.samples(spec.window_s), layout.samples(spec.step_s)
+    segments = resample(dataset.read(info), layout)
+    if not segments:
+        raise DatasetError(f"'{info.id}' has no valid sample, and so gives no window: choose another recording.")
+    segment = max(segments, key=len)
+    cuts = from_recording([segment], dataset, window, step)
+    looped = cuts[0].context == "loop"
+    data = cuts[0].x if looped else network_inputs(segment.data, layout)
+    name = next((name for name in layout.inputs if name in layout.names), layout.inputs[0])
+    y, unit = data[:, layout.inputs.index(name)].astype(np.float64), "as the network reads it"
+    if name in layout.names:
+        y, unit = y * layout.channels[layout.index(name)].step, layout.channels[layout.index(name)].unit
+    seconds = np.arange(len(y)) / layout.rate_hz
+    height = min(0.5 + 0.17 * len(cuts), 4.0)
+    figure = new_figure(9.2, 3.3 + height)
+    top, rows = figure.subplots(2, 1, height_ratios=(2.2, height), sharex=True)
+    own = len(segment) if looped else len(y)
+    top.plot(seconds[:own], y[:own], color=COLOURS[1], linewidth=1.2, label="recording")
+    if looped:
+        top.plot(seconds[own - 1 :], y[own - 1 :], "--", color=MARK, linewidth=1.0, label="repeated from its start")
+        for again in range(own, len(y), own):
+            top.axvline(again / layout.rate_hz, color=GREY, linestyle=":", linewidth=1.2)
+    top.set_ylabel(f"{name}\n({unit})", fontsize=9)
+    for number, cut in enumerate(cuts, 1):
+        begin = cut.begin / layout.rate_hz
+        rows.barh(number, len(cut.x) / layout.rate_hz, 0.7, begin, color=BAND, edgecolor=COLOURS[1], linewidth=0.8)
+        if len(cuts) <= _NUMBERED:
+            rows.text(begin + 0.03, number, str(number), va="center", fontsize=7)
+    unused = 0 if looped else len(y) - cuts[-1].begin - window
+    if unused:
+        after = ((len(y) - unused) / layout.rate_hz, len(y) / layout.rate_hz)
+        top.axvspan(*after, color=GREY, alpha=0.25, linewidth=0, label="in no window")
+    rows.set_ylim(len(cuts) + 0.6, 0.4)
+    rows.set_yticks([])
+    rows.set_ylabel("windows", fontsize=9)
+    rows.set_xlabel("seconds since the start of the recording", fontsize=9)
+    rows.set_xlim(0, len(y) / layout.rate_hz)
+    for axes in (top, rows):
+        axes.tick_params(labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    count = "1 window" if len(cuts) == 1 else f"{len(cuts)} windows"
+    said = f"{info.id}: {len(segment)} samples at {layout.rate_hz:g} Hz give {count} of {window} samples"
+    said += ", filled by repeating the recording" if looped else f", one every {step} samples"
+    said += f"; the last {unused} samples are in none" if unused else ""
+    said += f"; drawn is the longest of {len(segments)} parts between gaps" if len(segments) > 1 else ""
+    figure.suptitle(textwrap.fill(f"As the paper's Figure 5: {said}", 105), fontsize=9).set_parse_math(False)
+    return figure, f"{said}."
 
 
 def _thinned(rows: int) -> NDArray[np.int64]:

@@ -50,8 +50,9 @@ class GridSpec:
     """Settings of a grid. The constructor checks nothing; `problems` reports all errors at once.
 
     A network of n layers uses the first n numbers of each set of ``filters``. ``seeds`` are those of the trainings;
-    ``split_seed`` gives all of them the same folds. ``classes`` is "all", "shared" or labels joined by commas.
-    ``threads`` is part of a training's id, because the order of sums in PyTorch's layers depends on it.
+    ``split_seed`` gives all of them the same folds. ``classes`` is "all", "shared", labels joined by commas, or merged
+    gestures (`GestureSet.merged_by`). ``threads`` is part of a training's id, because the order of sums in PyTorch's
+    layers depends on it.
     """
 
     name: str = "grid"

@@ -32,7 +32,7 @@ from plushsense.training.spec import TrainSpec
 from plushsense.trials.grid import FULL, GridSpec, Trial, first_line, problems, trainings
 from plushsense.windows.cut import WindowSet, shared_gestures
 from plushsense.workflow.config import ALL
-from plushsense.workflow.preparation import Warn, choose_classes, silent, windows_for
+from plushsense.workflow.preparation import Warn, choose_classes, named_classes, silent, windows_for
 from plushsense.workflow.reporting import journal_of
 
 # Part of every id: increase it when the meaning of a stored training changes.
@@ -196,7 +196,8 @@ class _Cut:
     @classmethod
     def of(cls, dataset: Dataset, grid: GridSpec, warn: Warn) -> _Cut:
         """Cut windows of ``window_s`` without earlier samples; other spans give as many windows."""
-        gestures = choose_classes(dataset, grid.classes, warn)
+        dataset, classes = named_classes(dataset, grid.classes)
+        gestures = choose_classes(dataset, classes, warn)
         window = Arch.parse(
             "1", "1", channels=dataset.layout.n_inputs, padding="mirror", window=dataset.layout.samples(grid.window_s)
         )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,16 +19,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from plushsense.core.errors import need
+from plushsense.core.errors import ArchError, ConfigError, nearest, need
 from plushsense.core.files import replacing_file, write_file
 from plushsense.core.version import __version__
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.scores import gather_predictions, write_predictions
 from plushsense.jobs.journal import Result
-from plushsense.models.arch import slashed
+from plushsense.models.arch import parse_symbol, slashed
 from plushsense.reports.table import Column, Kind
 from plushsense.scoring.metrics import Counts, accuracy_complexity_ratio, class_rows, column_metrics
-from plushsense.trials.grid import CHOSEN
+from plushsense.trials.grid import CHOSEN, SECOND
 from plushsense.trials.plan import CURVE, Plan, PlannedRun, PlannedTrial, Scored, TrainingOutcome, outcome
 from plushsense.workflow.reporting import PREDICTIONS, machine
 
@@ -191,8 +191,66 @@ def listed_columns(*, terminal: bool = False) -> list[Column]:
     ]
 
 
+Network = tuple[str, str]
+"""Symbol and filters of a network, as in the table of trials."""
+PAPER_CHOICE, BEST_ONLY, EVERY = "chosen", "best", "all"
+
+
+def networks_to_keep(plan: Plan, choice: str) -> frozenset[Network]:
+    """Return the networks of a plan whose predictions and confusions are kept; those of the best trial always are.
+
+    Args:
+        choice: words joined by commas. "chosen": the two networks that the paper shows (Figures 10 and 11), where the
+            plan has them; "best": none besides the best trial; "all"; or the symbol of a network, with one of its
+            filter sets (``14d1_39d2_41d4:8/12/16``) or without, for all of them.
+
+    Raises:
+        ConfigError: for any other word, or a network that is not in the plan.
+    """
+    networks = {_network(planned): None for planned in plan.trials}
+    kept: set[Network] = set()
+    for word in filter(None, map(str.strip, choice.split(","))):
+        symbol, _, filters = word.partition(":")
+        if word in (PAPER_CHOICE, BEST_ONLY, EVERY):
+            chosen = {PAPER_CHOICE: {CHOSEN, SECOND}, BEST_ONLY: set[Network](), EVERY: set(networks)}[word]
+            kept |= chosen & set(networks)
+            continue
+        mine = {n for n in networks if _same_symbol(symbol, n[0]) and filters in ("", n[1])}
+        if not mine:
+            known = list(dict.fromkeys(name for name, _ in networks))
+            raise ConfigError(
+                f"Predictions of '{word}' cannot be kept: accepted are {PAPER_CHOICE}, {BEST_ONLY}, {EVERY}, and the "
+                f"networks of the grid, such as {known[0]} or {':'.join(next(iter(networks)))}."
+                f"{nearest(symbol, (PAPER_CHOICE, BEST_ONLY, EVERY, *known))}"
+            )
+        kept |= mine
+    return frozenset(kept)
+
+
+def _same_symbol(text: str, symbol: str) -> bool:
+    try:
+        return parse_symbol(text) == parse_symbol(symbol)
+    except ArchError:
+        return False
+
+
+def _network(planned: PlannedTrial) -> Network:
+    return planned.trial.arch.symbol, slashed(planned.trial.arch.filters)
+
+
+def prediction_files(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Return the names of the files of predictions by trial; in folders of earlier versions only the best has one."""
+    files = summary.get("predictions")
+    if isinstance(files, Mapping):
+        return {str(trial): str(name) for trial, name in files.items()}
+    return {str(summary["predicted"]): PREDICTIONS} if summary.get("predicted") else {}
+
+
 class Tables:
-    """Collects the outcomes of trainings and writes the results folder, each time in the context ``writing()``."""
+    """Collects the outcomes of trainings and writes the results folder, each time in the context ``writing()``.
+
+    ``keep`` are the networks whose predictions and confusions are kept besides those of the best trial.
+    """
 
     def __init__(
         self,
@@ -200,13 +258,14 @@ class Tables:
         out: Path,
         head: Mapping[str, Any],
         writing: Callable[[], AbstractContextManager[object]] = nullcontext,
+        keep: Collection[Network] = (),
     ) -> None:
-        self.plan, self.out, self.head, self._writing = plan, out, dict(head), writing
+        self.plan, self.out, self.head, self._writing, self.keep = plan, out, dict(head), writing, frozenset(keep)
         self.outcomes: dict[str, TrainingOutcome] = {}
         self.resumed: set[str] = set()
         self.lost: dict[str, str] = {}
         self.best: dict[str, Any] | None = None
-        self.predicted: str | None = None
+        self.predictions: dict[str, str] = {}
         self._of: dict[str, list[tuple[PlannedTrial, PlannedRun]]] = {}
         for planned in plan.trials:
             for run in planned.runs:
@@ -277,7 +336,7 @@ class Tables:
             "ranked_by": "accuracy",
             "best": best[:BEST],
             "best_on_validation": chosen,
-            "predicted": self.predicted,
+            "predictions": self.predictions,
             "confusions": {p.id: self._counts(p).tolist() for p in detailed},
             "per_class": {p.id: class_rows(self._counts(p), self.plan.gestures.labels) for p in detailed},
         }
@@ -286,26 +345,45 @@ class Tables:
         """Write all files, each by replacing it in one step, and return the summary.
 
         Args:
-            results: those of all trainings by job; with them, the predictions of the best trial are written, too.
+            results: those of all trainings by job; with them, the predictions are written, too.
         """
         with self._writing():
-            self.predicted = self._write_predictions(results) if results else None
+            self.predictions = self._write_predictions(results) if results else {}
             return self._write()
 
-    def _write_predictions(self, results: Mapping[str, Result]) -> str | None:
-        """Write what the best trial predicted with every seed and fold, as its confusions count it; return its id."""
-        best = next((t for t in self.plan.trials if self.best is not None and t.id == self.best["trial"]), None)
-        if best is None:
-            return None
-        runs = best.runs
-        tested = [(run.fold, self.plan.folds[run.span][run.fold_index].test) for run in runs]
-        parts = []
-        for run in runs:
-            result = results[run.job]
-            parts.append(result["probabilities"][list(result["epochs"]).index(best.trial.epochs)])
+    def _write_predictions(self, results: Mapping[str, Result]) -> dict[str, str]:
+        """Write what the best trial, and the best one of each kept network, predicted; return the files by trial.
+
+        A file has the predictions of every seed and fold, as the confusions count them. Files of networks that are no
+        longer kept are removed.
+        """
+        files: dict[str, str] = {}
         self.out.mkdir(parents=True, exist_ok=True)
-        write_predictions(self.out / PREDICTIONS, gather_predictions(self.plan.sets[runs[0].span], tested, parts))
-        return best.id
+        ranked = sorted(filter(_ranked, self.trial_rows()), key=_rank)
+        for planned in self._first_of(ranked, self.keep):
+            name = PREDICTIONS if not files else f"predictions-{'-'.join(_network(planned)).replace('/', '-')}.parquet"
+            runs = planned.runs
+            tested = [(run.fold, self.plan.folds[run.span][run.fold_index].test) for run in runs]
+            parts = []
+            for run in runs:
+                result = results[run.job]
+                parts.append(result["probabilities"][list(result["epochs"]).index(planned.trial.epochs)])
+            write_predictions(self.out / name, gather_predictions(self.plan.sets[runs[0].span], tested, parts))
+            files[planned.id] = name
+        for path in self.out.glob("predictions-*.parquet"):
+            if path.name not in files.values():
+                path.unlink()
+        return files
+
+    def _first_of(self, ranked: Sequence[Mapping[str, Any]], networks: Collection[Network]) -> list[PlannedTrial]:
+        """Return the first of the ``ranked`` trials, then the first of each other one of ``networks``."""
+        first: dict[Network, str] = {}
+        for row in ranked:
+            network = (row["arch"], row["filters"])
+            if not first or network in networks:
+                first.setdefault(network, row["trial"])
+        by_id = {planned.id: planned for planned in self.plan.trials}
+        return [by_id[trial] for trial in first.values()]
 
     def _write(self) -> dict[str, Any]:
         began = time.monotonic()
@@ -367,14 +445,18 @@ class Tables:
             )
         return polars.concat(parts) if parts else _frame(polars, [], _CURVE_COLUMNS)
 
-    def _with_confusions(self, best: Sequence[Mapping[str, Any]]) -> list[PlannedTrial]:
-        """Return the trials whose confusions are stored: the best, the best of each filter set, the paper's network."""
-        picked = [row["trial"] for row in best[:BEST]]
+    def _with_confusions(self, ranked: Sequence[Mapping[str, Any]]) -> list[PlannedTrial]:
+        """Return the trials whose confusions are stored.
+
+        They are the best, and the best of each filter set, of each kept network and of the two that the paper shows.
+        """
+        picked = {row["trial"] for row in ranked[:BEST]}
+        picked |= {planned.id for planned in self._first_of(ranked, self.keep | {CHOSEN, SECOND})}
         seen: set[str] = set()
-        for row in best:
-            if row["filter_set"] not in seen or (row["arch"], row["filters"]) == CHOSEN:
+        for row in ranked:
+            if row["filter_set"] not in seen:
                 seen.add(row["filter_set"])
-                picked.append(row["trial"])
+                picked.add(row["trial"])
         return [planned for planned in self.plan.trials if planned.id in picked]
 
     def _counts(self, planned: PlannedTrial) -> Counts:

@@ -131,11 +131,15 @@ class WindowSet:
 
 @dataclass
 class WindowCut:
-    """One window (T, F), before `assemble` makes a set of windows."""
+    """One window (T, F), before `assemble` makes a set of windows.
+
+    ``begin`` is the sample of the recording's segment at which it begins (`from_recording`).
+    """
 
     x: NDArray[np.int64]
     context: str
     window_rows: tuple[int, int]
+    begin: int = 0
 
 
 def from_recording(segments: list[Segment], dataset: Dataset, window: int, step: int) -> list[WindowCut]:
@@ -144,7 +148,8 @@ def from_recording(segments: list[Segment], dataset: Dataset, window: int, step:
     for segment in segments:
         if len(segment) >= window:
             x = network_inputs(segment.data, dataset.layout)
-            cuts += [WindowCut(x[s : s + window], "inside", (-1, -1)) for s in range(0, len(x) - window + 1, step)]
+            begins = range(0, len(x) - window + 1, step)
+            cuts += [WindowCut(x[s : s + window], "inside", (-1, -1), s) for s in begins]
     if not cuts and segments:
         x = network_inputs(max(segments, key=len).data, dataset.layout)
         repeated = np.tile(x, (-(-window // len(x)), 1))[:window]

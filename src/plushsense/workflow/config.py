@@ -88,7 +88,8 @@ class EvaluationSpec:
     """Settings of an evaluation.
 
     Attributes:
-        classes: "shared" (gestures that at least 90 % of the people made, without free choice), "all", or labels.
+        classes: "shared" (gestures that at least 90 % of the people made, without free choice), "all", labels, or
+            merged gestures (see `plushsense.core.gestures.GestureSet.merged_by`).
         train_context: context of the training windows; None: that of the scored windows.
         workers: number of processes; 0: one for each processor.
     """

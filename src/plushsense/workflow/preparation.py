@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.gestures import NOBODY, GestureSet, load_gestures
+from plushsense.core.gestures import NOBODY, GestureSet, merge_names
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.proposals import median_gesture_s
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
@@ -32,7 +32,7 @@ def silent(_: str) -> None:
 def network_inputs_of(dataset: Dataset, config: RunConfig) -> tuple[Dataset, RunConfig]:
     """Return the data set as the network of ``config`` reads it, and the settings with that network.
 
-    The data set has the inputs of the network and, if the classes are the file of a gesture set, its gestures.
+    The data set has the inputs of the network and, if the classes are merged gestures, these gestures.
     """
     config = config.for_layout(dataset.layout)
     dataset, classes = named_classes(dataset, config.evaluation.classes)
@@ -43,11 +43,18 @@ def network_inputs_of(dataset: Dataset, config: RunConfig) -> tuple[Dataset, Run
 
 
 def named_classes(dataset: Dataset, choice: str | Sequence[str]) -> tuple[Dataset, str | tuple[str, ...]]:
-    """Return the data set and the classes; if they are the file of a gesture set, the data set has its gestures."""
-    if isinstance(choice, str) and choice.endswith(".toml"):
-        gestures = load_gestures(choice)
-        return dataset.with_gestures(gestures), gestures.labels
-    return dataset, choice if isinstance(choice, str) else tuple(choice)
+    """Return the data set and the classes; for merged gestures (`GestureSet.merged_by`), the data set has these.
+
+    Of merged gestures, the classes are those that were recorded.
+    """
+    if not isinstance(choice, str):
+        return dataset, tuple(choice)
+    if choice not in merge_names() and not choice.endswith(".toml"):
+        return dataset, choice
+    gestures = dataset.gestures.merged_by(choice)
+    dataset = dataset.with_gestures(gestures)
+    recorded = {r.gesture for r in dataset.used}
+    return dataset, tuple(label for label in gestures.labels if label in recorded)
 
 
 def choose_classes(dataset: Dataset, choice: str | Sequence[str], warn: Warn = silent) -> GestureSet:

@@ -169,14 +169,23 @@ def write_report(
     evaluations: Sequence[Evaluation | Mapping[str, Any] | str | os.PathLike[str]] = (),
     models: Sequence[Bundle | str | os.PathLike[str]] = (),
     title: str | None = None,
+    *,
+    recordings: bool = False,
+    recording: str | None = None,
 ) -> Path:
     """Write one self-contained HTML page: data set, protocol, scores, confusions, curves, model cards.
 
     Args:
         evaluations: results of `evaluate`, or the folders or files of saved ones.
         models: bundles, or their paths.
+        recordings: also draw the durations of the gestures, and how a recording is cut into windows.
+        recording: id of the recording that is shown cut (default: the first short one, and one with several windows).
+
+    Raises:
+        DatasetError: for an unknown recording.
     """
     from plushsense.reports.evaluation import write_evaluation_report
+    from plushsense.reports.quality import describe_recordings
 
     dataset = as_dataset(dataset)
     summary = dataset.summary()
@@ -204,6 +213,7 @@ def write_report(
         "licence": summary["licence"],
         "hash": summary["hash"],
     }
+    pictures = describe_recordings(dataset, recording) if recordings else None
     with dataset.generation.writing():
         return write_evaluation_report(
             Path(path),
@@ -212,6 +222,7 @@ def write_report(
             evaluations=[_evaluation_table(e) for e in evaluations],
             models=cards,
             simulated=bool(summary["simulated"]),
+            recordings=pictures,
         )
 
 

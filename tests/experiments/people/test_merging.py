@@ -12,7 +12,9 @@ import pytest
 from plushsense.core.errors import GestureError
 from plushsense.core.gestures import Gesture, GestureSet, load_gestures
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.people.merging import merge_path, merged_set
+from plushsense.evaluation.scores import Predictions
+from plushsense.experiments.people import merging
+from plushsense.experiments.people.merging import merge_path
 from plushsense.models.bundle import Bundle
 
 Cli = Callable[..., Any]
@@ -53,16 +55,32 @@ def test_the_pair_that_people_confuse_most_is_merged_first_and_only_within_an_af
 
 
 def test_a_merged_set_knows_the_labels_of_its_members() -> None:
-    taps = merged_set(SET, ((0,), (1,), (2, 3), (4,), (5,)))
+    taps = SET.merged(((0,), (1,), (2, 3), (4,), (5,)))
     assert taps.labels == ("Rest", "Hold", "Tap", "Scratch", "Hit")
     assert taps.get("tap_2").label == "Tap" and taps.get("Tap 1").affect == "positive"
     assert taps.gestures[0] == SET.gestures[0]
-    both = merged_set(SET, ((0,), (1,), (2, 4), (3,), (5,)))
+    both = SET.merged(((0,), (1,), (2, 4), (3,), (5,)))
     assert both.get("Scratch").label == "Tap 1 + Scratch"
     again = GestureSet.from_dict(taps.to_dict())
     assert again == taps and "labels" not in taps.to_dict()["gestures"][0]
     with pytest.raises(GestureError, match="'Tap' twice"):
         GestureSet("x", (Gesture("Tap"), Gesture("Other", labels=("tap",))))
+
+
+def test_the_largest_class_is_that_of_the_people_who_are_scored() -> None:
+    truth = np.array([0] * 6 + [2, 2, 2, 3], dtype=np.int64)
+    subject = np.array(["none"] * 6 + ["P1", "P1", "P2", "P2"])
+    plain = dict.fromkeys(("recording", "context", "fold"), subject)
+    read = np.eye(6, dtype=np.float32)[[0] * 6 + [3, 2, 2, 2]]
+    predictions = Predictions(SET.labels, subject, window=truth, truth=truth, probabilities=read, **plain)
+    people = np.array(["P1", "P2"])
+    alone = merging._scored(predictions, people, tuple((k,) for k in range(6)))
+    assert (alone["classes"], alone["largest"], alone["merged"]) == (6, 0.75, [])
+    assert alone["scores"]["accuracy"]["mean"] == 0.5
+    taps = merging._scored(predictions, people, SET.groups_of(SET.merged_by("family")))
+    assert (taps["classes"], taps["largest"], taps["merged"]) == (5, 1.0, [["Tap 1", "Tap 2"]])
+    assert taps["scores"]["accuracy"]["mean"] == 1.0
+    assert list(merging._named(SET, None)) == ["family", "affect"], "plush-13 merges nothing of these"
 
 
 def test_a_merged_set_is_trained_scored_and_exported(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
@@ -89,6 +107,20 @@ def test_a_merged_set_is_trained_scored_and_exported(cli: Cli, dataset: Dataset,
     streams = cli("stream-eval", dataset.path, "--model", bundle, "--subjects", "P1", "--json")
     assert streams.status == 0, streams.err
     assert cli("export", bundle, tmp_path / "C").status == 0
+
+    # A merge named beforehand is scored beside those of the data; sweeps take it as classes, too.
+    text = file.read_text(encoding="utf-8")
+    named = cli("merge", dataset.path, tmp_path / "E", "--groups", file, "--out", tmp_path / "n.toml", "--json").json
+    (scored,) = named["groupings"]
+    step = next(step for step in steps if step["merges"] == 1)
+    assert (scored["name"], scored["classes"], scored["scores"]) == (str(file), 2, step["scores"])
+    assert (tmp_path / "n.toml").read_text(encoding="utf-8") == text
+    network = ("--architectures", "9", "--filters", "2", "--epochs", "1", "--batches", "4", "--workers", "1")
+    swept = cli("sweep", dataset.path, *network, "--classes", file, "--json")
+    assert swept.status == 0 and tuple(swept.json["labels"]) == merged.labels, swept.err
+    nothing = cli("merge", dataset.path, tmp_path / "E", "--groups", "plush-13", "--out", tmp_path / "no.toml")
+    assert nothing.status == 2 and "'plush-13' merges none of the 3 gestures of the evaluation" in nothing.err
+    assert "have no affect" in cli("train", dataset.path, "--classes", "affect", "--out", tmp_path / "x.plush").err
 
     wrong = cli("merge", dataset.path, tmp_path / "E", "--merges", "7", "--out", tmp_path / "no.toml")
     assert wrong.status == 2 and "merges is 7: accepted are 1 to 1" in wrong.err

@@ -6,7 +6,7 @@ import csv
 import json
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ import pytest
 
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.experiments.sweep import figures as sweep_figures
+from plushsense.experiments.sweep import report as sweep_report
 from plushsense.experiments.sweep import tables as sweep_tables
 from plushsense.experiments.sweep.report import confusion_words, sections_of, write_sweep_report
 from plushsense.experiments.sweep.results import read_sweep
@@ -144,11 +145,33 @@ def test_table4_has_maxima_means_and_the_papers_row(tmp_path):
     assert (first["accuracy"], first["mean_accuracy"], first["trials"]) == (0.8, pytest.approx(0.6), 3)
     assert first["acr"] == pytest.approx(0.8 / math.log10(13262)) and first["macro_f1"] == pytest.approx(0.7)
     assert (first["paper_accuracy"], first["paper_mean"], first["paper_acr"]) == (0.75, 0.657, 0.182)
+    assert (first["paper_parameters"], first["paper_split"]) == ("13.2k", "recordings:holdout")
     assert [r["paper_accuracy"] for r in table.rows[1:]] == [None] * 3
+    papers = [i for i, c in enumerate(table.columns) if c.key.startswith("paper_")]
+    assert [[row[i] for i in papers] for row in table.cells()[1:]] == [["—"] * 5] * 3, "not printed there: a dash"
+    assert "recordings:holdout" in " ".join(table.notes) and "75.0 %" in " ".join(table.notes)
     assert [r["above"] for r in table.rows] == ["yes", "no", "no", "no"], "0.70 is not above 70 %"
     assert [r["above"] for r in sweep_tables.table4(sweep, threshold=0.2).rows] == ["yes"] * 4
     assert len(sweep_tables.table4(sweep, top=1).rows) == 2
     assert "1 of 4 scored networks" in " ".join(table.notes)
+
+
+def test_table4_has_every_network_that_the_paper_printed(whole):
+    """Also those that are not among the best of their size class; Figure 9 has only the best."""
+    sweep = read_sweep(whole)
+    table = sweep_tables.table4(sweep)
+    printed = {(r["arch"], r["filters"]): r for r in table.rows if r["paper_accuracy"] is not None}
+    assert set(printed) == set(sweep_tables.TABLE4)
+    assert {key: (r["paper_accuracy"], r["paper_mean"], r["paper_acr"]) for key, r in printed.items()} == {
+        key: (row.highest, row.mean, row.acr) for key, row in sweep_tables.TABLE4.items()
+    }
+    best = sweep_tables.top_rows(table)
+    assert len(best) == 12 and all(r["rank"] <= 3 or r["paper_accuracy"] for r in table.rows)
+    figure = sweep_figures.size_and_accuracy(sweep)
+    assert sum(len(line.get_xdata()) for line in figure.axes[0].lines) == 12
+    with_split = sweep_tables.table4(replace(sweep, head={**sweep.head, "split": "recordings:holdout"}))
+    assert "This sweep has that split." in " ".join(with_split.notes)
+    assert "This sweep has that split." not in " ".join(table.notes)
 
 
 def test_architectures_over_all_and_over_one_filter_set(tmp_path):
@@ -215,6 +238,31 @@ def test_the_confusion_is_by_affect_and_counted(tmp_path):
     assert {"positive", "neutral", "negative"} <= {t.get_text() for t in figure.axes[0].texts}
 
 
+def test_the_confusions_of_every_kept_network_are_files(tmp_path, monkeypatch):
+    two = {"archs": ("19d1_19d2_19d4_17d8", "14d1_39d2_41d4"), "filter_sets": ((4, 6, 8, 8), (8, 12, 16, 16))}
+    folder = make_sweep(tmp_path / "S", **{**ONE, **two})
+    head = json.loads((folder / "sweep.json").read_text())
+    kept = [t["trial"] for t in read_sweep(folder).trials]
+    head["confusions"] = {trial: [[9, 1, 0], [i, 8, 1], [0, 0, 7]] for i, trial in enumerate(kept)}
+    head["predictions"] = {trial: f"predictions-{trial}.parquet" for trial in kept}
+    (folder / "sweep.json").write_text(json.dumps(head))
+    sweep = read_sweep(folder)
+    monkeypatch.setattr(sweep_report, "_MATRICES", 2)
+    section = sweep_report._confusions(sweep, [t for t in (sweep.chosen, sweep.second) if t])
+    drawn = [d.name for d in (*section.drawings, *section.more_drawings)]
+    assert drawn[0].startswith("figure-10-confusion-14d1_39d2_41d4-8-12-16-")
+    assert drawn[1].startswith("figure-11-confusion-19d1_19d2_19d4_17d8-4-6-8-8-")
+    assert {name.split("-")[-1] for name in drawn} == set(kept) and len(section.drawings) == 2
+    assert section.dropped[-1] == "2 more confusion matrices are in the files only, with their tables."
+    assert "As the paper's Figure 10" in section.drawings[0].alt
+    assert section.drawings[0].figure.axes[0].get_title().startswith("As the paper's Figure 10: confusions of\n14d1")
+    counts = {t.name: t for t in section.files}
+    for name in drawn:
+        assert [list(row.values())[1:] for row in counts[name].rows] == head["confusions"][name.split("-")[-1]]
+    lone = sweep_report._confusions(read_sweep(make_sweep(tmp_path / "T", **ONE)), [])
+    assert "No trial of 19d1_19d2_19d4_17d8 4/6/8/8, the network of Figure 11, is done here." in lone.dropped
+
+
 def test_a_nested_training_is_cut_at_the_trials_epochs(whole):
     sweep = read_sweep(whole)
     trial = next(t for t in sweep.trials if t["epochs"] == 25)
@@ -238,6 +286,8 @@ def test_the_page_is_complete_marked_and_beside_its_files(tmp_path):
     assert len(scores) > 10 and all("LEAKY" in h and "SIMULATION" in h for h in scores)
     names = {f.name for f in made.files}
     assert {"table-3.csv", "table-4.csv", "acr.csv", "effect.csv", "pareto.csv"} <= names
+    assert "figure-7-and-8-architectures.csv" in names
+    assert {Path(n).suffix for n in names if n.startswith("figure-10-confusion-")} == {".csv", ".png", ".svg"}
     for figure in (
         "figure-7-architectures",
         "figure-8-filter-sets",

@@ -10,6 +10,7 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import polars
@@ -19,9 +20,11 @@ from polars.testing import assert_frame_equal
 from plushsense.core.errors import ConfigError, DivergedError, TrainingError
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
+from plushsense.evaluation.scores import read_predictions
 from plushsense.experiments.sweep.run import sweep
 from plushsense.jobs.journal import UNFINISHED
 from plushsense.jobs.progress import JobProgress
+from plushsense.scoring.metrics import confusion
 from plushsense.trials import tables as sweep_tables
 from plushsense.trials.plan import JOURNAL
 from plushsense.trials.tables import TRIAL_COLUMNS, TrialColumn
@@ -33,6 +36,7 @@ SMALL: dict[str, Any] = {
     "classes": "shared",
     "workers": 1,
 }
+CHOSEN_ARCH, SECOND_ARCH = ("14d1_39d2_41d4", (8, 12, 16)), ("19d1_19d2_19d4_17d8", (4, 6, 8, 8))
 SCORES = ["accuracy", "macro_f1", "validation_accuracy", "validation_macro_f1", "train_loss", "acr"]
 COMMAND = [sys.executable, "-m", "plushsense", "sweep"]
 
@@ -90,13 +94,56 @@ def test_the_folder_holds_what_it_promises(dataset: Dataset, tmp_path: Path) -> 
     assert summary["best"][0]["accuracy"] == trials["accuracy"].max()
     assert not summary["leaky"] and not summary["simulated"]
     tested = sum(len(fold) for fold in _tested(dataset))
-    for confusion in summary["confusions"].values():
-        assert sum(map(sum, confusion)) == 2 * tested, "two seeds, each window once a seed"
+    for counts in summary["confusions"].values():
+        assert sum(map(sum, counts)) == 2 * tested, "two seeds, each window once a seed"
     for rows in summary["per_class"].values():
         assert [row["label"] for row in rows] == summary["labels"]
     assert (seen[-1].done, seen[-1].total) == (16, 16) and seen[-1].share == pytest.approx(1.0)
     assert "8 of 8 trials" in repr(found) and "<table>" in found._repr_html_()
     assert_frame_equal(found.trials, trials)
+
+
+def test_predictions_are_kept_of_the_networks_that_were_asked_for(cli: Any, dataset: Dataset, tmp_path: Path) -> None:
+    words = ("--architectures", "9,5_5d2", "--filters", "2/2,3/3", "--epochs", "1,2", "--batches", "4")
+    words = ("sweep", dataset.path, *words, "--classes", "shared", "--workers", "1", "--out", tmp_path / "o", "--json")
+
+    def files() -> set[str]:
+        return {path.name for path in (tmp_path / "o").glob("predictions*")}
+
+    kept = cli(*words, "--keep-predictions", "all").json
+    best = {"predictions.parquet"}
+    assert len(files()) == 4 == len(kept["predictions"]) and set(kept["predictions"].values()) == files() > best
+    assert kept["predictions"][kept["best"][0]["trial"]] == "predictions.parquet"
+    assert set(kept["predictions"]) <= set(kept["confusions"])
+    for trial, name in kept["predictions"].items():
+        stored = read_predictions(tmp_path / "o" / name)
+        counts = confusion(stored.truth, stored.predicted, len(stored.labels))
+        assert counts.tolist() == kept["confusions"][trial], "the file is of this trial"
+    # Nothing is trained again, and what is not kept any more is removed.
+    again = cli(*words, "--keep-predictions", "5d1_5d2:2/2").json
+    assert again["trainings_resumed"] == again["trainings"] and files() <= best | {"predictions-5d1_5d2-2-2.parquet"}
+    assert len(files()) == (2 if again["best"][0]["filters"] != "2/2" else 1)
+    assert cli(*words).status == 0 and files() == best, "the paper's networks are not in this grid"
+    wrong = cli(*words, "--keep-predictions", "5_5d3")
+    assert wrong.status == 2 and "Predictions of '5_5d3' cannot be kept: accepted are chosen, best, all" in wrong.err
+    assert "5d1_5d2" in wrong.err and files() == best
+
+
+def test_the_papers_two_networks_are_kept_and_earlier_folders_read() -> None:
+    def planned(symbol: str, filters: tuple[int, ...]) -> Any:
+        return SimpleNamespace(trial=SimpleNamespace(arch=SimpleNamespace(symbol=symbol, filters=filters)))
+
+    grid: Any = SimpleNamespace(
+        trials=[planned(*CHOSEN_ARCH), planned("14d1_39d2_41d4", (4, 6, 8)), planned(*SECOND_ARCH), planned("9", (4,))]
+    )
+    papers = {("14d1_39d2_41d4", "8/12/16"), ("19d1_19d2_19d4_17d8", "4/6/8/8")}
+    assert sweep_tables.networks_to_keep(grid, "chosen") == papers
+    assert sweep_tables.networks_to_keep(grid, "best") == frozenset()
+    assert sweep_tables.networks_to_keep(grid, "chosen, 9") == papers | {("9", "4")}
+    both = {("14d1_39d2_41d4", "8/12/16"), ("14d1_39d2_41d4", "4/6/8")}
+    assert sweep_tables.networks_to_keep(grid, "14_39d2_41d4") == both
+    assert sweep_tables.prediction_files({"predicted": "a"}) == {"a": "predictions.parquet"}
+    assert sweep_tables.prediction_files({"predicted": None}) == sweep_tables.prediction_files({}) == {}
 
 
 def _tested(dataset: Dataset) -> list[Any]:

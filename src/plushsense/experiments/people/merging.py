@@ -1,8 +1,9 @@
-"""Propose merges of gestures that a network confuses, within one affect (paper, sections 4.3 and 4.4).
+"""Propose merges of gestures that a network confuses, within one affect, and score merges that are named beforehand.
 
-The confusion is taken person by person, so that a few people with many windows do not decide, and nothing is trained:
-the probabilities of merged gestures are added. Merges that are chosen and scored on the same people look too good, so
-the scores are also given with the merges of each person chosen on all other people.
+The paper suggests both for future trainings (sections 4.3 and 4.4), and does neither. The confusion is taken person by
+person, so that a few people with many windows do not decide, and nothing is trained: the probabilities of merged
+gestures are added. Merges that are chosen and scored on the same people look too good, so the scores are also given
+with the merges of each person chosen on all other people.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.files import write_file
-from plushsense.core.gestures import NOBODY, Gesture, GestureSet
+from plushsense.core.gestures import AFFECT, NOBODY, Gesture, GestureSet, merge_names
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.scores import Predictions, read_predictions
@@ -38,6 +39,7 @@ def propose_merges(
     evaluation: str | os.PathLike[str],
     *,
     merges: int | None = None,
+    groups: str | None = None,
     out: str | os.PathLike[str] | None = None,
 ) -> dict[str, Any]:
     """Merge the two groups of gestures that people's windows are most confused between, again and again.
@@ -48,16 +50,22 @@ def propose_merges(
     Args:
         evaluation: a folder that `evaluate` wrote, of gestures of ``dataset``.
         merges: how many merges the gesture set in ``out`` has.
+        groups: the merged gestures to write instead: "family", "affect", a built-in merge, or a file, which is scored
+            as well (see `GestureSet.merged_by`).
         out: a TOML file to write, for ``--classes`` of `train` and `evaluate`.
 
     Returns:
         ``steps``, one for each number of merges from 0: {merges, classes, merged (labels), confusion, people, largest,
         scores, crossfitted}. ``confusion`` is the mean over people of the share of windows that the two groups of the
-        last merge exchanged, in ``people`` of them; ``largest`` the share of the most frequent class; ``scores`` and
-        ``crossfitted`` hold the summary of each metric over people, with merges chosen on all people and on the others.
+        last merge exchanged, in ``people`` of them; ``largest`` the share of the most frequent class in the windows of
+        people; ``scores`` and ``crossfitted`` hold the summary of each metric over people, with merges chosen on all
+        people and on the others.
+        ``groupings``, one for each merge named beforehand that applies: {name, classes, merged, largest, scores};
+        nothing is chosen, so that nothing needs to be cross-fitted.
 
     Raises:
-        BadInput: for an evaluation of other gestures; ConfigError: for a number of merges that is not possible.
+        BadInput: for an evaluation of other gestures; GestureError: for unknown ``groups``; ConfigError: for a number
+            of merges that is not possible, or ``groups`` that merge nothing.
     """
     folder = Path(evaluation)
     table, predictions = load_evaluation(folder), read_predictions(folder / PREDICTIONS)
@@ -70,23 +78,23 @@ def propose_merges(
     # Without a person, another order of merges may follow, of another length.
     others = [merge_path(np.delete(counts, i, axis=0), gestures) for i in range(len(people))]
     steps = []
-    for number, (groups, exchanged, confused) in enumerate(path):
+    for number, (merged, exchanged, confused) in enumerate(path):
         chosen = [other[min(number, len(other) - 1)][0] for other in others]
-        sizes = np.array([np.isin(predictions.truth, group).sum() for group in groups])
         steps.append(
             {
                 "merges": number,
-                "classes": len(groups),
-                "merged": [[predictions.labels[k] for k in group] for group in groups if len(group) > 1],
+                **_scored(predictions, people, merged),
                 "confusion": exchanged,
                 "people": confused,
-                "largest": float(sizes.max() / sizes.sum()),
-                "scores": _scores(predictions, people, lambda _, groups=groups: groups),  # type: ignore[misc]
                 "crossfitted": _scores(predictions, people, lambda i, chosen=chosen: chosen[i]),  # type: ignore[misc]
             }
         )
+    named = _named(gestures, groups)
     result = {
         "steps": steps,
+        "groupings": [
+            {"name": name, **_scored(predictions, people, gestures.groups_of(merged))} for name, merged in named.items()
+        ],
         "split": table["split"],
         "leaky": table["leaky"],
         "simulated": table["simulated"],
@@ -94,12 +102,44 @@ def propose_merges(
         "gestures": None,
     }
     if out is not None:
-        if merges is None or not 0 < merges < len(path):
+        if groups is not None:
+            merged_set = named[groups]
+        elif merges is not None and 0 < merges < len(path):
+            merged_set = gestures.merged(path[merges][0])
+        else:
             raise ConfigError(f"merges is {merges}: accepted are 1 to {len(path) - 1}, the steps that are possible.")
-        merged = merged_set(gestures, path[merges][0])
-        write_file(Path(out), tomli_w.dumps(_without_defaults(merged)))
+        write_file(Path(out), tomli_w.dumps(_without_defaults(merged_set)))
         result["gestures"] = str(out)
     return result
+
+
+def _named(gestures: GestureSet, groups: str | None) -> dict[str, GestureSet]:
+    """Return the merges named beforehand that merge some of the gestures, and ``groups``, which must be one of them."""
+    found = {}
+    for name in dict.fromkeys((*merge_names(), *([] if groups is None else [groups]))):
+        if name == AFFECT != groups and not gestures.has_affect:
+            continue
+        merged = gestures.merged_by(name)
+        if 1 < len(gestures.groups_of(merged)) < len(gestures):
+            found[name] = merged
+    if groups is not None and groups not in found:
+        raise ConfigError(
+            f"'{groups}' merges none of the {len(gestures)} gestures of the evaluation, or all of them to one: "
+            f"{', '.join(gestures.labels)}."
+        )
+    return found
+
+
+def _scored(predictions: Predictions, people: NDArray[np.str_], groups: Groups) -> dict[str, Any]:
+    # Like the scores, of people only: recordings at rest would often be the largest class.
+    truth = predictions.truth[np.isin(predictions.subject, people)]
+    sizes = np.array([np.isin(truth, group).sum() for group in groups])
+    return {
+        "classes": len(groups),
+        "merged": [[predictions.labels[k] for k in group] for group in groups if len(group) > 1],
+        "largest": float(sizes.max() / sizes.sum()),
+        "scores": _scores(predictions, people, lambda _: groups),
+    }
 
 
 def merge_path(counts: NDArray[np.int64], gestures: GestureSet) -> list[tuple[Groups, float | None, int | None]]:
@@ -128,34 +168,6 @@ def merge_path(counts: NDArray[np.int64], gestures: GestureSet) -> list[tuple[Gr
         groups = tuple(sorted([g for i, g in enumerate(groups) if i not in (a, b)] + [joined]))
         path.append((groups, mean, people))
     return path
-
-
-def merged_set(gestures: GestureSet, groups: Groups) -> GestureSet:
-    """Return the gesture set in which the gestures of each group are one.
-
-    It has the label of their family if it is the whole family, otherwise the labels of its members joined by "+".
-    """
-    made = []
-    for group in groups:
-        members = [gestures.gestures[k] for k in group]
-        first = members[0]
-        if len(members) == 1:
-            made.append(first)
-            continue
-        family = {g.label for g in gestures.gestures if g.family == first.family}
-        whole = family == {g.label for g in members}
-        label = first.family if whole else " + ".join(g.label for g in members)
-        made.append(
-            Gesture(
-                label,
-                first.affect,
-                family=label,
-                energetic=all(g.energetic for g in members),
-                description="; ".join(g.description for g in members if g.description),
-                labels=tuple(name for g in members for name in (g.label, *g.labels) if name != label),
-            )
-        )
-    return GestureSet(f"{gestures.name}, {len(groups)} classes", tuple(made))
 
 
 def _gestures_of(dataset: Dataset, labels: Sequence[str]) -> GestureSet:

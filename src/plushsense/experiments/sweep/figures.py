@@ -20,10 +20,12 @@ from plushsense.experiments.sweep.tables import (
     epochs,
     pareto_points,
     table4,
+    top_rows,
 )
 from plushsense.reports import figures
 from plushsense.reports.table import Row, count
 from plushsense.reports.wording import describe_runs
+from plushsense.trials.grid import CHOSEN, SECOND
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,9 +46,13 @@ CLASSES = (
 _STYLES = ("-", "--", ":", "-.")
 BARS = 30
 """Largest number of architectures in a bar chart; of more only the best are drawn, so that it stays legible."""
+_BAR_WITH_VALUE = 10.0
 _LETTERS_AN_INCH = 13
 _NARROWEST_IN = 5.2
 _RANKED = 15
+LIKE = "As the paper's Figure {}"
+PAPER_CONFUSIONS = {CHOSEN: 10, SECOND: 11}
+"""The figures of the paper that show the confusions of these networks (symbol, filters)."""
 NAMED = 14
 """Largest number of points of a Pareto front that are labelled."""
 
@@ -88,7 +94,8 @@ def score_label(sweep: SweepResults, measure: str) -> str:
 def by_architecture(sweep: SweepResults) -> Figure:
     """Draw the paper's Figure 7: highest and mean accuracy of each architecture, and its size with the most filters."""
     rows = _bars(architectures(sweep))
-    figure = _figure(sweep, 9.2, 1.9 + 0.42 * len(rows), "Accuracy of each architecture, and its size")
+    title = f"{LIKE.format(7)}: accuracy of each architecture, and its size"
+    figure = _figure(sweep, 9.2, 1.9 + 0.42 * len(rows), title)
     axes = figure.add_subplot()
     _accuracy_bars(axes, rows, "epochs, batch and filters")
     axes.set_xlabel(score_label(sweep, "Accuracy (% of test windows)"), fontsize=9)
@@ -109,9 +116,8 @@ def by_filters(sweep: SweepResults) -> Figure:
     sets = sweep.filter_sets[::-1]
     names = [row["arch"] for row in _bars(architectures(sweep))]
     rows_of_panels = -(-len(sets) // 2)
-    figure = _figure(
-        sweep, 9.6, 1.2 + rows_of_panels * (1.0 + 0.33 * len(names)), "Accuracy of each architecture by filter set"
-    )
+    title = f"{LIKE.format(8)}: accuracy of each architecture by filter set"
+    figure = _figure(sweep, 9.6, 1.2 + rows_of_panels * (1.0 + 0.33 * len(names)), title)
     panels = figure.subplots(rows_of_panels, 2, sharex=True, squeeze=False).flatten()
     for i, (axes, filter_set) in enumerate(zip(panels, sets, strict=False)):
         by_name = {row["arch"]: row for row in architectures(sweep, filter_set)}
@@ -120,6 +126,7 @@ def by_filters(sweep: SweepResults) -> Figure:
         _accuracy_bars(axes, rows, "epochs and batch")
         axes.set_title(f"({chr(97 + i % 26)})  [{filter_set.replace('/', ' ')}]", fontsize=9.5, loc="left")
         axes.set_xlabel(score_label(sweep, "Accuracy (% of test windows)"), fontsize=8.5)
+        axes.tick_params(labelbottom=True)
         if i % 2:
             axes.set_yticklabels([])
     for axes in panels[len(sets) :]:
@@ -147,7 +154,9 @@ def _accuracy_bars(axes: Axes, rows: Sequence[Row], over: str) -> None:
         axes.errorbar(mean[some], rows_at, xerr=sd[some], fmt="none", ecolor="#333333", elinewidth=0.9, capsize=1.8)
     for y, value in enumerate(high):
         if np.isfinite(value):
-            axes.text(1.2, y - 0.19, f"{value:.1f}", va="center", fontsize=7.5, color="white")
+            # Write the value inside a bar that is long enough.
+            at_x, ink = (1.2, "white") if value > _BAR_WITH_VALUE else (value + 1.2, "black")
+            axes.text(at_x, y - 0.19, f"{value:.1f}", va="center", fontsize=7.5, color=ink)
         else:
             axes.text(1.2, y, "no trial done", va="center", fontsize=7.5, color="#57606a")
     axes.set_yticks(at, [str(r["arch"]) for r in rows], parse_math=False)
@@ -166,8 +175,8 @@ def _legend(figure: Figure, axes: Axes) -> None:
 
 def size_and_accuracy(sweep: SweepResults) -> Figure:
     """Draw the paper's Figure 9: accuracy against the number of parameters, for the networks of Table 4."""
-    rows = table4(sweep).rows
-    figure = _figure(sweep, 9.2, 5.2, "Accuracy and size of the best of each size class")
+    rows = top_rows(table4(sweep))
+    figure = _figure(sweep, 9.2, 5.2, f"{LIKE.format(9)}: accuracy and size of the best of each size class")
     axes = figure.add_subplot()
     points = []
     for filter_set, (marker, colour) in _by_class(sweep):
@@ -321,7 +330,9 @@ def confusion(sweep: SweepResults, trial: Row) -> Figure | None:
     order = affect_order(sweep.affects)
     labels, affects = [sweep.labels[i] for i in order], [sweep.affects[i] for i in order]
     table = np.asarray(counts)[np.ix_(order, order)]
-    figure = figures.confusion(labels, table, title=f"Confusions of {name_of(trial).replace(', ', chr(10), 1)}")
+    number = PAPER_CONFUSIONS.get((trial["arch"], trial["filters"]))
+    title = f"{LIKE.format(number)}: confusions of" if number else "Confusions of"
+    figure = figures.confusion(labels, table, title=f"{title}\n{name_of(trial)}")
     figure.set_figwidth(max(figure.get_figwidth(), _NARROWEST_IN))
     axes = figure.axes[0]
     rectangle = need("matplotlib.patches", "reports").Rectangle

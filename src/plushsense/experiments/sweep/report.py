@@ -12,13 +12,12 @@ import numpy as np
 
 from plushsense.experiments.sweep import figures as draw
 from plushsense.experiments.sweep import tables
-from plushsense.experiments.sweep.results import SweepResults, name_of, read_sweep
+from plushsense.experiments.sweep.results import SweepResults, file_name_of, name_of, read_sweep
 from plushsense.reports import wording
 from plushsense.reports.figures import png, svg, svg_uri
 from plushsense.reports.page import check_page_path, earlier_files, render_page, write_files, write_page
 from plushsense.reports.table import DASH, Row, Table, count, number, text
 from plushsense.scoring.metrics import grouped
-from plushsense.trials.grid import SECOND
 from plushsense.trials.tables import SUMMARY
 
 if TYPE_CHECKING:
@@ -36,7 +35,10 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the page: tables, figures, and in ``dropped`` sentences on what is left out, and why."""
+    """A section of the page: tables, figures, and in ``dropped`` sentences on what is left out, and why.
+
+    ``files`` and ``more_drawings`` are written as files only.
+    """
 
     key: str
     title: str
@@ -44,19 +46,21 @@ class Section:
     drawings: tuple[Drawing, ...] = ()
     dropped: tuple[str, ...] = ()
     scores: bool = True
+    files: tuple[Table, ...] = ()
+    more_drawings: tuple[Drawing, ...] = ()
 
 
 def sections_of(sweep: SweepResults) -> Iterator[Section]:
     """Yield the sections of the report in the paper's order; without any finished trial, only those without scores."""
     if not sweep.done:
         yield Section("best", "The best trials", dropped=("No trial is done yet: there is no score to show.",))
-        yield Section("table-3", "Table 3: parameters", (tables.table3(sweep),), scores=False)
+        yield _parameters(sweep)
         return
     best = sweep.best
     assert best is not None
     yield Section("best", "The best trials", (tables.best_trials(sweep),))
     yield _overview(sweep)
-    yield Section("table-3", "Table 3: parameters", (tables.table3(sweep),), scores=False)
+    yield _parameters(sweep)
     yield _by_filters(sweep)
     yield _top(sweep)
     yield Section("acr", "ACR ranking", (tables.acr_ranking(sweep),), (_acr(sweep),))
@@ -67,16 +71,20 @@ def sections_of(sweep: SweepResults) -> Iterator[Section]:
     yield _fronts(sweep)
 
 
+def _parameters(sweep: SweepResults) -> Section:
+    return Section("table-3", "Parameters (the paper's Table 3)", (tables.table3(sweep),), scores=False)
+
+
 def _overview(sweep: SweepResults) -> Section:
     rows = sorted(tables.architectures(sweep), key=lambda r: -(r["highest"] or 0.0))
     alt = (
         f"Bars: highest and mean accuracy of {len(rows)} architectures. The first: {_bar_words(rows[:3])}. "
-        "Diamonds: parameters."
+        f"Diamonds: parameters. {draw.LIKE.format(7)}."
     )
     dropped = _only_best(len(rows))
     return Section(
         "figure-7",
-        "Figure 7: accuracy of each architecture",
+        "Accuracy of each architecture (the paper's Figure 7)",
         (tables.architecture_table(sweep),),
         (Drawing("figure-7-architectures", draw.by_architecture(sweep), alt),),
         dropped,
@@ -84,7 +92,7 @@ def _overview(sweep: SweepResults) -> Section:
 
 
 def _by_filters(sweep: SweepResults) -> Section:
-    title = "Figure 8: accuracy by filter set"
+    title = "Accuracy by filter set (the paper's Figure 8)"
     if len(sweep.filter_sets) < 2:
         return Section("figure-8", title, dropped=("There is one filter set only: it would be Figure 7 again.",))
     best = []
@@ -92,6 +100,7 @@ def _by_filters(sweep: SweepResults) -> Section:
         rows = sorted(tables.architectures(sweep, filter_set), key=lambda r: -(r["highest"] or 0.0))
         best.append(f"{filter_set}: {_bar_words(rows[:1])}")
     alt = f"A panel of bars a filter set: highest and mean accuracy of each architecture. The best: {'; '.join(best)}."
+    alt += f" {draw.LIKE.format(8)}."
     drawing = Drawing("figure-8-filter-sets", draw.by_filters(sweep), alt)
     return Section("figure-8", title, drawings=(drawing,), dropped=_only_best(len(sweep.archs)))
 
@@ -113,7 +122,7 @@ def _bar_words(rows: Sequence[Row]) -> str:
 
 def _top(sweep: SweepResults) -> Section:
     table = tables.table4(sweep)
-    title = "Table 4 and Figure 9: the best of each size class"
+    title = "The best of each size class (the paper's Table 4 and Figure 9)"
     if len(table.rows) < 2:
         return Section(
             "table-4", title, (table,), dropped=("One network only is scored: Figure 9 would be one point.",)
@@ -121,7 +130,10 @@ def _top(sweep: SweepResults) -> Section:
     first = ", ".join(
         f"{r['arch']} {r['filters']} {100 * r['accuracy']:.1f} % at {count(r['parameters'])}" for r in table.rows[:3]
     )
-    alt = f"Points: accuracy against parameters of {len(table.rows)} networks. The most accurate: {first} parameters."
+    alt = (
+        f"Points: accuracy against parameters of {len(tables.top_rows(table))} networks. The most accurate: {first} "
+        f"parameters. {draw.LIKE.format(9)}."
+    )
     return Section("table-4", title, (table,), (Drawing("figure-9-size", draw.size_and_accuracy(sweep), alt),))
 
 
@@ -151,26 +163,46 @@ def _effect(sweep: SweepResults) -> Section:
 
 
 def _looked_at(sweep: SweepResults, best: Row) -> list[Row]:
-    """Return the trials to show with confusions and curves: the best, and the paper's two networks if in the grid."""
-    candidates = [sweep.chosen, sweep.best_of(*SECOND), best]
+    """Return the trials to show with confusions and curves: the paper's two networks if in the grid, and the best."""
+    candidates = [sweep.chosen, sweep.second, best]
     return list({t["trial"]: t for t in candidates if t}.values())
 
 
+_MATRICES = 12
+"""Largest number of confusion matrices on the page; all are files."""
+
+
 def _confusions(sweep: SweepResults, trials: Sequence[Row]) -> Section:
-    title = "Figures 10 and 11: confusions"
+    title = "Confusions (the paper's Figures 10 and 11)"
     if len(sweep.labels) < 2:
         return Section("confusion", title, dropped=("The sweep names no classes: there is nothing to confuse.",))
-    drawings, by_gesture, dropped = [], [], []
-    for trial in trials:
+    drawings, by_gesture, counts, dropped = [], [], [], []
+    for network, figure_number in draw.PAPER_CONFUSIONS.items():
+        if sweep.best_of(*network) is None:
+            dropped.append(f"No trial of {' '.join(network)}, the network of Figure {figure_number}, is done here.")
+    for trial in {t["trial"]: t for t in (*trials, *sweep.kept)}.values():
         figure = draw.confusion(sweep, trial)
         if figure is None:
             dropped.append(f"The confusions of {name_of(trial)} were not kept.")
             continue
-        drawings.append(Drawing(f"confusion-{_file_name(trial)}", figure, confusion_words(sweep, trial)))
+        number = draw.PAPER_CONFUSIONS.get((trial["arch"], trial["filters"]))
+        name = f"{f'figure-{number}-' if number else ''}confusion-{file_name_of(trial)}"
+        drawings.append(Drawing(name, figure, confusion_words(sweep, trial)))
         by_gesture += [table for table in (tables.per_class(sweep, trial),) if table]
+        counts.append(tables.confusion_table(sweep, trial, name))
     if by_gesture and set(sweep.affects) == {"none"}:
         dropped.append("The gestures of this data set have no affect: there are no blocks.")
-    return Section("confusion", title, tuple(by_gesture), tuple(drawings), tuple(dropped))
+    if more := len(drawings[_MATRICES:]):
+        dropped.append(f"{more} more confusion matrices are in the files only, with their tables.")
+    return Section(
+        "confusion",
+        title,
+        tuple(by_gesture[:_MATRICES]),
+        tuple(drawings[:_MATRICES]),
+        tuple(dropped),
+        files=(*counts, *by_gesture[_MATRICES:]),
+        more_drawings=tuple(drawings[_MATRICES:]),
+    )
 
 
 def confusion_words(sweep: SweepResults, trial: Row) -> str:
@@ -190,7 +222,8 @@ def confusion_words(sweep: SweepResults, trial: Row) -> str:
     if wrong.any():
         i, j = np.unravel_index(wrong.argmax(), wrong.shape)
         description += f". Most often mistaken: {sweep.labels[i]} for {sweep.labels[j]} ({wrong[i, j]} windows)"
-    return description + "."
+    number = draw.PAPER_CONFUSIONS.get((trial["arch"], trial["filters"]))
+    return description + (f". {draw.LIKE.format(number)}." if number else ".")
 
 
 def _curves(sweep: SweepResults, trials: Sequence[Row]) -> Section:
@@ -201,7 +234,7 @@ def _curves(sweep: SweepResults, trials: Sequence[Row]) -> Section:
             dropped.append(f"No learning curves of {name_of(trial)} were kept.")
             continue
         alt = f"Learning curves of {name_of(trial)}: loss and accuracy by epoch, training and validation."
-        drawings.append(Drawing(f"curves-{_file_name(trial)}", figure, alt))
+        drawings.append(Drawing(f"curves-{file_name_of(trial)}", figure, alt))
     return Section("curves", "Learning curves", drawings=tuple(drawings), dropped=tuple(dropped))
 
 
@@ -219,10 +252,6 @@ def _fronts(sweep: SweepResults) -> Section:
         alt = f"Points: macro-F1 against {label.lower()} of {len(points)} networks, log scale. On the front: {members}."
         drawings.append(Drawing(f"pareto-{cost.replace('_', '-')}", draw.pareto(sweep, cost), alt))
     return Section("pareto", "Pareto fronts", (tables.pareto(sweep),), tuple(drawings), tuple(dropped))
-
-
-def _file_name(trial: Row) -> str:
-    return f"{trial['arch']}-{str(trial['filters']).replace('/', '-')}-{trial['trial']}"
 
 
 PAGE, FILES = "report.html", "report-files"
@@ -262,7 +291,7 @@ def write_sweep_report(
     beside = target.parent / (FILES if target.name == PAGE else f"{target.stem}-files")
     before = earlier_files(beside)
     sections = list(sections_of(sweep))
-    drawings = [d for section in sections for d in section.drawings]
+    drawings = [d for section in sections for d in (*section.drawings, *section.more_drawings)]
     for d in drawings:
         # Compute the layout once for PNG and SVG.
         d.figure.draw_without_rendering()
@@ -314,12 +343,6 @@ def render(
     )
 
 
-_PAPERS_SPLIT = (
-    "The paper describes a random split of windows (windows:holdout), but the authors' script divides each gesture in "
-    "the order of the files (recordings:holdout). Compare the printed accuracies, such as 75.0 %, with the latter."
-)
-
-
 def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
     """Return grid, data and split as (name, value) pairs."""
     head = sweep.head
@@ -338,7 +361,7 @@ def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
         ("Hash (SHA-256)", text(head.get("dataset_hash"))),
         ("Split", f"{how} (“{head.get('split')}”{', leaky' if sweep.leaky else ''})"),
         ("Who validates", who),
-        *([("Beside the paper", _PAPERS_SPLIT)] if str(head.get("split")).endswith(":holdout") else []),
+        *([("Beside the paper", tables.PAPERS_SPLIT)] if str(head.get("split")).endswith(":holdout") else []),
         ("Windows scored", count(scored) if scored else DASH),
         ("Context", wording.CONTEXT_WORDS.get(str(head.get("context")), text(head.get("context")))),
         ("Training preset", text(head.get("preset"))),
@@ -363,7 +386,15 @@ def _template_values(sweep: SweepResults, section: Section, pictures: Mapping[st
         "scores": section.scores and bool(section.tables or section.drawings),
         "dropped": section.dropped,
         "tables": [replace(table, leaky=sweep.leaky, simulated=sweep.simulated) for table in section.tables],
-        "drawings": [{"src": svg_uri(pictures[d.name]), "alt": d.alt, "name": d.name} for d in section.drawings],
+        "drawings": [
+            {
+                "src": svg_uri(pictures[d.name]),
+                "alt": d.alt,
+                "name": d.name,
+                "csv": any(table.name == d.name for table in section.files),
+            }
+            for d in section.drawings
+        ],
     }
 
 
@@ -374,8 +405,8 @@ def _contents(
     source = {"dataset": sweep.head.get("dataset"), "split": sweep.head.get("split")}
     source |= {"leaky": "yes" if sweep.leaky else "no", "simulated": "yes" if sweep.simulated else "no"}
     for section in sections:
-        for table in section.tables:
+        for table in (*section.tables, *section.files):
             yield f"{table.name}.csv", table.csv(source).encode()
-        for d in section.drawings:
+        for d in (*section.drawings, *section.more_drawings):
             yield f"{d.name}.png", png(d.figure, dpi=_DPI)
             yield f"{d.name}.svg", pictures[d.name]

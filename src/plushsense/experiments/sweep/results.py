@@ -13,8 +13,8 @@ from typing import Any
 
 from plushsense.core.errors import BadInput, need
 from plushsense.reports.table import Row
-from plushsense.trials.grid import CHOSEN
-from plushsense.trials.tables import CURVES, RUNS, SUMMARY, TRIALS
+from plushsense.trials.grid import CHOSEN, SECOND
+from plushsense.trials.tables import CURVES, RUNS, SUMMARY, TRIALS, prediction_files
 
 _NEEDED = ("trial", "arch", "filters", "filter_set", "epochs", "batch_asked", "parameters", "accuracy", "macro_f1")
 
@@ -143,6 +143,17 @@ class SweepResults:
         return max(mine, key=lambda t: float(t["accuracy"])) if mine else None
 
     @property
+    def second(self) -> Row | None:
+        """The trial with the highest accuracy of the other network that the paper shows; None if it has no score."""
+        return self.best_of(*SECOND)
+
+    @property
+    def kept(self) -> list[Row]:
+        """The trials whose predictions were kept, the most accurate first."""
+        files = prediction_files(self.head)
+        return sorted((t for t in self.done if t["trial"] in files), key=lambda t: -float(t["accuracy"]))
+
+    @property
     def best(self) -> Row | None:
         """The trial with the highest test accuracy; of equal ones that of the smallest network."""
         return max(self.done, key=lambda t: (float(t["accuracy"]), -int(t["parameters"])), default=None)
@@ -213,6 +224,11 @@ def schedule(trial: Row) -> str:
 
 def name_of(trial: Row) -> str:
     return f"{trial['arch']} {trial['filters']}, {trial['epochs']} epochs, batch {trial['batch_asked']}"
+
+
+def file_name_of(trial: Row) -> str:
+    """Return the part of file names that identifies a trial and names its network."""
+    return f"{trial['arch']}-{str(trial['filters']).replace('/', '-')}-{trial['trial']}"
 
 
 def spread(values: Sequence[float]) -> float | None:

@@ -27,7 +27,16 @@ from plushsense.reports.table import Table
 from plushsense.trials.estimate import plan_seconds
 from plushsense.trials.grid import GridSpec, load_grid
 from plushsense.trials.plan import GridProblems, Plan, Task, plan, processes, train_all
-from plushsense.trials.tables import RUNS, SUMMARY, TRIALS, Tables, listed_columns, summary_head
+from plushsense.trials.tables import (
+    PAPER_CHOICE,
+    RUNS,
+    SUMMARY,
+    TRIALS,
+    Tables,
+    listed_columns,
+    networks_to_keep,
+    summary_head,
+)
 from plushsense.workflow.preparation import Warn, silent
 from plushsense.workflow.reporting import check_results, journal_of
 
@@ -109,6 +118,7 @@ def sweep(
     overwrite: bool = False,
     workers: int = 0,
     cluster: str | None = None,
+    keep_predictions: str = PAPER_CHOICE,
     progress: Callable[[JobProgress], None] | None = None,
     display: bool = False,
     warn: Warn = silent,
@@ -124,6 +134,7 @@ def sweep(
         out: output folder; see `default_place` for the default.
         workers: number of trainings at a time; 0: as many as the processor cores allow.
         cluster: address of a Ray cluster that trains instead of this machine's processes.
+        keep_predictions: the networks whose predictions and confusions are kept; see `networks_to_keep`.
         progress: called when a training reports an epoch or is done.
         display: show the trainings, the best score so far and the time left on standard error.
         changes: new values of a grid's keys, such as ``split="by-subject:5"`` (the paper's "windows:holdout" is leaky),
@@ -136,8 +147,9 @@ def sweep(
     spec, wrong = load_grid(grid, changes)
     planned = plan(dataset, spec, wrong, warn)
     place = Path(out) if out is not None else default_place(dataset, grid, spec)
+    keep = networks_to_keep(planned, keep_predictions)
     check_results(place, "A sweep", SUMMARY, planned.id, replace=overwrite)
-    tables = Tables(planned, place, summary_head(dataset, planned), writing=dataset.generation.writing)
+    tables = Tables(planned, place, summary_head(dataset, planned), dataset.generation.writing, keep)
     reporter = _reporter(planned, tables, progress)
 
     def done(job: Job, result: Result, resumed: bool) -> None:
@@ -189,6 +201,7 @@ def preview(
     grid: GridSpec | str | os.PathLike[str] = "paper",
     *,
     measure: bool = False,
+    keep_predictions: str = PAPER_CHOICE,
     warn: Warn = silent,
     **changes: Any,
 ) -> dict[str, Any]:
@@ -202,6 +215,7 @@ def preview(
         planned = plan(dataset, spec, wrong, warn)
     except GridProblems as cause:
         return {"name": spec.name, "trials": 0, "problems": list(cause.problems), "grid": spec.to_dict()}
+    networks_to_keep(planned, keep_predictions)
     journal = journal_of(dataset, JOURNAL)
     macs = {job.id: planned.macs(job) for job in planned.jobs}
     total = sum(macs.values())

@@ -23,7 +23,7 @@ from plushsense.scoring import metrics
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace, file_stamps
 from plushsense.trials.tables import SUMMARY as SWEEP
-from plushsense.trials.tables import TRIALS_CSV
+from plushsense.trials.tables import TRIALS_CSV, prediction_files
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.preparation import WHOLE_PEOPLE
 from plushsense.workflow.reporting import LEARNING, PREDICTIONS, SCORES, load_evaluation
@@ -401,8 +401,9 @@ class StoredResults:
             if counts is None:
                 return ResultDetails(row, affects=affects)
             by_gesture = _confusion({"labels": table["labels"], "counts": counts})
-            stored = table.get("predicted") == row.trial and (row.path / PREDICTIONS).is_file()
-            return ResultDetails(row, by_gesture, sum_by_affect(by_gesture, affects), affects, clickable=stored)
+            stored = prediction_files(table).get(row.trial, "")
+            clickable = bool(stored) and (row.path / stored).is_file()
+            return ResultDetails(row, by_gesture, sum_by_affect(by_gesture, affects), affects, clickable=clickable)
         bundle = Bundle.load(row.path)
         affects = {g.label: g.affect for g in bundle.gestures.gestures}
         facts = {**bundle.provenance, "fitted": bundle.decision.get("fitted")}
@@ -432,7 +433,9 @@ class StoredResults:
                 cached = self._read[key] = (stamp, validation_predictions(Bundle.load(row.path), dataset))
             predictions: Predictions = cached[1]
             return predictions
-        stored = self._once(row.path / PREDICTIONS, lambda path, _: read_predictions(path), None, refuse=True)
+        files = prediction_files(read_json(row.path / SWEEP)) if row.kind == TRIAL else {}
+        file = files.get(row.trial, PREDICTIONS)
+        stored = self._once(row.path / file, lambda path, _: read_predictions(path), None, refuse=True)
         assert stored is not None
         return stored
 
