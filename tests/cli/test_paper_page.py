@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.cli.main import main
+from plushsense.deploy.proof.verify import Setting
 from plushsense.studio.app import serve
 from support.archive import make_archive
 
@@ -74,6 +75,7 @@ def run(command: str) -> tuple[int, str]:
 def test_every_command_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     make_archive(tmp_path / "made").rename(tmp_path / "ARCHIVE")
+    monkeypatch.setattr("plushsense.deploy.proof.verify.settings_of", lambda name: [Setting(name, "gcc", "-O2")])
     served: list[object] = []
     monkeypatch.setattr(serve, "run", lambda *given, **options: served.append(given))
     for command in commands():
