@@ -58,6 +58,12 @@ def plain_c_library(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -
 
 
 @pytest.fixture(scope="session")
+def window_libraries(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
+    """The library for window networks, as a PC and as small cores compile it."""
+    return [compiled(c_compiler, tmp_path_factory, "-DPLUSH_WINDOW", *plain) for plain in ((), ("-DPLUSH_PLAIN",))]
+
+
+@pytest.fixture(scope="session")
 def sanitized(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Programs that read a file of cases under the address and undefined-behaviour sanitizers."""
     folder = built_once(tmp_path_factory, "sanitized", lambda draft: _sanitize(c_compiler, draft))

@@ -34,7 +34,11 @@
 extern "C" {
 #endif
 
+#ifdef PLUSH_WINDOW
+#define PLUSH_IMAGE_VERSION 5 /* of window networks, which compute the whole window again at every step */
+#else
 #define PLUSH_IMAGE_VERSION 4
+#endif /* PLUSH_WINDOW */
 #define PLUSH_MAX_LAYERS 4
 #define PLUSH_ONE 32768 /* a confidence or probability of 1 */
 #define PLUSH_NO_GESTURE 255
@@ -111,6 +115,9 @@ typedef struct {
     uint16_t dilation;
     uint16_t newest;        /* row of the newest sample */
     uint16_t phase;         /* the next of tap_sums */
+#ifdef PLUSH_WINDOW
+    uint16_t done;          /* positions of the window that are computed */
+#endif /* PLUSH_WINDOW */
     const uint8_t *scales;  /* of each filter: bias, multiplier, shifts */
     const uint8_t *weights;
     uint8_t *ring;          /* rows x groups x 4 activations */
