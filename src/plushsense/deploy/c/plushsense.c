@@ -660,7 +660,9 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         layer->ring = (uint8_t *)take(memory, &used, (uint32_t)layer->rows * layer->groups * GROUP);
         layer->tap_sums = (uint32_t *)take(memory, &used, UINT32_C(4) * layer->dilation);
     }
+#ifndef PLUSH_WINDOW
     toy->sums = (uint16_t *)take(memory, &used, UINT32_C(2) * toy->features * toy->blocks);
+#endif /* PLUSH_WINDOW */
     toy->total = (uint32_t *)take(memory, &used, 4u * toy->features);
     toy->logits = (int32_t *)take(memory, &used, 4u * toy->classes);
     toy->smooth = (int32_t *)take(memory, &used, 4u * (toy->classes + 1u));
@@ -760,10 +762,12 @@ static uint32_t row_sum(const plush_layer *layer, uint32_t row)
 #ifdef PLUSH_WINDOW
 static uint32_t surplus(plush_layer *layer, taps_on taps)
 {
-    uint32_t *kept = &layer->tap_sums[layer->phase], first = row_under(layer, taps.at, taps.first), sum, n;
+    uint32_t *kept = &layer->tap_sums[layer->phase], first = row_under(layer, taps.at, taps.first), sum = 0;
 
     if (layer->done < layer->dilation) {
-        for (sum = 0, n = layer->kernel; n > 0; n--, go_on(&taps))
+        uint32_t n;
+
+        for (n = layer->kernel; n > 0; n--, go_on(&taps))
             sum += row_sum(layer, row_under(layer, taps.at, taps.first));
     } else {
         sum = *kept + row_sum(layer, row_under(layer, layer->done, taps.first));
@@ -966,7 +970,7 @@ PLUSH_APART
 static void network_sample(plush_toy *toy)
 {
     plush_layer *last = &toy->layer[toy->layers - 1u], *layer = last;
-    uint32_t f, made, needed;
+    uint32_t f;
 
     if (toy->filled + 1u < toy->step || toy->warm + 1u < toy->span)
         return;
@@ -974,9 +978,9 @@ static void network_sample(plush_toy *toy)
     for (f = 0; f < toy->layers; f++)
         toy->layer[f].done = toy->layer[f].phase = 0;
     while (last->done < toy->span) {
-        made = layer == toy->layer ? toy->span : layer[-1].done;
-        needed = layer->done + 1u > layer->rows ? layer->done + 1u : layer->rows;
-        if (made < needed) {
+        uint32_t made = layer == toy->layer ? toy->span : layer[-1].done;
+
+        if (made <= layer->done || made < layer->rows) {
             layer--;
         } else if (layer != last) {
             advance(layer, next_taps(layer, made, toy->span), next_row(layer + 1));
@@ -985,6 +989,8 @@ static void network_sample(plush_toy *toy)
             advance(layer, next_taps(layer, made, toy->span), toy->top);
             for (f = 0; f < toy->features; f++)
                 toy->total[f] += toy->top[f];
+            if (toy->on_position != NULL)
+                toy->on_position(toy, toy->user);
         }
     }
 }

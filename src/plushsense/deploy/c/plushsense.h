@@ -139,6 +139,11 @@ typedef struct plush_toy {
      * (plush_push, plush_silence, plush_restart, plush_begin, plush_swap, plush_patch). A step's event comes before its answer. */
     void (*on_answer)(const struct plush_toy *toy, void *user);
     void (*on_event)(const struct plush_toy *toy, void *user);
+#ifdef PLUSH_WINDOW
+    /* Called many times while a step computes its window, by the same rules; may be NULL. Readings that are due meanwhile
+     * can be taken here and kept with their times, to be pushed when plush_push() has returned. */
+    void (*on_position)(const struct plush_toy *toy, void *user);
+#endif /* PLUSH_WINDOW */
     void *user;
 
     /* The model, as it was read. `channels` and `layout` may be read, too: `layout` stands for the names, units, steps
@@ -188,7 +193,9 @@ typedef struct plush_toy {
     /* Pooling and smoothing. */
     uint16_t filled, block;
     uint8_t *top;            /* the last layer's newest activations */
+#ifndef PLUSH_WINDOW
     uint16_t *sums;          /* blocks x features */
+#endif /* PLUSH_WINDOW */
     uint32_t *total;         /* of each feature: its sum over all blocks */
     uint32_t warm;           /* samples, up to the span */
     uint8_t started;         /* the smoothing has begun */
