@@ -98,6 +98,8 @@ def make_case(
         found = Bundle.load(bundle)
         arch, weights, laid, named, scaler = found.arch, dict(found.weights), found.layout, found.gestures, found.scaler
         refuse_undeployable(arch)
+        if arch.padding != "stream":
+            raise ArchError(f"{arch.title} has the padding '{arch.padding}': the comparison needs 'stream'.")
         smoothing = fixed.smoothing_weight(0.3, arch.step / laid.rate_hz)
     if form == "cheapest":
         form = min(("window", "span"), key=lambda f: macs_of(arch, f))

@@ -500,7 +500,7 @@ def test_each_fold_is_deployed_with_ranges_of_its_own_training_windows(dataset: 
     assert "Deployed in 8 bits" in Path(found["report"]).read_text()
     plain = cli(*words[:-1], "--json").json
     assert "int8" not in plain and plain["accuracy"] == found["accuracy"]
-    assert cli(*words, "--padding", "mirror").status == 2
+    assert cli(*words, "--padding", "causal").status == 2
 
 
 def test_fine_tuning_is_told_from_training(capsys: pytest.CaptureFixture[str]) -> None:

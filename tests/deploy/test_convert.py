@@ -39,7 +39,7 @@ NETS: list[tuple[str, tuple[int, ...], str, dict[str, Any]]] = [
     ("9d1_5d3", (5, 7), "plush-15", {"window": 60, "padding": "causal"}),
     ("9d1_5d3", (5, 7), "accel-3", {"window": 60, "norm": "none"}),
 ]
-DEPLOYABLE = [net for net in NETS if "padding" not in net[3] and net[3].get("norm") != "layer"]
+DEPLOYABLE = [net for net in NETS if net[3].get("padding") != "causal" and net[3].get("norm") != "layer"]
 
 
 def made(net: tuple[str, tuple[int, ...], str, dict[str, Any]], seed: int = 1, **parts: Any) -> Bundle:
@@ -94,6 +94,10 @@ def test_litert_answers_as_the_network(net: Any, tmp_path: Path, litert_here: No
 def test_int8_comes_close_to_the_integers(name: str, net: Any, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     request.getfixturevalue("onnx_here" if name == "onnx-int8" else "litert_here")
     bundle = made(net)
+    if name == "tflite-int8" and bundle.arch.padding == "mirror":
+        with pytest.raises(ArchError, match="take the C of plushsense export, onnx, onnx-int8 or tflite"):
+            convert(bundle, tmp_path / "m", name)
+        return
     integer = integer_network(bundle)
     done = convert(bundle, tmp_path / "m", name)
     raw = others(bundle, 60)
@@ -206,8 +210,8 @@ def test_a_missing_package_says_how_to_install_it(
 def test_int8_refuses_what_has_no_whole_numbers(name: str, tmp_path: Path) -> None:
     with pytest.raises(BundleError, match="holds no calibration"):
         convert(replace(made(NETS[1]), calibration={}), tmp_path / "m", name)
-    with pytest.raises(ArchError, match="padding 'mirror'"):
-        convert(made(NETS[4]), tmp_path / "m", name)
+    with pytest.raises(ArchError, match="padding 'causal'"):
+        convert(made(NETS[-2]), tmp_path / "m", name)
     assert not list(tmp_path.iterdir())
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from plushsense.cli.export import format_profile
 from plushsense.core.errors import BadInput, ProgramError, ToolError
 from plushsense.deploy.emit import TOY_BYTES, read_facts
 from plushsense.deploy.profile import cores, count, estimate, profile
@@ -74,6 +75,25 @@ def test_the_networks_of_the_issue_stay_within_their_limits(
         assert cost.flash_bytes <= flash * 1024
         assert cost.ram_bytes + (cost.stack_push or 0) <= 6 * 1024
     assert all(e.fits == "yes" for e in found.estimates.values())
+
+
+def test_a_window_network_costs_its_window_at_every_step(tmp_path: Path, target_here: Here) -> None:
+    target = target_here("riscv32")
+    folder = exported(tmp_path / "window", bundle_of("accel-3", padding="mirror", window=60, step=20))
+    found = profile(folder, [target])
+    cost, arch = found.costs[target], found.arch
+    assert cost.step is not None and cost.gap is not None and sum(cost.stages.values()) == cost.step
+    assert found.macs_by_layer == {"layer 1": 9 * 3 * 4 * 60, "layer 2": 5 * 4 * 6 * 60, "dense": 18 * 6}
+    assert arch.macs_per_step < cost.stages["network"] < 20 * arch.macs_per_step and cost.stages["pooling"] < 60
+    # It needs more than the frames of the step that it completes.
+    assert cost.stages["network"] < cost.gap < cost.step
+    assert cost.memory_bytes == read_facts(folder)["memory_bytes"] and 0 <= TOY_BYTES - cost.toy_bytes <= 24
+    slow = found.estimates["esp32-c3"]
+    assert slow.high_ms == pytest.approx(cost.step * 2.0 / 160e3 + 60 * cost.flash_bytes / 15e3)
+    assert slow.largest_rate_hz == (1000 / slow.high_ms, 1000 / slow.low_ms)
+    text = "\n".join(format_profile(found))
+    assert "Every step computes 60 samples again, " in text and "largest rate, Hz" in text
+    assert found.to_dict()["decisions_counted"] == 5 and list(found.to_dict()["largest_rate_hz"]) == ["esp32-c3"]
 
 
 def test_a_heap_and_floating_point_are_found(own: Path, target_here: Here) -> None:

@@ -43,17 +43,19 @@ class Reader:
 
 
 @settings(max_examples=25)
-@given(models(longest=300))
+@given(models(longest=300) | models(longest=300, window=True))
 def test_read_back(model: IntegerModel) -> None:
     """By the table of the module's docstring, and by nothing else."""
     image = model.to_bytes()
     network, layout, arch = model.network, model.layout, model.network.arch
     magic, version, zero, length, crc = struct.unpack_from("<4sHHII", image)
-    assert (magic, version, zero, length, crc) == (b"PLSH", 4, 0, len(image), zlib.crc32(image[16:]))
+    window = arch.padding == "mirror"
+    assert (magic, version, zero, length) == (b"PLSH", 5 if window else 4, 0, len(image))
+    assert crc == zlib.crc32(image[16:])
     r = Reader(image[16:])
     head = r.take("BBBBHHIIIIHH")
     assert head[:4] == (len(arch.layers), len(layout.channels), arch.channels, arch.classes)
-    assert head[4:7] == (arch.step, arch.pooled // arch.step, arch.span)
+    assert head[4:7] == (arch.step, 0 if window else arch.pooled // arch.step, arch.span)
     period, gap, units, smoothing, check = head[7:]
     assert period * 1000 == layout.period_us * units
     assert gap == layout.gap_ms * units
@@ -208,6 +210,9 @@ def test_counts_that_do_not_fit_their_bits() -> None:
     made((ConvLayer(2, 1, 1),), classes=255).to_bytes()
     with pytest.raises(BundleError, match="256 gestures: in the toy"):
         made((ConvLayer(2, 1, 1),), classes=256)
+    made((ConvLayer(2, 1, 1),), padding="mirror", window=65535, pool=None).to_bytes()
+    with pytest.raises(BundleError, match="window of 65536 samples: in the toy there may be at most 65535"):
+        made((ConvLayer(2, 1, 1),), padding="mirror", window=65536, pool=None)
     # As many filters as an architecture may have.
     made((ConvLayer(1, 1, 4096), ConvLayer(1, 1, 1))).to_bytes()
 

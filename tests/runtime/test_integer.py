@@ -15,7 +15,7 @@ from plushsense.core.errors import BadInput, BundleError
 from plushsense.models.arch import Arch, ConvLayer
 from plushsense.runtime.image import IntegerModel
 from plushsense.runtime.integer import IntegerLayer, IntegerNetwork
-from support.integers import INT32, any_network, models, plain_model
+from support.integers import INT32, any_network, models, plain_model, window_model
 
 
 def samples_of(model: IntegerModel, n: int, seed: int) -> NDArray[np.int64]:
@@ -36,7 +36,7 @@ def samples_of(model: IntegerModel, n: int, seed: int) -> NDArray[np.int64]:
 
 
 @settings(max_examples=40)
-@given(models(longest=300), st.integers(0, 1 << 30))
+@given(models(longest=300) | models(longest=100, window=True), st.integers(0, 1 << 30))
 def test_a_window_and_a_stream_agree(model: IntegerModel, seed: int) -> None:
     """Whatever the sizes of the pieces in which the stream comes."""
     network, arch, rng = model.network, model.network.arch, np.random.default_rng(seed)
@@ -152,6 +152,11 @@ def test_activations_are_those_of_forward() -> None:
     seen = network.activations(x)
     assert [each.shape[1:] for each in seen] == [(37, 2), (29, 6), (20, 5)]
     assert np.array_equal(network.dense.apply(seen[-1].sum(axis=1).astype(float)), network.forward(x))
+    model = window_model(window=20)
+    x = samples_of(model, 20, 3).T[None]
+    seen = model.network.activations(x)
+    assert [each.shape[1:] for each in seen] == [(20, 2), (20, 6), (20, 5)]
+    assert np.array_equal(model.network.dense.apply(seen[-1].sum(axis=1).astype(float)), model.network.forward(x))
 
 
 def test_no_windows() -> None:

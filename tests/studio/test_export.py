@@ -88,16 +88,16 @@ def test_a_broken_export_is_found(little: Workspace, target_here: Callable[[str]
 
 def test_facts_of_bundles(tmp_path: Path) -> None:
     bundle_of().save(tmp_path / "fine.plush")
-    bundle_of(padding="mirror").save(tmp_path / "mirror.plush")
+    bundle_of(padding="causal").save(tmp_path / "causal.plush")
     (tmp_path / "broken.plush").write_bytes((tmp_path / "fine.plush").read_bytes()[:-9])
-    fine, mirror, broken = (BundleFacts.of(tmp_path / f"{n}.plush") for n in ("fine", "mirror", "broken"))
+    fine, causal, broken = (BundleFacts.of(tmp_path / f"{n}.plush") for n in ("fine", "causal", "broken"))
     assert (fine.problem, fine.cannot, fine.bundle.layout.name, len(fine.bundle.gestures)) == (
         None,
         None,
         "accel-3",
         18,
     )
-    assert "train 5d1_4d3 with --padding stream" in mirror.cannot and mirror.problem is None
+    assert "train 5d1_4d3 with --padding stream" in causal.cannot and causal.problem is None
     assert "bytes are missing at its end" in broken.problem
     assert BundleFacts.of(tmp_path / "none.plush").problem.startswith("There is no bundle")
 

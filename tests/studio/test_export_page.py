@@ -113,20 +113,20 @@ def test_export_verify_and_break(
 
 def test_each_refusal_is_a_sentence(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:
     home = tmp_path / "home"
-    bundle_of(padding="mirror").save(home / "bundles" / "mirror.plush")
+    bundle_of(padding="causal").save(home / "bundles" / "causal.plush")
     bundle_of().save(home / "bundles" / "fine.plush")
     (home / "bundles" / "broken.plush").write_bytes((home / "bundles" / "fine.plush").read_bytes()[:-9])
     (home / "exports" / "taken").mkdir(parents=True)
     url = studio(home=home).url
     browser = look()
-    page = browser.open(f"{url}/export?model={home / 'bundles' / 'mirror.plush'}")
-    assert "padding mirror" in marked(page, "bundle-cannot").inner_text()
-    marked(page, "name").fill("mirror")
+    page = browser.open(f"{url}/export?model={home / 'bundles' / 'causal.plush'}")
+    assert "padding causal" in marked(page, "bundle-cannot").inner_text()
+    marked(page, "name").fill("causal")
     marked(page, "do").click()
     marked(page, "ended").wait_for(timeout=300_000)
-    assert "padding mirror" in marked(page, "ended").inner_text()
+    assert "padding causal" in marked(page, "ended").inner_text()
     assert marked(page, "ended").get_attribute("role") == "alert"
-    assert not (home / "exports" / "mirror").exists()
+    assert not (home / "exports" / "causal").exists()
     assert axe(page) == []
     shots(page, "export-refused")
 

@@ -17,7 +17,7 @@ from plushsense.windows.features import Scaler
 
 
 def bundle_of(**changes: str) -> Bundle:
-    """A little network out of thin air; ``padding="mirror"`` cannot be exported."""
+    """A little network out of thin air; ``padding="causal"`` cannot be exported."""
     arch = Arch.parse("5d1_4d3", "4,6", channels=3, classes=18, window=48, **changes)
     scaler = Scaler(np.array([0.0, 5.0, 10.0]), np.array([0.01, 0.02, 0.03]))
     bundle = Bundle(arch, random_weights(arch, 1), load_layout("accel-3"), scaler, load_gestures("plush-18"))

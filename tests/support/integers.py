@@ -188,13 +188,13 @@ def any_rules(arch: Arch, layout: Layout, rng: np.random.Generator) -> Rules:
 
 
 @st.composite
-def models(draw: st.DrawFn, longest: int = 700) -> IntegerModel:
-    """Any model that fits the toy and whose span is at most ``longest`` samples."""
+def models(draw: st.DrawFn, longest: int = 700, window: bool = False) -> IntegerModel:
+    """Any model that fits the toy and whose span is at most ``longest`` samples; a ``window`` network has padding."""
     layout = any_layout(draw)
     layers: list[ConvLayer] = []
     left = longest - 100
     vector = None
-    if layout.vectors:
+    if layout.vectors and not window:
         vector = VectorLayer(draw(st.integers(1, min(40, left // 2))), draw(st.integers(2, 9)), len(layout.vectors))
         left -= vector.reach
     for _ in range(draw(st.integers(1, 4))):
@@ -203,14 +203,12 @@ def models(draw: st.DrawFn, longest: int = 700) -> IntegerModel:
         layers.append(ConvLayer(kernel, dilation, draw(st.integers(1, 20))))
         left -= layers[-1].reach
     step = draw(st.integers(1, 10))
-    arch = Arch(
-        tuple(layers),
-        channels=layout.n_inputs,
-        classes=draw(st.integers(2, 20)),
-        step=step,
-        pool=step * draw(st.integers(1, 10)),
-        vector=vector,
-    )
+    settings: dict[str, Any] = {"pool": step * draw(st.integers(1, 10)), "vector": vector}
+    if window:
+        # Most reach back further than the shorter windows, so that samples are reflected again.
+        samples = draw(st.integers(2, 40) | st.integers(2, longest))
+        step, settings = min(step, samples), {"padding": "mirror", "window": samples}
+    arch = Arch(tuple(layers), channels=layout.n_inputs, classes=draw(st.integers(2, 20)), step=step, **settings)
     rng = np.random.default_rng(draw(st.integers(0, 1 << 30)))
     idle = rng.random(arch.classes) < 0.2
     gestures = tuple(Gesture(f"gèste {i}", AFFECTS[i % 4], idle=bool(idle[i])) for i in range(arch.classes))
@@ -267,6 +265,11 @@ def plain_model(seed: int = 1, **changes: Any) -> IntegerModel:
     arch = Arch((ConvLayer(5, 2, 6), ConvLayer(4, 3, 5)), **settings)
     gestures = GestureSet("plain", tuple(Gesture(f"gesture {i}", AFFECTS[i % 4]) for i in range(arch.classes)))
     return IntegerModel(any_network(arch, layout, np.random.default_rng(seed)), layout, gestures, 5000)
+
+
+def window_model(seed: int = 1, window: int = 40, **changes: Any) -> IntegerModel:
+    """`plain_model` as a window network: its layers reach 8 and 9 samples back."""
+    return plain_model(seed, **({"padding": "mirror", "window": window, "pool": None} | changes))
 
 
 def vector_model(seed: int = 1) -> IntegerModel:

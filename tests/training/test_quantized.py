@@ -47,9 +47,11 @@ def alike(windows: WindowSet) -> WindowSet:
     return windows
 
 
-def test_it_computes_what_the_toy_computes(made: Make) -> None:
-    network, windows = arch(), made(64)
-    scaler, weights = Scaler.fit(windows.x), random_weights(arch(), 3)
+# With reflected samples, more activations lie on the boundary of a rounding.
+@pytest.mark.parametrize(("padding", "share"), [("stream", 0.25), ("mirror", 0.5)])
+def test_it_computes_what_the_toy_computes(padding: str, share: float, made: Make) -> None:
+    network, windows = arch(padding=padding), made(64)
+    scaler, weights = Scaler.fit(windows.x), random_weights(network, 3)
     weights["norm0.gain"][1] *= -1.0
     weights["norm0.gain"][2] = 0.0
     kept = calibration(network, weights, scaler, windows.x)
@@ -58,7 +60,7 @@ def test_it_computes_what_the_toy_computes(made: Make) -> None:
     wanted = deployed(network, weights, scaler, kept).forward(x) / 256
     floats = Network(network, weights).forward(scaler.apply(x))
     assert np.abs(found - wanted).max() < 0.02, "what is left are the fixed-point scales"
-    assert np.abs(found - wanted).max() < 0.25 * np.abs(floats - wanted).max()
+    assert np.abs(found - wanted).max() < share * np.abs(floats - wanted).max()
 
 
 def test_it_saves_a_network_that_plain_rounding_spoils(made: Make) -> None:
@@ -97,7 +99,7 @@ def test_the_same_seed_gives_the_same_weights_and_leaves_the_global_seed_alone(m
 @pytest.mark.parametrize(
     ("changes", "epochs", "said"),
     [
-        ({"padding": "mirror"}, 1, "cannot be deployed"),
+        ({"padding": "causal"}, 1, "cannot be deployed"),
         ({"norm": "layer"}, 1, "cannot be deployed"),
         ({}, 0, "0 epoch"),
     ],

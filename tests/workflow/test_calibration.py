@@ -73,12 +73,12 @@ def test_fine_tuning_for_8_bits_keeps_the_ranges_it_was_made_for(dataset: Datase
         assert 0.5 < found["agreement"] <= 1 and 0 <= found["macro_f1"] <= 1
     poor = plain.scores["int8"]["agreement"] < 0.95
     assert any("--quantize-aware" in line for line in said) == poor
-    assert ps.train(dataset, epochs=1, filters=(4, 4, 4), padding="mirror").scores["int8"] is None
+    assert ps.train(dataset, epochs=1, filters=(4, 4, 4), padding="causal").scores["int8"] is None
 
 
 def test_fine_tuning_what_cannot_be_deployed_is_refused_before_training(dataset: Dataset) -> None:
-    with pytest.raises(ArchError, match="mirror"):
-        ps.train(dataset, epochs=1, filters=(4, 4, 4), padding="mirror", quantize_aware=1)
+    with pytest.raises(ArchError, match="causal"):
+        ps.train(dataset, epochs=1, filters=(4, 4, 4), padding="causal", quantize_aware=1)
     with pytest.raises(ConfigError, match="quantize_aware is -1"):
         ps.train(dataset, epochs=1, filters=(4, 4, 4), quantize_aware=-1)
 

@@ -36,12 +36,24 @@ def _conversion(entry: dict[str, Any]) -> str:
     return f"  {entry['file']:<17} {entry['bytes']:,} bytes{difference}"
 
 
+def _window(facts: dict[str, Any]) -> list[str]:
+    """Format the cost of a window network beside that of a streaming one."""
+    if "times_streaming" not in facts:
+        return []
+    text = (
+        f"every step computes its window of {facts['span']} samples again, {facts['times_streaming']:g} times the MACs "
+        f"of a streaming {facts['symbol']} (train --padding stream); plushsense profile shows how often it can run"
+    )
+    return textwrap.wrap(text, 118, initial_indent="  window network    ", subsequent_indent=" " * 20)
+
+
 def run(args: argparse.Namespace) -> int:
     from plushsense.workflow.export import export
 
     if args.patch_for is not None:
         return _patch(args)
-    done = export(args.bundle, args.out, dataset=args.dataset, also=listed(args.also), warn=warn)
+    also = listed(args.also)
+    done = export(args.bundle, args.out, dataset=args.dataset, step_s=args.step_s, also=also, warn=warn)
     facts = done.facts
     simulated = ["  SIMULATION: trained on a virtual toy, not on real touch"] if facts["simulated"] else []
     emit(
@@ -53,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
             f"  model             {done.flash_bytes:,} bytes of flash, without the code (see plushsense profile)",
             f"  memory            {done.ram_bytes:,} bytes of RAM",
             f"  a step            {facts['step_ms']:g} ms, {facts['macs_per_step']:,} MACs",
+            *_window(facts),
             *(_conversion(entry) for entry in facts.get("conversions", {}).values()),
             f"  prove it          plushsense verify {args.out}",
         ],
@@ -65,6 +78,8 @@ def _patch(args: argparse.Namespace) -> int:
 
     if args.also:
         raise ConfigError("--also writes formats of a whole export: leave it out, or leave out --patch-for.")
+    if args.step_s is not None:
+        raise ConfigError("--step-s is for a whole export: a patch has the step of the export that it is for.")
     done = export_patch(args.bundle, args.out, export=args.patch_for, dataset=args.dataset, warn=warn)
     emit(args, done.to_dict(), [f"{done.path}: {done.bytes:,} bytes, for plush_patch on a toy with {args.patch_for}"])
     return 0
@@ -199,7 +214,7 @@ def format_profile(profile: Profile) -> list[str]:
 
 
 def _counts(profile: Profile) -> list[str]:
-    from plushsense.deploy.profile import STEPS
+    from plushsense.deploy.profile import steps_of
 
     costs = [c for c in profile.costs.values() if c.stages]
     if not costs:
@@ -212,16 +227,19 @@ def _counts(profile: Profile) -> list[str]:
         ["plush_begin, once", *(f"{c.begin:,}" for c in costs)],
         ["network, for each MAC", *(f"{c.stages['network'] / profile.arch.macs_per_step:.2f}" for c in costs)],
     ]
-    window, times = profile.window_instructions, profile.arch.macs_per_window / profile.arch.macs_per_step
+    arch, window, steps = profile.arch, profile.window_instructions, steps_of(profile.facts)
     again = (
-        f"Recomputing all {profile.arch.span} samples of the span at every step takes {profile.arch.macs_per_window:,} "
-        f"MACs, {times:.0f} times as many; with the same instructions for each MAC about "
+        f"Recomputing all {arch.span} samples of the span at every step takes {arch.macs_per_window:,} MACs, "
+        f"{arch.macs_per_window / arch.macs_per_step:.0f} times as many; with the same instructions for each MAC about "
         + ", ".join(f"{window[c.target] / 1e6:.1f} M on {c.target}" for c in costs)
         + " (estimate)."
     )
+    if arch.padding != "stream":
+        times = profile.facts["times_streaming"]
+        again = f"Every step computes {arch.span} samples again, {times:g} times the MACs of a streaming {arch.symbol}."
     return [
         "",
-        f"Instructions, counted (mean of {STEPS} steps; frames come up to a fifth of a period early or late)",
+        f"Instructions, counted (mean of {steps} steps; frames come up to a fifth of a period early or late)",
         table(["", *(c.target for c in costs)], rows),
         *textwrap.wrap(again, 118),
     ]
@@ -274,24 +292,38 @@ def _times(profile: Profile) -> list[str]:
             e.core.mhz,
             e.core.target,
             f"{e.core.cycles_low:g} to {e.core.cycles_high:g}",
-            f"{e.low_ms:.2g} to {e.high_ms:.2g}",
+            f"{_two_digits(e.low_ms)} to {_two_digits(e.high_ms)}",
             e.answer,
+            " to ".join(map(_two_digits, e.largest_rate_hz)),
         ]
         for e in profile.estimates.values()
     ]
+    head = ["chip", "MHz", "counted on", "cycles an instruction", "ms a step", f"fits {1000 / profile.step_ms:g} Hz"]
+    notes: list[str] = []
+    if profile.arch.padding == "stream":
+        rows = [row[:-1] for row in rows]
+    else:
+        head.append("largest rate, Hz")
+        notes = textwrap.wrap(
+            "Largest rate of a window network: the first surely fits, by the upper bound of the time; above the second "
+            "none does. plushsense export --step-s sets the rate, with the same weights.",
+            118,
+        )
     why: dict[str, list[str]] = {}
     for e in profile.estimates.values():
         why.setdefault(e.core.reasons, []).append(e.core.title.partition(" (")[0])
     return [
         "",
         *textwrap.wrap(f"Time of a step, ESTIMATED. {SUMMARY}", 118),
-        table(
-            ["chip", "MHz", "counted on", "cycles an instruction", "ms a step", f"fits {1000 / profile.step_ms:g} Hz"],
-            rows,
-        ),
+        table(head, rows),
+        *notes,
         "Where the bounds come from:",
         *(line for words, names in why.items() for line in _wrapped(f"{', '.join(names)}: {words}.")),
     ]
+
+
+def _two_digits(number: float) -> str:
+    return f"{number:.2g}" if number < 99.5 else f"{number:.0f}"
 
 
 def _wrapped(text: str) -> list[str]:

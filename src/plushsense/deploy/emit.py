@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
@@ -14,6 +15,7 @@ from plushsense.core.errors import BadInput
 from plushsense.core.files import new_folder
 from plushsense.core.templates import fill_text
 from plushsense.deploy.golden import write_golden
+from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.image import HEAD_BYTES, IntegerModel, image_head, layout_check, memory_bytes
 
@@ -116,15 +118,29 @@ def code_files(model: IntegerModel, bundle: Bundle) -> dict[str, bytes]:
     A program is compiled from these files only. They depend only on the model and on names in the bundle, so that they
     can be compared with the files of an export of unknown origin.
     """
-    library = files("plushsense.deploy") / "c"
     image = model.to_bytes()
     facts = _facts(model, bundle, len(image))
     return {
-        **{name: (library / name).read_bytes() for name in LIBRARY},
+        **{name: library_text(name, window=model.is_window).encode() for name in LIBRARY},
         MODEL[0]: _header(facts).encode(),
         MODEL[1]: _source(model, facts["title"]).encode(),
         IMAGE: image,
     }
+
+
+# What is compiled only with, or without, PLUSH_WINDOW; with an alternative or none.
+_ONLY_WINDOW = re.compile(r"#if(n?)def PLUSH_WINDOW\n(.*?)(?:#else\n(.*?))?#endif /\* PLUSH_WINDOW \*/\n", re.S)
+
+
+def library_text(name: str, *, window: bool) -> str:
+    """Return a file of the C library with the code for window networks, or else with that for streaming ones."""
+    text = (files("plushsense.deploy") / "c" / name).read_text(encoding="utf-8")
+    return _ONLY_WINDOW.sub(lambda m: (m[2] if window != bool(m[1]) else m[3]) or "", text)
+
+
+def times_streaming(arch: Arch) -> float:
+    """Return how many times the MACs of a step are those of a streaming network with the same symbol and filters."""
+    return round(arch.macs_per_step / replace(arch, padding="stream", pool=None).macs_per_step, 1)
 
 
 def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, Any]:
@@ -155,6 +171,8 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
         "parameters": arch.parameters,
         "macs_per_step": arch.macs_per_step,
         "macs_per_window": arch.macs_per_window,
+        "padding": arch.padding,
+        **({"times_streaming": times_streaming(arch)} if model.is_window else {}),
         "model_bytes": model_bytes,
         "memory_bytes": memory_bytes(model),
         "simulated": bool(bundle.provenance.get("simulated", False)),
@@ -190,7 +208,7 @@ def _header(facts: Mapping[str, Any]) -> str:
 
 def _source(model: IntegerModel, title: str) -> str:
     sections = model.sections()
-    head = image_head(b"".join(data for _, data in sections))
+    head = image_head(b"".join(data for _, data in sections), version=model.image_version)
     description = f"head: PLSH, version, bytes, CRC-32 of what follows ({HEAD_BYTES} bytes)"
     return fill_text(
         "plushsense.deploy",

@@ -51,7 +51,7 @@ class Core:
         if self.flash_mb_s is None:
             return self.why
         return (
-            f"{self.why}; high also fetches code and model from the serial flash again for every sample, at "
+            f"{self.why}; high also fetches code and model from the serial flash again for every computed sample, at "
             f"{self.flash_mb_s:g} MB/s, as if its cache had kept nothing (in RAM they never are)"
         )
 
@@ -89,6 +89,11 @@ class Estimate:
         return f"no, it would use {float(low):g} % of the core or more"
 
     @property
+    def largest_rate_hz(self) -> tuple[float, float]:
+        """Largest rates of steps: one that fits by the upper bound, and one by the lower bound."""
+        return 1000 / self.high_ms, 1000 / self.low_ms
+
+    @property
     def verdict(self) -> str:
         """Verdict as text, with the rate of steps."""
         return f"fits {1000 / self.step_ms:g} Hz: {self.answer}"
@@ -113,7 +118,9 @@ class Estimate:
 
 
 def estimate(core: Core, instructions: int, flash_bytes: int, samples: int, step_ms: float) -> Estimate:
-    """Estimate the time of a step; a serial flash adds reading ``flash_bytes`` per sample to the upper bound."""
+    """Estimate the time of a step that computes ``samples``; a serial flash adds reading ``flash_bytes`` per sample to
+    the upper bound.
+    """
     low = instructions * core.cycles_low / core.mhz / 1000
     high = instructions * core.cycles_high / core.mhz / 1000
     if core.flash_mb_s is not None:
@@ -121,7 +128,7 @@ def estimate(core: Core, instructions: int, flash_bytes: int, samples: int, step
     return Estimate(core, instructions, step_ms, low, high)
 
 
-STEPS = 50  # number of decisions whose instructions are counted
+STEPS, WINDOW_STEPS = 50, 5  # number of decisions whose instructions are counted; of window networks
 STAGES = ("health", "inputs", "gate", "network", "dense", "decision", "events", "pooling")
 _HEAP = ("malloc", "calloc", "realloc", "free", "reallocarray", "aligned_alloc", "sbrk", "_sbrk", "_Znw", "_Zna")
 # Helper functions of compilers for floating point: __addsf3, __mulsf3, __floatsidf, __aeabi_fadd, __aeabi_i2d …
@@ -134,9 +141,9 @@ _SECTIONS["bss"] = (".bss", ".sbss")
 class Cost:
     """Cost on one target in instructions and bytes; counts are None if the target does not count (the host).
 
-    ``step`` is the mean over `STEPS` decisions with frames up to a fifth of a period early or late, ``step_most`` their
-    maximum, ``even`` the mean with even time stamps; ``gap`` is a call that bridges the longest gap. ``stages`` add up
-    to ``step``: ``clock`` (with the check of values) is the remainder, ``gate`` is 0 for a model without one.
+    ``step`` is the mean over `steps_of` decisions with frames up to a fifth of a period early or late, ``step_most``
+    their maximum, ``even`` the mean with even time stamps; ``gap`` is a call that bridges the longest gap. ``stages``
+    add up to ``step``: ``clock`` (with the check of values) is the remainder, ``gate`` is 0 for a model without one.
     ``stack_push``, ``stack_begin`` and ``stack_memory_bytes`` are the stack depths of these functions, without a
     callback; ``stack_functions`` is the stack frame of each function as the compiler reports it.
     """
@@ -215,7 +222,6 @@ def count(
         BadInput: if there are too few golden frames.
     """
     code = code or folder
-    step = int(facts["step"])
     even, jittered = _streams(folder, facts)
     with tempfile.TemporaryDirectory(prefix="plushsense-profile-") as temporary:
         work = Path(temporary)
@@ -225,7 +231,7 @@ def count(
         sources = [C_FOLDER / "profile.c", code / MODEL[1]]
         same = partial(build, target, include=[code], optimise=optimise, blobs=blobs)
         whole = same([*sources, code / LIBRARY[1]], work / "whole", flags=["-fstack-usage"])
-        head, rows_even, rows_jittered = _whole(whole, step)
+        head, rows_even, rows_jittered = _whole(whole, facts)
         counts = TARGETS[target].counts
         stages: dict[str, int] = {}
         if counts:
@@ -257,6 +263,11 @@ def count(
         )
 
 
+def steps_of(facts: Mapping[str, Any]) -> int:
+    """Return the number of decisions that are counted for an export."""
+    return STEPS if facts.get("padding", "stream") == "stream" else WINDOW_STEPS
+
+
 def _mean(counts: Ints) -> int:
     return round(float(counts.mean()))
 
@@ -265,28 +276,29 @@ def _streams(folder: Path, facts: Mapping[str, Any]) -> tuple[Ints, Ints]:
     """Return frames at even times, and the same readings with jitter and the longest bridged gap at the end.
 
     The readings are touches near the beginning of the golden frames, which have no faults. The counted part begins and
-    ends with a frame without jitter, so that it contains a whole number of samples.
+    ends with a frame without jitter, so that it contains a whole number of samples. The gap completes a step.
     """
     span, step, period_us = int(facts["span"]), int(facts["step"]), int(facts["period_us"])
+    gap_ms = int(facts["gap_ms"])
     frames, _ = read_golden(folder / GOLDEN, len(facts["channels"]), int(facts["classes"]))
     clean = frames[6 : 6 + span, 1:]
     if len(clean) < span:
         raise BadInput(f"'{folder / GOLDEN}' holds too few frames: export the model again.")
-    n = span + STEPS * step
+    n = span + steps_of(facts) * step + max(0, step - gap_ms * 1000 // period_us)
     values = np.resize(clean, (n, clean.shape[1]))
     at_us = 1_000_000 + np.arange(n) * period_us
     jitter = np.random.default_rng(5).integers(-period_us // 5, period_us // 5 + 1, n)
-    jitter[[0, span - 1, n - 1]] = 0
+    jitter[[0, span - 1, *range(span + steps_of(facts) * step - 1, n)]] = 0
     even = np.column_stack([at_us // 1000, values])
     jittered = np.column_stack([(at_us + jitter) // 1000, values])
-    last = np.concatenate([[jittered[-1, 0] + int(facts["gap_ms"])], values[0]])
+    last = np.concatenate([[jittered[-1, 0] + gap_ms], values[0]])
     return even, np.vstack([jittered, last])
 
 
-def _whole(program: Program, step: int) -> tuple[list[int], Ints, Ints]:
+def _whole(program: Program, facts: Mapping[str, Any]) -> tuple[list[int], Ints, Ints]:
     """Run the program; return its six numbers about the toy, and a table of the steps of each stream.
 
-    The tables, even (`STEPS`, 3) and jittered (`STEPS` + 1, 3), omit the first decision; the latter ends with the gap.
+    The tables, even (n, 3) and jittered (n + 1, 3), omit the first decision; the latter ends with the gap.
     """
     numbers = np.frombuffer(program.run(), dtype="<u4").astype(np.int64)
     if not len(numbers):
@@ -296,9 +308,10 @@ def _whole(program: Program, step: int) -> tuple[list[int], Ints, Ints]:
     table = numbers[6:].reshape(-1, 3)
     first = int(np.flatnonzero(table[:, 2] == 2)[0])
     even, jittered = (part[part[:, 2] == 1][1:] for part in (table[:first], table[first + 1 : -1]))
-    if (len(even), len(jittered)) != (STEPS, STEPS + 1):
+    n = steps_of(facts)
+    if (len(even), len(jittered)) != (n, n + 1):
         raise ProgramError(
-            f"The C in the export gave {len(even)} answers on {program.target.name} where {STEPS} steps of {step} "
+            f"The C in the export gave {len(even)} answers on {program.target.name} where {n} steps of {facts['step']} "
             "samples should: plushsense verify shows where it goes wrong."
         )
     return numbers[:6].tolist(), even, jittered
@@ -361,7 +374,9 @@ class Profile:
     def macs_by_layer(self) -> dict[str, int]:
         """Multiply-accumulates of a step by layer; the dense layer is computed once per step."""
         names = (f"layer {n}" for n in range(1, len(self.arch.layers) + 1))
-        macs = {name: m * self.arch.step for name, m in zip(names, self.arch.macs_per_position, strict=True)}
+        positions = [self.arch.step] * len(self.arch.layers) if self.arch.padding == "stream" else self.arch.positions
+        each = zip(names, self.arch.macs_per_position, positions, strict=True)
+        macs = {name: m * n for name, m, n in each}
         return macs | {"dense": self.arch.classes * self.arch.features}
 
     @property
@@ -382,7 +397,7 @@ class Profile:
             "optimise": self.optimise,
             "step": self.arch.step,
             "step_ms": self.step_ms,
-            "decisions_counted": STEPS,
+            "decisions_counted": steps_of(self.facts),
             "instructions_per_step": {name: c.step for name, c in counted.items()},
             "network_instructions_per_step": {name: c.stages["network"] for name, c in counted.items()},
             "macs_per_step": self.arch.macs_per_step,
@@ -391,6 +406,7 @@ class Profile:
             "flash_bytes": {name: c.flash_bytes for name, c in self.costs.items()},
             "ram_bytes": {name: c.ram_bytes for name, c in self.costs.items()},
             "estimated_ms": {name: e.to_dict() for name, e in self.estimates.items()},
+            "largest_rate_hz": {name: [round(r, 2) for r in e.largest_rate_hz] for name, e in self.estimates.items()},
             "estimated_window_instructions": self.window_instructions,
             "targets": {name: c.to_dict() for name, c in self.costs.items()},
             "missing": {name: list(packages) for name, packages in self.missing.items()},
@@ -446,8 +462,9 @@ def profile(
             progress(done, len(installed))
             costs[name] = count(folder, name, facts, optimise, code=code)
     progress(len(installed), len(installed))
+    samples = arch.step if arch.padding == "stream" else arch.span
     estimates = {
-        core.name: estimate(core, cost.step, cost.flash_bytes, arch.step, float(facts["step_ms"]))
+        core.name: estimate(core, cost.step, cost.flash_bytes, samples, float(facts["step_ms"]))
         for core in cores()
         if (cost := costs.get(core.target)) is not None and cost.step is not None
     }

@@ -1,7 +1,8 @@
 """Quantization of a trained network: folded batch normalisation, 8-bit weights and activations, fixed-point scales.
 
-Folding is exact: each normalisation moves into the weights of the next layer, the last one into those of the dense
-layer. `calibrate` measures the 8-bit ranges of inputs and activations, on windows of the training people only.
+Folding is exact, also where a layer reads reflected samples: each normalisation moves into the weights of the next
+layer, the last one into those of the dense layer. `calibrate` measures the 8-bit ranges of inputs and activations, on
+windows of the training people only.
 
 The bias of each layer compensates the mean error caused by the rounding of its weights, which is computed from the mean
 input. Input codes lie around 128, by which a weight's error is multiplied; so on makeability this lowers the share of
@@ -120,10 +121,10 @@ def calibrate(network: Network, x: NDArray[np.floating[Any]]) -> Ranges:
 
 def refuse_undeployable(arch: Arch) -> None:
     """Raise ArchError for a network that cannot be deployed, with the reason and the option to train it with."""
-    if arch.padding != "stream":
+    if arch.padding == "causal":
         raise ArchError(
-            f"{arch.title} has the padding '{arch.padding}', with which a decision cannot be made sample by sample: "
-            f"train {arch.symbol} with --padding stream.",
+            f"{arch.title} has the padding '{arch.padding}', whose zeros cannot be folded with the normalisation: "
+            f"train {arch.symbol} with --padding stream, or mirror for a window network.",
             reason="arch_padding",
             padding=arch.padding,
         )

@@ -87,6 +87,23 @@ class Pool:
         return np.asarray(runs.sum(axis=1) / (self.blocks * self.step))
 
 
+class WindowRing:
+    """Buffer of the samples of a window, for networks that compute each window as a whole."""
+
+    def __init__(self, arch: Arch) -> None:
+        self.arch = arch
+        self._ring = SampleRing(ConvLayer(arch.window, 1, 1), arch.channels)
+        self._seen = 0
+
+    def feed(self, x: Floats) -> Floats:
+        """Add rows (n, C); return the windows (m, T, C) of the decisions that are then due."""
+        windows = self._ring.feed(x)
+        self._seen += len(x)
+        ends = np.arange(self._seen - len(windows), self._seen) + 1 - self.arch.window
+        due: Floats = windows[ends % self.arch.step == 0].reshape(-1, self.arch.window, self.arch.channels)
+        return due
+
+
 Weights = Mapping[str, NDArray[np.float32]]
 
 _TAPS_BYTES = 2 << 20
@@ -174,7 +191,8 @@ def taps_of(x: Floats, layer: ConvLayer) -> Floats:
     return np.ndarray(shape, np.float64, x, 0, (batch, row, layer.dilation * row, item))
 
 
-def _padded(x: Floats, arch: Arch, reach: int) -> Floats:
+def padded(x: Floats, arch: Arch, reach: int) -> Floats:
+    """Return the inputs of a layer, (N, T, C), with the padding of ``arch`` before them: (N, reach + T, C)."""
     if arch.padding == "mirror":
         return x[:, reflected(x.shape[1], reach)]
     if arch.padding == "causal":
@@ -184,7 +202,7 @@ def _padded(x: Floats, arch: Arch, reach: int) -> Floats:
 
 def _through(x: Floats, block: _Block, arch: Arch) -> Floats:
     """Apply one block to whole windows, (N, T, C) → (N, T', filters), a few windows at a time."""
-    taps = taps_of(_padded(x, arch, block.layer.reach), block.layer)
+    taps = taps_of(padded(x, arch, block.layer.reach), block.layer)
     n, t, width = len(taps), taps.shape[1], len(block.matrix)
     out = np.empty((n, t, block.layer.filters))
     group = max(1, _TAPS_BYTES // (8 * t * width))
@@ -237,12 +255,12 @@ class Network:
     def rectified(self, x: NDArray[np.floating[Any]]) -> list[Floats]:
         """Return the ReLU outputs (N, T', F) of each layer, before normalisation, for scaled windows (N, C, T).
 
-        Only for networks with the padding ``stream`` and batch normalisation.
+        Not for networks with layer normalisation.
         """
         z = self.convolved(x)
         seen = []
         for block in self.blocks:
-            taps = taps_of(z, block.layer)
+            taps = taps_of(padded(z, self.arch, block.layer.reach), block.layer)
             seen.append(block.rectified(taps.reshape(-1, len(block.matrix))).reshape(*taps.shape[:2], -1))
             z = seen[-1] * block.gain + block.shift
         return seen
@@ -361,12 +379,10 @@ class _Recomputing(_FloatStepper):
     """Stepper for the paddings ``mirror`` and ``causal``; each decision computes the whole window again."""
 
     def _clear(self) -> None:
-        self._ring = SampleRing(ConvLayer(self.arch.window, 1, 1), self.arch.channels)
+        self._windows = WindowRing(self.arch)
 
     def _advance(self, chunk: Floats) -> Floats:
-        windows = self._ring.feed(chunk)
-        ends = np.arange(self.seen - len(windows), self.seen) + 1 - self.arch.window
-        due = windows[ends % self.arch.step == 0].reshape(-1, self.arch.window, self.arch.channels)
+        due = self._windows.feed(chunk)
         return self.network.forward(due.transpose(0, 2, 1)) if len(due) else np.empty((0, self.arch.classes))
 
 
@@ -418,7 +434,7 @@ def random_weights(arch: Arch, seed: int) -> dict[str, NDArray[np.float32]]:
             put(f"norm{i}.mean", np.zeros(f))
             put(f"norm{i}.var", np.ones(f))
             block = _Block.of(arch, i, weights)
-            rows = block.rectified(taps_of(_padded(x, arch, layer.reach), layer).reshape(-1, taps))
+            rows = block.rectified(taps_of(padded(x, arch, layer.reach), layer).reshape(-1, taps))
             put(f"norm{i}.mean", rows.mean(axis=0) * np.exp(0.1 * rng.normal(size=f)))
             put(f"norm{i}.var", (rows.var(axis=0) + 1e-3) * np.exp(0.2 * rng.normal(size=f)))
         x = _through(x, _Block.of(arch, i, weights), arch)

@@ -3,8 +3,9 @@
 All numbers are little-endian. Head (16 bytes): ``PLSH``, u16 version, u16 0, u32 length of the whole image, u32 CRC-32
 of everything after the head. The following sections come in this order:
 
-- u8 layers, u8 measured channels, u8 inputs, u8 classes, u16 step, u16 pooled steps, u32 span (samples), u32 period and
-  u32 gap in clock units, u32 clock units per millisecond, u16 smoothing weight, u16 layout checksum (`layout_check`)
+- u8 layers, u8 measured channels, u8 inputs, u8 classes, u16 step, u16 pooled steps (0 in a window network, with the
+  padding ``mirror``), u32 span (samples), u32 period and u32 gap in clock units, u32 clock units per millisecond, u16
+  smoothing weight, u16 layout checksum (`layout_check`)
 - for each measured channel: i32 lowest and i32 highest valid value, i32 zero
 - for each input: u8 kind (0 channel, 1 magnitude, 2 gravity), u8 n, u8 shift of the running mean (else 0), n × u8
   measured channels
@@ -23,6 +24,9 @@ of everything after the head. The following sections come in this order:
 - gate: u8 signals, u8 rules (both 0 without rules); for each signal: u8 kind, u8 n, n × u8 inputs, u8 lag, u8 shift,
   u8 baseline, u8 noise, u32 floor; for each rule: u8 terms, u8 affect, u8 gesture, u8 within, u16 deaf; then for each
   of its terms: u8 signal, i8 sign, u8 times, u8 0, u32 threshold
+
+Images of window networks have a version of their own, because the C library of a streaming network cannot run them, nor
+the other way round.
 
 A patch replaces the dense layer of one image. Its head is that of an image with ``PLPT`` for ``PLSH``; then come the
 u32 CRC-32 in the head of that image, and the two sections of the new dense layer as in an image.
@@ -56,10 +60,12 @@ from plushsense.runtime.vectors import MOST_AXIS_SHIFT, IntegerVectors
 MAGIC = b"PLSH"
 PATCH_MAGIC = b"PLPT"
 IMAGE_VERSION = 4  # 2: settings of events, gate and health; 3: zeros and the vector layer; 4: another known score
+WINDOW_IMAGE_VERSION = 5  # of window networks; otherwise as 4
 HEAD_BYTES = 16
 IDLE_BIT = 4
 GROUP = 4  # number of filters, and of channels, in a block of weights
 MOST_TAPS = 255  # of a vector layer
+MOST_ROWS = (1 << 16) - 1  # samples that a layer remembers
 _DENSE = "dense layer"  # how the descriptions of its sections begin
 _INPUT_KINDS = ("channel", "magnitude", "gravity")
 MOST_CLOCK_UNITS = 1 << 22  # limit for gap and period of the clock: interpolation then needs at most 32 bits
@@ -96,19 +102,23 @@ class IntegerModel:
             if found > 255:
                 raise BundleError(f"The model has {found} {name}: in the toy there may be at most 255.")
         for n, layer in enumerate(arch.layers, 1):
-            if layer.reach + 1 >= 1 << 16:
+            if layer.reach + 1 > MOST_ROWS:
                 raise BundleError(
                     f"Layer {n} of {arch.title} remembers {layer.reach + 1} samples: in the toy there may be at most "
-                    "65535, so take a shorter kernel or a smaller dilation."
+                    f"{MOST_ROWS}, so take a shorter kernel or a smaller dilation."
                 )
+        if self.is_window and arch.window > MOST_ROWS:
+            raise BundleError(
+                f"{arch.title} has a window of {arch.window} samples: in the toy there may be at most {MOST_ROWS}."
+            )
         if arch.vector is not None and arch.vector.kernel > MOST_TAPS:
             raise BundleError(
                 f"The vector layer of {arch.title} has kernels of {arch.vector.kernel} taps: in the toy there may be "
                 f"at most {MOST_TAPS}."
             )
-        if arch.pooled // arch.step >= 1 << 16:
+        if self.pooled_steps >= 1 << 16:
             raise BundleError(
-                f"{arch.title} pools {arch.pooled // arch.step} steps: in the toy there may be at most 65535, so take "
+                f"{arch.title} pools {self.pooled_steps} steps: in the toy there may be at most 65535, so take "
                 "a smaller pool or a longer step."
             )
         if not 1 <= self.smoothing <= 1 << PROBABILITY_BITS:
@@ -140,6 +150,22 @@ class IntegerModel:
                 raise BundleError(f"The gesture {gesture.label!r} has a character that the toy cannot keep: rename it.")
 
     @property
+    def is_window(self) -> bool:
+        """Whether every step computes the whole window again (padding ``mirror``)."""
+        return self.network.arch.padding != "stream"
+
+    @property
+    def image_version(self) -> int:
+        """Version of the image, and of a patch of it."""
+        return WINDOW_IMAGE_VERSION if self.is_window else IMAGE_VERSION
+
+    @property
+    def pooled_steps(self) -> int:
+        """Number of steps of which the pooling keeps a sum; 0 for a window network."""
+        arch = self.network.arch
+        return 0 if self.is_window else arch.pooled // arch.step
+
+    @property
     def _units_per_ms(self) -> int:
         """Clock units per millisecond: the smallest number for which the period is a whole number of units."""
         return 1000 // math.gcd(1000, self.layout.period_us)
@@ -158,7 +184,7 @@ class IntegerModel:
                     arch.channels,
                     arch.classes,
                     arch.step,
-                    arch.pooled // arch.step,
+                    self.pooled_steps,
                     arch.span,
                     layout.period_us * units_per_ms // 1000,
                     layout.gap_ms * units_per_ms,
@@ -210,7 +236,7 @@ class IntegerModel:
     def to_bytes(self) -> bytes:
         """Return the bytes of the image."""
         body = b"".join(piece for _, piece in self.sections())
-        return image_head(body) + body
+        return image_head(body, version=self.image_version) + body
 
 
 def _vectors(vectors: IntegerVectors | None) -> list[tuple[str, bytes]]:
@@ -259,9 +285,9 @@ def layout_check(layout: Layout) -> int:
     return zlib.crc32(channels.encode()) & 0xFFFF
 
 
-def image_head(body: bytes, magic: bytes = MAGIC) -> bytes:
+def image_head(body: bytes, magic: bytes = MAGIC, version: int = IMAGE_VERSION) -> bytes:
     """Return the 16-byte head for the body of an image, or of a patch."""
-    return magic + struct.pack("<HHII", IMAGE_VERSION, 0, len(body) + HEAD_BYTES, zlib.crc32(body))
+    return magic + struct.pack("<HHII", version, 0, len(body) + HEAD_BYTES, zlib.crc32(body))
 
 
 def image_check(image: bytes) -> int:
@@ -270,7 +296,8 @@ def image_check(image: bytes) -> int:
     Raises:
         BundleError: for bytes that are no image of this version.
     """
-    if image[:HEAD_BYTES] != image_head(image[HEAD_BYTES:]):
+    versions = (IMAGE_VERSION, WINDOW_IMAGE_VERSION)
+    if image[:HEAD_BYTES] not in [image_head(image[HEAD_BYTES:], version=v) for v in versions]:
         raise BundleError("The image is damaged, or of another version of PlushSense: export the model again.")
     return int(struct.unpack_from("<I", image, HEAD_BYTES - 4)[0])
 
@@ -292,7 +319,7 @@ def patch_bytes(original: bytes | IntegerModel, adapted: IntegerModel) -> bytes:
                 "bundle from which the image was exported (model.plush beside it)."
             )
         at += len(piece)
-    return image_head(body, PATCH_MAGIC) + body
+    return image_head(body, PATCH_MAGIC, adapted.image_version) + body
 
 
 def memory_bytes(model: IntegerModel) -> int:
@@ -305,10 +332,12 @@ def memory_bytes(model: IntegerModel) -> int:
     if arch.vector is not None:
         pieces.append(0 if gate.rules else 4 * arch.channels)  # inputs
         pieces += [6 * arch.vector.vectors * arch.vector.kernel, 12 * arch.vector.filters]  # axes, horizontal parts
-    for layer, read in zip(arch.layers, arch.inputs, strict=True):
-        pieces.append((layer.reach + 1) * _filled(read))
+    for n, (layer, read) in enumerate(zip(arch.layers, arch.inputs, strict=True)):
+        # A window network remembers the inputs of the window, and of the other layers only what is read again.
+        rows = layer.reach + 1 if not model.is_window else arch.window if n == 0 else min(layer.reach + 1, arch.window)
+        pieces.append(rows * _filled(read))
         pieces.append(4 * (layer.dilation if layer.kernel > 1 else 1))  # sums under the taps
-    pieces.append(2 * features * (arch.pooled // arch.step))
+    pieces.append(2 * features * model.pooled_steps)
     pieces += [4 * features, 4 * arch.classes, 4 * arch.classes + 4]  # sums, logits, smoothed probabilities and known
     pieces += [channels, features]  # which channels are valid, the newest features
     health = model.rules.health

@@ -1,8 +1,9 @@
 """Integer network: 8-bit weights and activations, 32-bit sums, fixed-point scales.
 
-This module is the specification of a deployed network; the C in the toy gives the same results bit for bit. Only
-``stream`` networks are supported; batch normalisation is folded into the following layer. Sums are computed in float64,
-which is fast and represents all possible sums exactly.
+This module is the specification of a deployed network; the C in the toy gives the same results bit for bit. Networks
+with the padding ``stream`` run sample by sample. With the padding ``mirror``, every step computes the whole window
+again: each layer reads 8-bit activations, reflected before the first. Batch normalisation is folded into the following
+layer. Sums are computed in float64, which is fast and represents all possible sums exactly.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from plushsense.models.arch import Arch
 from plushsense.models.reference import (
     Floats,
     Stepper,
+    WindowRing,
     axes_ring,
     check_windows,
+    padded,
     stream_state,
     tap_layer,
     taps_of,
@@ -33,7 +36,7 @@ _SUM_LIMIT = (1 << 31) - 1
 
 def deployable(arch: Arch) -> bool:
     """Return whether a network can be deployed; `plushsense.deploy.quantize.refuse_undeployable` gives the reasons."""
-    return arch.padding == "stream" and arch.norm != "layer"
+    return arch.padding != "causal" and arch.norm != "layer"
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +95,7 @@ class IntegerNetwork:
         if not deployable(arch):
             raise BundleError(
                 f"{arch.title} has padding '{arch.padding}' and {arch.norm} normalisation: a network in "
-                "integers needs 'stream' and batch normalisation."
+                "integers needs 'stream' or 'mirror', and batch normalisation or none."
             )
         shapes = arch.weight_shapes
         needed = [shapes[f"conv{i}.weight"] for i in range(len(arch.layers))] + [shapes["dense.weight"]]
@@ -120,7 +123,7 @@ class IntegerNetwork:
                 raise BundleError(f"A sum of layer {n} of {arch.title} could leave 32 bits: use fewer taps or filters.")
         if arch.step > 257:
             raise BundleError(
-                f"A step of {arch.step} samples does not fit the 16-bit sums of the pooling: at most 257."
+                f"A step of {arch.step} samples does not fit the toy, with its 16-bit sums of a step: at most 257."
             )
 
     def forward(self, x: ArrayLike) -> Ints:
@@ -136,11 +139,15 @@ class IntegerNetwork:
         return np.concatenate([self._logits(x[at : at + 64]) for at in range(0, len(x), 64)] or [self._none()])
 
     def _logits(self, x: NDArray[Any]) -> Ints:
+        return self.dense.apply(self.sums(x))
+
+    def sums(self, x: NDArray[Any]) -> Floats:
+        """Compute the inputs of the dense layer, sums over time (N, F), of raw windows (N, C, T)."""
         z = self._first(x[:, :, x.shape[2] - self.arch.span :]).astype(np.float64)
         for layer, part in zip(self.arch.layers, self.layers, strict=True):
-            taps = taps_of(z, layer)
+            taps = taps_of(padded(z, self.arch, layer.reach), layer)
             z = np.stack([part.apply(each.reshape(len(each), -1)) for each in taps])
-        return self.dense.apply(z.sum(axis=1))
+        return np.asarray(z.sum(axis=1))
 
     def _first(self, x: NDArray[Any]) -> Bytes:
         """Return the inputs of the first convolution (N, T', C') of raw windows (N, C, T)."""
@@ -157,13 +164,13 @@ class IntegerNetwork:
         """Return the inputs of each layer and the output of the last, [(N, T', C')] uint8, of windows (N, C, T)."""
         outputs = [self._first(_whole(x))]
         for layer, part in zip(self.arch.layers, self.layers, strict=True):
-            taps = taps_of(outputs[-1].astype(np.float64), layer)
+            taps = taps_of(padded(outputs[-1].astype(np.float64), self.arch, layer.reach), layer)
             outputs.append(np.stack([part.apply(each.reshape(len(each), -1)) for each in taps]).astype(np.uint8))
         return outputs
 
     def stepper(self) -> IntegerStepper:
         """Create a stepper for one stream."""
-        return IntegerStepper(self)
+        return IntegerStepper(self) if self.arch.padding == "stream" else IntegerWindowStepper(self)
 
 
 def _whole(x: ArrayLike) -> NDArray[Any]:
@@ -177,7 +184,7 @@ def _whole(x: ArrayLike) -> NDArray[Any]:
 
 
 class IntegerStepper(Stepper):
-    """Computes the network sample by sample from raw integers; logits are in steps of 1/256."""
+    """Computes the network on a stream of raw integers, sample by sample; logits are in steps of 1/256."""
 
     def __init__(self, network: IntegerNetwork) -> None:
         self.network, self._dense = network, network.dense
@@ -211,3 +218,15 @@ class IntegerStepper(Stepper):
             z = part.apply(taps)
         # The pool returns means: multiply by its length and round to get the exact sums.
         return self._dense.apply(np.rint(self._pool.feed(z) * self.arch.pooled))
+
+
+class IntegerWindowStepper(IntegerStepper):
+    """The same for the padding ``mirror``: each decision computes the whole window again."""
+
+    def _clear(self) -> None:
+        self._windows = WindowRing(self.arch)
+
+    def _advance(self, chunk: NDArray[Any]) -> Ints:
+        # 32-bit values are exact in the ring's float64.
+        due = self._windows.feed(chunk.astype(np.float64)).astype(np.int64)
+        return self._dense.apply(self.network.sums(due.transpose(0, 2, 1))) if len(due) else self.network._none()

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import TrainingError
-from plushsense.models.arch import NORM_EPSILON, Arch
+from plushsense.models.arch import NORM_EPSILON, Arch, reflected
 from plushsense.models.net import Net, VectorNet
 from plushsense.runtime.integer import deployable
 from plushsense.training.engine import slices, torch_threads
@@ -67,7 +67,7 @@ def fine_tune(
     if not deployable(arch) or not calibration:
         raise TrainingError(
             f"{arch.title} cannot be deployed, so there is nothing to fine-tune it for: train it with --padding stream "
-            "and --norm batch or none."
+            "or mirror and --norm batch or none."
         )
     if epochs < 1:
         raise TrainingError(f"{epochs} epochs of fine-tuning: accepted are 1 and more.")
@@ -135,6 +135,8 @@ class Rounded:
         codes = _whole((x - start[:, None]) / unit[:, None])
         for i, (layer, top) in enumerate(zip(arch.layers, self._tops, strict=True)):
             w, b = _rounded(tensors[f"conv{i}.weight"], tensors[f"conv{i}.bias"], unit, start, mean)
+            if arch.padding == "mirror":
+                codes = codes[:, :, reflected(codes.shape[2], layer.reach)]
             sums = F.conv1d(codes, w, b, dilation=layer.dilation)
             codes = _whole(sums / (top / 255)[:, None])
             gain, start = torch.ones_like(top), torch.zeros_like(top)

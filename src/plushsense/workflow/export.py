@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import BadInput, BundleError
+from plushsense.core.errors import ArchError, BadInput, BundleError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
 from plushsense.core.sentences import Sentence
@@ -106,25 +106,31 @@ def export(
     out: str | os.PathLike[str],
     *,
     dataset: Dataset | str | os.PathLike[str] | None = None,
+    step_s: float | None = None,
     also: Sequence[str] = (),
     warn: Warn = silent,
 ) -> ExportResult:
     """Write the files that a toy needs to run a bundle's network: C99, the model as data, golden vectors, packages.
 
     Args:
-        bundle: a bundle with ``stream`` padding and batch normalisation.
+        bundle: a bundle with the padding ``stream`` or ``mirror``, and batch normalisation or none. With ``mirror`` it
+            becomes a window network, which computes the whole window again at every step.
         out: a new or empty folder.
         dataset: the data set of the training, to calibrate on; required if the bundle has no calibration.
+        step_s: seconds from one decision of a window network to the next; by default those of the bundle.
         also: formats for other runtimes (`plushsense.deploy.convert.CONVERTERS`), such as ``onnx``.
         warn: called with a sentence for everything unusual.
 
     Raises:
-        ArchError: for a network that cannot be deployed; the message suggests the nearest one that can.
+        ArchError: for a network that cannot be deployed; the message suggests the nearest one that can. Also for a
+            ``step_s`` longer than the window, or for a streaming network, whose pooling is made for its own step.
         BundleError: for a bundle without calibration, or a conversion whose output differs from the network's.
         ConfigError, MissingExtraError: for an unknown format, or one whose package is not installed.
         BadInput: for a folder that is not empty.
     """
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
+    if step_s is not None:
+        given = _with_step(given, step_s)
     windows = None
     if dataset is not None:
         dataset = as_dataset(dataset)
@@ -148,6 +154,18 @@ def export(
     for name in also:
         check_format(name)
     return emit(model, given, Path(out), extras=[converted, package])
+
+
+def _with_step(bundle: Bundle, step_s: float) -> Bundle:
+    arch = bundle.arch
+    if arch.padding == "stream":
+        raise ArchError(
+            f"{arch.title} is a streaming network, whose pooling has steps of {arch.step} samples: only a window "
+            "network (padding mirror) can take another step, so leave it out."
+        )
+    if not 0.0 < step_s <= 60.0:
+        raise ArchError(f"The step is {step_s:g} s: accepted are more than 0, and at most the window of the network.")
+    return replace(bundle, arch=replace(arch, step=bundle.layout.samples(step_s)))
 
 
 @dataclass(frozen=True)

@@ -326,7 +326,11 @@ PLUSH_SMALL static int read_head(plush_toy *toy, source *from)
     toy->layout = (uint16_t)le16(p + 26);
     toy->ranges = next_bytes(from, RANGE_BYTES * toy->channels);
     if (toy->layers == 0 || toy->layers > PLUSH_MAX_LAYERS || toy->channels == 0 || toy->inputs == 0 ||
+#ifdef PLUSH_WINDOW
+        toy->classes == 0 || toy->step == 0 || toy->step > MOST_STEP || toy->blocks != 0 || toy->period == 0 ||
+#else
         toy->classes == 0 || toy->step == 0 || toy->step > MOST_STEP || toy->blocks == 0 || toy->period == 0 ||
+#endif /* PLUSH_WINDOW */
         toy->period > MOST_UNITS || toy->gap == 0 || toy->gap > MOST_UNITS || toy->units_per_ms == 0 ||
         toy->smoothing == 0 || toy->smoothing > PLUSH_ONE || toy->ranges == NULL)
         return 0;
@@ -581,12 +585,31 @@ PLUSH_SMALL static int read_gate_plan(plush_toy *toy, source *from)
 PLUSH_SMALL static int read_model(plush_toy *toy, const uint8_t *model)
 {
     source from;
+#ifdef PLUSH_WINDOW
+    uint32_t i;
+#else
     uint32_t span, i;
+#endif /* PLUSH_WINDOW */
 
     from.at = model + HEAD_BYTES;
     from.left = word_at(model + 8) - HEAD_BYTES;
     if (!read_head(toy, &from) || !read_input_plan(toy, &from) || !read_vectors(toy, &from))
         return 0;
+#ifdef PLUSH_WINDOW
+    if (toy->vectors != 0 || toy->span < 2 || toy->span > MOST_ROWS)
+        return 0;
+    for (i = 0; i < toy->layers; i++) {
+        plush_layer *layer = &toy->layer[i];
+
+        if (!read_layer(layer, toy->features, &from))
+            return 0;
+        toy->features = layer->filters;
+        if (i == 0 || layer->rows > toy->span)
+            layer->rows = (uint16_t)toy->span;
+    }
+    return read_dense_and_names(toy, &from) && read_event_plan(toy, &from) && read_health_plan(toy, &from) &&
+           read_gate_plan(toy, &from) && from.left == 0;
+#else
     span = (uint32_t)toy->step * toy->blocks + (toy->vectors != 0 ? toy->vector_taps - 1u : 0u);
     for (i = 0; i < toy->layers; i++) {
         if (!read_layer(&toy->layer[i], toy->features, &from))
@@ -596,6 +619,7 @@ PLUSH_SMALL static int read_model(plush_toy *toy, const uint8_t *model)
     }
     return toy->span == span && read_dense_and_names(toy, &from) && read_event_plan(toy, &from) &&
            read_health_plan(toy, &from) && read_gate_plan(toy, &from) && from.left == 0;
+#endif /* PLUSH_WINDOW */
 }
 
 /* A piece of the memory; only reckoned while there is none. */
@@ -636,7 +660,9 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         layer->ring = (uint8_t *)take(memory, &used, (uint32_t)layer->rows * layer->groups * GROUP);
         layer->tap_sums = (uint32_t *)take(memory, &used, UINT32_C(4) * layer->dilation);
     }
+#ifndef PLUSH_WINDOW
     toy->sums = (uint16_t *)take(memory, &used, UINT32_C(2) * toy->features * toy->blocks);
+#endif /* PLUSH_WINDOW */
     toy->total = (uint32_t *)take(memory, &used, 4u * toy->features);
     toy->logits = (int32_t *)take(memory, &used, 4u * toy->classes);
     toy->smooth = (int32_t *)take(memory, &used, 4u * (toy->classes + 1u));
@@ -672,6 +698,55 @@ static uint8_t *next_row(plush_layer *layer)
     return layer->ring + (uint32_t)layer->newest * layer->groups * GROUP;
 }
 
+#ifdef PLUSH_WINDOW
+/* Where the taps of a position lie on the window: the first one at `at`, the next one `by` further. Before the first
+ * sample and after the last, they turn around. */
+typedef struct {
+    int32_t at, by;
+    int32_t last;  /* sample of the window */
+    int32_t first; /* row of the ring, for sample 0 of the window */
+} taps_on;
+
+/* The taps of the next position of a layer that can read `made` samples of a window of `span`. */
+static taps_on next_taps(const plush_layer *layer, uint32_t made, uint32_t span)
+{
+    uint32_t reach = (layer->kernel - 1u) * (uint32_t)layer->dilation, around = 2u * (span - 1u), before;
+    taps_on taps;
+
+    taps.by = layer->dilation;
+    taps.last = (int32_t)span - 1;
+    taps.first = (int32_t)layer->newest + 1 - (int32_t)made;
+    if (layer->done >= reach) {
+        taps.at = (int32_t)(layer->done - reach);
+        return taps;
+    }
+    before = reach - layer->done;
+    if (before >= span)
+        before %= around;
+    if (before >= span) {
+        taps.at = (int32_t)(around - before);
+    } else {
+        taps.at = (int32_t)before;
+        taps.by = -taps.by;
+    }
+    return taps;
+}
+
+static uint32_t row_under(const plush_layer *layer, int32_t at, int32_t first)
+{
+    return (uint32_t)(at + first < 0 ? at + first + layer->rows : at + first);
+}
+
+static void go_on(taps_on *taps)
+{
+    taps->at += taps->by;
+    while (taps->at < 0 || taps->at > taps->last) {
+        taps->at = taps->at < 0 ? -taps->at : 2 * taps->last - taps->at;
+        taps->by = -taps->by;
+    }
+}
+
+#endif /* PLUSH_WINDOW */
 static uint32_t row_sum(const plush_layer *layer, uint32_t row)
 {
     const uint8_t *x = layer->ring + row * layer->groups * GROUP;
@@ -684,11 +759,27 @@ static uint32_t row_sum(const plush_layer *layer, uint32_t row)
 
 /* What every weight's + 128 adds to the sums of the newest position: 128 times all activations under the taps. Their
  * sum is that of `dilation` samples ago, less the row that has left, plus the one that has come. */
+#ifdef PLUSH_WINDOW
+static uint32_t surplus(plush_layer *layer, taps_on taps)
+{
+    uint32_t *kept = &layer->tap_sums[layer->phase], first = row_under(layer, taps.at, taps.first), sum = 0;
+
+    if (layer->done < layer->dilation) {
+        uint32_t n;
+
+        for (n = layer->kernel; n > 0; n--, go_on(&taps))
+            sum += row_sum(layer, row_under(layer, taps.at, taps.first));
+    } else {
+        sum = *kept + row_sum(layer, row_under(layer, layer->done, taps.first));
+    }
+    *kept = sum - row_sum(layer, first);
+#else
 static uint32_t surplus(plush_layer *layer)
 {
     uint32_t *kept = &layer->tap_sums[layer->phase], sum = *kept + row_sum(layer, layer->newest);
 
     *kept = sum - row_sum(layer, oldest(layer));
+#endif /* PLUSH_WINDOW */
     layer->phase = (uint16_t)(layer->phase + 1u < layer->dilation ? layer->phase + 1u : 0u);
     return sum * WEIGHT_ZERO;
 }
@@ -790,6 +881,26 @@ static uint32_t surplus(plush_layer *layer)
 /* The sums of four filters at the newest position, of activations times (weight + 128), modulo 2^32; returns where the
  * next filters' weights begin. By itself, so that its loop has all registers. */
 PLUSH_APART
+#ifdef PLUSH_WINDOW
+static const uint8_t *four_sums(const plush_layer *layer, taps_on on, const uint8_t *w, uint32_t sum[GROUP])
+{
+    uint32_t row = layer->groups * GROUP, taps = layer->kernel;
+    PLUSH_SUMS;
+
+    do {
+        const uint8_t *x = layer->ring + row_under(layer, on.at, on.first) * row, *end = x + row;
+
+        do {
+            PLUSH_SIXTEEN;
+            w += 16;
+            x += 4;
+        } while (x != end);
+        go_on(&on);
+    } while (--taps != 0);
+    PLUSH_GIVE;
+    return w;
+}
+#else
 static const uint8_t *four_sums(const plush_layer *layer, const uint8_t *w, uint32_t sum[GROUP])
 {
     uint32_t row = layer->groups * GROUP, size = layer->rows * row, stride = layer->dilation * row;
@@ -811,6 +922,7 @@ static const uint8_t *four_sums(const plush_layer *layer, const uint8_t *w, uint
     PLUSH_GIVE;
     return w;
 }
+#endif /* PLUSH_WINDOW */
 
 /* ReLU, and a sum to 8 bits. */
 static uint32_t requantize(int32_t sum, const uint8_t *scale)
@@ -827,6 +939,16 @@ static uint32_t requantize(int32_t sum, const uint8_t *scale)
 }
 
 /* One new position of a layer, (filters) activations. */
+#ifdef PLUSH_WINDOW
+static void advance(plush_layer *layer, taps_on taps, uint8_t *out)
+{
+    const uint8_t *weights = layer->weights, *scale = layer->scales;
+    uint32_t extra = surplus(layer, taps), sum[GROUP], f, i;
+
+    layer->done++;
+    for (f = 0; f < layer->filters; f += GROUP) {
+        weights = four_sums(layer, taps, weights, sum);
+#else
 static void advance(plush_layer *layer, uint8_t *out)
 {
     const uint8_t *weights = layer->weights, *scale = layer->scales;
@@ -834,11 +956,45 @@ static void advance(plush_layer *layer, uint8_t *out)
 
     for (f = 0; f < layer->filters; f += GROUP) {
         weights = four_sums(layer, weights, sum);
+#endif /* PLUSH_WINDOW */
         for (i = 0; i < GROUP && f + i < layer->filters; i++, scale += SCALE_BYTES)
             out[f + i] = (uint8_t)requantize(as_signed(sum[i] + le32(scale) - extra), scale);
     }
 }
 
+#ifdef PLUSH_WINDOW
+/* One new sample, whose quantized inputs are in the first ring. When a step is complete, all of the window goes through
+ * all layers into the pooling again: the last layer position by position, and those below as far as it needs them, so
+ * that a layer remembers no more than what lies under its taps. */
+PLUSH_APART
+static void network_sample(plush_toy *toy)
+{
+    plush_layer *last = &toy->layer[toy->layers - 1u], *layer = last;
+    uint32_t f;
+
+    if (toy->filled + 1u < toy->step || toy->warm + 1u < toy->span)
+        return;
+    memset(toy->total, 0, 4u * toy->features);
+    for (f = 0; f < toy->layers; f++)
+        toy->layer[f].done = toy->layer[f].phase = 0;
+    while (last->done < toy->span) {
+        uint32_t made = layer == toy->layer ? toy->span : layer[-1].done;
+
+        if (made <= layer->done || made < layer->rows) {
+            layer--;
+        } else if (layer != last) {
+            advance(layer, next_taps(layer, made, toy->span), next_row(layer + 1));
+            layer++;
+        } else {
+            advance(layer, next_taps(layer, made, toy->span), toy->top);
+            for (f = 0; f < toy->features; f++)
+                toy->total[f] += toy->top[f];
+            if (toy->on_position != NULL)
+                toy->on_position(toy, toy->user);
+        }
+    }
+}
+#else
 /* One new sample, whose quantized inputs are in the first ring, through all layers into the pooling. */
 PLUSH_APART
 static void network_sample(plush_toy *toy)
@@ -856,6 +1012,7 @@ static void network_sample(plush_toy *toy)
         toy->total[f] += toy->top[f];
     }
 }
+#endif /* PLUSH_WINDOW */
 
 /* ---- From pooled sums to an answer ----------------------------------------------------------------------------- */
 
@@ -1215,9 +1372,11 @@ static void event_step(plush_toy *toy, uint32_t best, uint32_t ms)
 PLUSH_APART
 static void answer(plush_toy *toy, uint32_t ms)
 {
+#ifndef PLUSH_WINDOW
     uint16_t *sums;
     uint32_t f;
 
+#endif /* PLUSH_WINDOW */
     toy->answer.ms = ms;
     if (toy->warm >= toy->span) {
         toy->answer.state = PLUSH_TRACKING;
@@ -1227,12 +1386,14 @@ static void answer(plush_toy *toy, uint32_t ms)
         blind_step(toy, ms);
     }
     toy->filled = 0;
+#ifndef PLUSH_WINDOW
     toy->block = (uint16_t)(toy->block + 1u < toy->blocks ? toy->block + 1u : 0u);
     sums = toy->sums + (uint32_t)toy->block * toy->features;
     for (f = 0; f < toy->features; f++) {
         toy->total[f] -= sums[f];
         sums[f] = 0;
     }
+#endif /* PLUSH_WINDOW */
     toy->answers++;
     if (toy->on_answer != NULL)
         toy->on_answer(toy, toy->user);

@@ -34,7 +34,11 @@
 extern "C" {
 #endif
 
+#ifdef PLUSH_WINDOW
+#define PLUSH_IMAGE_VERSION 5 /* of window networks, which compute the whole window again at every step */
+#else
 #define PLUSH_IMAGE_VERSION 4
+#endif /* PLUSH_WINDOW */
 #define PLUSH_MAX_LAYERS 4
 #define PLUSH_ONE 32768 /* a confidence or probability of 1 */
 #define PLUSH_NO_GESTURE 255
@@ -111,6 +115,9 @@ typedef struct {
     uint16_t dilation;
     uint16_t newest;        /* row of the newest sample */
     uint16_t phase;         /* the next of tap_sums */
+#ifdef PLUSH_WINDOW
+    uint16_t done;          /* positions of the window that are computed */
+#endif /* PLUSH_WINDOW */
     const uint8_t *scales;  /* of each filter: bias, multiplier, shifts */
     const uint8_t *weights;
     uint8_t *ring;          /* rows x groups x 4 activations */
@@ -132,6 +139,11 @@ typedef struct plush_toy {
      * (plush_push, plush_silence, plush_restart, plush_begin, plush_swap, plush_patch). A step's event comes before its answer. */
     void (*on_answer)(const struct plush_toy *toy, void *user);
     void (*on_event)(const struct plush_toy *toy, void *user);
+#ifdef PLUSH_WINDOW
+    /* Called many times while a step computes its window, by the same rules; may be NULL. Readings that are due meanwhile
+     * can be taken here and kept with their times, to be pushed when plush_push() has returned. */
+    void (*on_position)(const struct plush_toy *toy, void *user);
+#endif /* PLUSH_WINDOW */
     void *user;
 
     /* The model, as it was read. `channels` and `layout` may be read, too: `layout` stands for the names, units, steps
@@ -181,7 +193,9 @@ typedef struct plush_toy {
     /* Pooling and smoothing. */
     uint16_t filled, block;
     uint8_t *top;            /* the last layer's newest activations */
+#ifndef PLUSH_WINDOW
     uint16_t *sums;          /* blocks x features */
+#endif /* PLUSH_WINDOW */
     uint32_t *total;         /* of each feature: its sum over all blocks */
     uint32_t warm;           /* samples, up to the span */
     uint8_t started;         /* the smoothing has begun */

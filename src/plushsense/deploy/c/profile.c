@@ -153,6 +153,7 @@ static void count_stages(const int32_t *row, const int32_t *end)
             gate_sample(&toy, (uint32_t)row[0]);
             gate += since(then);
         }
+        toy.filled = (uint16_t)samples; /* a window network computes when the step is complete */
         then = target_instructions();
         network_sample(&toy);
         network += since(then);

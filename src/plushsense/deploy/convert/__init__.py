@@ -94,6 +94,15 @@ def refuse_vectors(arch: Arch, suffix: str) -> None:
         )
 
 
+def refuse_window(arch: Arch, format_name: str) -> None:
+    """Raise ArchError for a network with padding, which a format of 8 bits cannot hold here."""
+    if arch.padding != "stream":
+        raise ArchError(
+            f"{arch.title} has the padding '{arch.padding}', which PlushSense does not write to {format_name}: take "
+            f"the C of plushsense export, onnx, onnx-int8 or tflite, or train {arch.symbol} with --padding stream."
+        )
+
+
 def check_format(name: str) -> None:
     """Raise ConfigError for an unknown format."""
     check_known(name, CONVERTERS, "format", ConfigError)

@@ -29,6 +29,7 @@ from plushsense.deploy.convert import (
     compared,
     describe,
     refuse_vectors,
+    refuse_window,
 )
 from plushsense.deploy.convert.onnx import OnnxGraph
 from plushsense.deploy.quantize import Ranges, folded, refuse_undeployable
@@ -62,6 +63,7 @@ def to_espdl(job: ConversionJob, target: str) -> Conversion:
     """
     bundle = job.bundle
     refuse_undeployable(bundle.arch)
+    refuse_window(bundle.arch, "espdl")
     refuse_vectors(bundle.arch, ".espdl")
     job = job.thinned(_MOST)
     scaled = bundle.scaler.apply(job.windows)

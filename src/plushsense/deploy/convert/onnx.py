@@ -230,7 +230,8 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
         scales = sum_scales(integer_layer.scale.multiplier, integer_layer.scale.before, integer_layer.scale.after)
         w = dequantized(f"conv{i}.weight", integer_layer.weights, scales)
         b = dequantized(f"conv{i}.bias", integer_layer.bias.astype(np.int32), scales)
-        z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel])
+        z, pads = _padding(g, i, arch, layer, z)
+        z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel], pads=pads)
         z = quantized(g.add("Relu", f"relu{i}", z), f"layer{i}")
     z = _mean(g, z)
     dense = network.dense

@@ -28,6 +28,7 @@ from plushsense.deploy.convert import (
     describe,
     input_codes,
     refuse_vectors,
+    refuse_window,
     scaling,
     sum_scales,
 )
@@ -276,6 +277,7 @@ def to_tflite(job: ConversionJob) -> Conversion:
 
 def to_integer_tflite(job: ConversionJob) -> Conversion:
     """Convert the network with int8 convolutions; its outputs are close to those of the C, not bit-identical."""
+    refuse_window(job.bundle.arch, "tflite-int8")
     refuse_vectors(job.bundle.arch, ".tflite")
     network = integer_network(job.bundle)
     model = integer_model(job.bundle, network)

@@ -26,6 +26,7 @@ from plushsense.windows.clock import resample
 
 _LOW, _HIGH = -(1 << 31), (1 << 31) - 1
 _PAUSE_MS = 1000
+_SLOWEST_MACS_S = 2e6  # multiply-accumulates that an emulator does in a second, on a busy computer
 
 
 def recorded_frames(dataset: Dataset, layout: Layout, *, subjects: Sequence[str] = (), rows: int) -> Ints:
@@ -198,6 +199,10 @@ class Export:
         for name, content in self._code.items():
             (room / name).write_bytes(content)
         return room
+
+    def seconds(self, vectors: Sequence[Vectors]) -> float:
+        """Return how long the network of the vectors' decisions takes at most on the slowest emulator."""
+        return sum(v.decisions for v in vectors) * self.model.network.arch.macs_per_step / _SLOWEST_MACS_S
 
     @property
     def labels(self) -> tuple[str, ...]:

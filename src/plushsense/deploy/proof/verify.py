@@ -360,8 +360,8 @@ class _Runner:
             (copy / IMAGE).write_bytes(mutant.image)
         if mutant.source is not None:
             (copy / LIBRARY[1]).write_text(mutant.source, _ENCODING)
-        # On the host compiling takes longer than running.
-        optimise = "-O0" if setting.target == "host" else "-O2"
+        # On the host compiling a streaming network takes longer than running it.
+        optimise = "-O0" if setting.target == "host" and not self.export.model.is_window else "-O2"
         plain = replace(setting, optimise=optimise, flags=("-std=c99",), image=mutant.image is not None)
         streams = streams[: 1 if mutant.image is not None else None]
         # Scenarios are most likely to detect mutants of the rules.
@@ -406,7 +406,7 @@ class _Runner:
             object_folder=self.objects,
         )
         try:
-            got = program.run(timeout_s=60 + 0.02 * sum(len(v.frames) for v in stream))
+            got = program.run(timeout_s=60 + 0.02 * sum(len(v.frames) for v in stream) + self.export.seconds(stream))
         except ProgramError as cause:
             return RowComparison(len(expected), len(expected), 0, f"{where}: {cause}")
         result = compare(expected, got, labels)

@@ -15,7 +15,11 @@ static uint64_t free_at; // when the line is silent again
 
 Port Serial;
 
-uint32_t micros() { return static_cast<uint32_t>(now); }
+#ifndef LOOK_US // that looking at the clock takes
+#define LOOK_US 0
+#endif
+
+uint32_t micros() { return static_cast<uint32_t>(now += LOOK_US); }
 uint32_t millis() { return static_cast<uint32_t>(now / 1000); }
 void pinMode(uint8_t, uint8_t) {}
 void analogWrite(uint8_t pin, int value)
