@@ -503,9 +503,12 @@ def test_a_new_person_is_led_through_the_validation(studio: Fixture, look: Fixtu
     page.get_by_role("alert").get_by_text("Vispirms norādiet").wait_for()
     page.wait_for_function("document.activeElement.dataset.test === 'validation-person'")
     page.keyboard.type("S31")
+    marked(page, "validation-noted").click()
     marked(page, "validate").click()
     trial = "() => parseInt(document.querySelector('[data-test=validation-trial]').textContent.match(/[0-9]+/))"
     page.wait_for_function(f"() => ({trial})() > 2")
+    marked(page, "validation-negative").click()
+    marked(page, "validation-noted-count").get_by_text("Atzīmētas reakcijas: 1").wait_for()
     marked(page, "validation-pause").click()
     marked(page, "validation-prompt").get_by_text("Pauze. Nākamais: ").wait_for()
     marked(page, "validation-trial").get_by_text("no 51").wait_for()
@@ -527,5 +530,5 @@ def test_a_new_person_is_led_through_the_validation(studio: Fixture, look: Fixtu
     with page.expect_download() as saved:
         marked(page, "validation-trials").click()
     rows = list(csv.DictReader(Path(saved.value.path()).read_text(encoding="utf-8").splitlines()))
-    assert {row["who"] for row in rows} == {"S31"} and {row["system"] for row in rows} >= {"rules", "cnn"}
+    assert {row["who"] for row in rows} == {"S31"} and {row["system"] for row in rows} >= {"toy", "rules", "cnn"}
     assert browser.complaints == []

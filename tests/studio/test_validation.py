@@ -39,7 +39,11 @@ def test_every_gesture_is_prompted_made_kept_and_scored(workspace: Workspace) ->
     with pytest.raises(DatasetError, match="no code"):
         validation.begin("Anna", 1, None)
     commands = [
-        (lambda status: status.done == 1, validation.pause),
+        # The toy's own reaction is noted just after the gesture.
+        (lambda status: status.phase == "after", lambda: validation.react("positive")),
+        # A pause in that moment would repeat a trial that was made.
+        (lambda status: status.phase == "after", validation.pause),
+        (lambda status: (status.done, status.phase) == (1, "countdown"), validation.pause),
         # A trial that is skipped does not count.
         (lambda status: (status.label, status.phase) == ("Tail pull", "countdown"), validation.skip),
     ]
@@ -50,7 +54,7 @@ def test_every_gesture_is_prompted_made_kept_and_scored(workspace: Workspace) ->
             commands.pop(0)[1]()
 
     validation.changed = SimpleNamespace(notify=command)  # type: ignore[assignment]
-    validation.begin("S31", 2, None)
+    validation.begin("S31", 2, None, noted=True)
     with pytest.raises(ConfigError, match="under way"):
         validation.begin("S31", 2, None)
     assert validation.status.total == 4
@@ -67,6 +71,11 @@ def test_every_gesture_is_prompted_made_kept_and_scored(workspace: Workspace) ->
     assert result["simulated"] is True and result["people"] == ["S31"]
     trials = {(o["gesture"], o["repetition"]) for o in result["outcomes"]}
     assert ("Tail pull", 1) not in trials and ("Tail pull", 2) in trials and ("Ear scratch 1", 1) in trials
+    # At this speed a press is up to seconds of the toy late, so that it may belong to the trial or not.
+    in_trials = [o["reaction_s"] for o in result["outcomes"] if o["system"] == "toy"]
+    outside = next(row["positive"] for row in result["between"] if row["system"] == "toy")
+    assert len(in_trials) == 3 and sum(s is not None for s in in_trials) + outside == 1
+    assert "noted by a person" in (validation.status.result / "protocol.html").read_text("utf-8")
     (clip,) = clips.all()
     assert (clip.labels[0].gesture, clip.labels[-1].gesture) == ("Ear scratch 1", "Tail pull")
     assert all(label.last - label.first > 50 for label in clip.labels)
@@ -80,6 +89,8 @@ def test_every_gesture_is_prompted_made_kept_and_scored(workspace: Workspace) ->
 def test_a_validation_that_ends_early_keeps_what_was_made(workspace: Workspace) -> None:
     validation, clips, reader = (workspace.part(kind) for kind in (Validation, Clips, LiveReader))
     validation.begin("S31", 1, None)
+    validation.react("positive")
+    assert validation.status.reactions is None
     validation.stop()
     until(lambda: validation.status.phase == "")
     assert (validation.status.result, validation.status.failed, clips.recording) == (None, None, "")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plushsense.experiments.protocol.score import GROUPS, PrintedFigures
+from plushsense.experiments.protocol.score import GROUPS, NAMELESS, PrintedFigures
 from plushsense.reports.figures import data_uri, new_figure
 from plushsense.reports.page import render_page
 from plushsense.reports.table import DASH, Column, Table, number
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 SIMULATION = "SIMULATION: virtual people touched a virtual toy. These figures say nothing about a real one."
 # Okabe and Ito's colours; the marker distinguishes the systems without colour.
-_LOOKS = {"rules": ("#d55e00", "s"), "cnn": ("#0072b2", "o"), "hybrid": ("#009e73", "D")}
-_SHORT = {"rules": "Rules", "cnn": "Network", "hybrid": "Hybrid"}
+_LOOKS = {"toy": ("#cc79a7", "^"), "rules": ("#d55e00", "s"), "cnn": ("#0072b2", "o"), "hybrid": ("#009e73", "D")}
+_SHORT = {"toy": "Toy's own rules", "rules": "Rules", "cnn": "Network", "hybrid": "Hybrid"}
 _JUDGED = {
     "right": "right",
     "family": "other of its family",
@@ -55,6 +55,8 @@ _CELLS = (
 )
 # The paper's figures by group and system.
 PAPER = {(name, system): figures for name, group in GROUPS.items() for system, figures in group.paper.items()}
+# The paper's rules were those of a real toy.
+PAPER |= {(name, "toy"): figures for (name, system), figures in PAPER.items() if system == "rules"}
 _PRINTED = ("answered", "time", "likelihood")
 _PAPER_CELLS = tuple(
     Column(f"paper_{key}", key, group="The paper, real toy", plain=f"paper: {key}", style="paper") for key in _PRINTED
@@ -65,7 +67,7 @@ def _cells(row: Mapping[str, Any], energetic: bool) -> dict[str, str]:
     n = row["trials"]
     return {
         "answered": percent(row["activated"], n),
-        "named": DASH if row["system"] == "rules" else percent(row["named"], n),
+        "named": DASH if row["system"] in NAMELESS else percent(row["named"], n),
         "median": seconds(row["reaction_s"]["median"]),
         "p90": seconds(row["reaction_s"]["p90"]),
         "quick": percent(row["within_200_ms"], n) if energetic else "",
@@ -114,7 +116,7 @@ def gesture_table(result: Mapping[str, Any]) -> Table:
                 "title": row["gesture"] if first else "",
                 "system": _SHORT[row["system"]],
                 **_cells(row, row["gesture"] in energetic),
-                "called": DASH if row["system"] == "rules" else _judgements(row["called"]),
+                "called": DASH if row["system"] in NAMELESS else _judgements(row["called"]),
                 "class": "top" if first else "",
             }
         )
@@ -137,7 +139,7 @@ def judged_table(result: Mapping[str, Any]) -> Table:
         {"title": row["title"], "system": _SHORT[row["system"]]}
         | {judged: percent(row["called"][judged], row["trials"]) for judged in _JUDGED}
         for row in result["rows"]
-        if row["system"] != "rules"
+        if row["system"] not in NAMELESS
     )
     columns: tuple[Column, ...] = (Column("title", "Gestures"), Column("system", "System"))
     columns += tuple(Column(judged, head, "right") for judged, head in _JUDGED.items())
@@ -148,7 +150,7 @@ def confusion_table(result: Mapping[str, Any]) -> Table:
     """Return one row for each true family and system with a network: the recognised families, most frequent first."""
     called: dict[tuple[str, str], list[str]] = {}
     for entry in result["confusions"]:
-        if entry["system"] != "rules":
+        if entry["system"] not in NAMELESS:
             name = entry["called"] or "not named"
             called.setdefault((entry["did"], entry["system"]), []).append(f"{name} {100 * entry['share']:.0f} %")
     rows = tuple(

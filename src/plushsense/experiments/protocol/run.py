@@ -161,6 +161,7 @@ def live_protocol(
     if tune_on is not None:
         baseline, tuned = recorded_rules(tune_on, bundle.gestures, people)
     place = None if out is None else _place(Path(out))
+    noted = ("noted",) if any(s.reactions is not None for s in sittings) else ()
     made = scoring.run(sittings, integer_model(bundle) if engine == "int8" else bundle, baseline)
     result = _with_notes(
         made
@@ -172,7 +173,7 @@ def live_protocol(
             "people_text": ", ".join(people),
             "rules_text": tuned,
             "aims": [],
-            "counted": [NOTES[key] for key in ("answered", "onset_live", "likelihood")],
+            "counted": [NOTES[key] for key in ("answered", "onset_live", "likelihood", *noted)],
         },
         bundle,
         engine,

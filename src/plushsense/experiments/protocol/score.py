@@ -26,7 +26,14 @@ from plushsense.runtime.image import IntegerModel
 from plushsense.runtime.trace import replay, trace_of
 from plushsense.scoring.events import latency_summary
 
-SYSTEMS = {"rules": "Rules only", "cnn": "Network only", "hybrid": "Hybrid: rules and network"}
+SYSTEMS = {
+    "toy": "The toy's own rules, noted by hand",
+    "rules": "Rules only",
+    "cnn": "Network only",
+    "hybrid": "Hybrid: rules and network",
+}
+NAMELESS = ("toy", "rules")
+"""Systems that answer with an affect and never name a gesture."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +124,16 @@ def system_outputs(
         answers = tuple((now / 1e6, answer.best, answer.share / ONE) for now, answer in done.answers)
         outputs[key] = SystemOutput(events_of(done.updates, trace.gestures), answers)
     return outputs
+
+
+def noted_output(reactions: Sequence[tuple[float, str]]) -> SystemOutput:
+    """Return the toy's own reactions, (time in s, affect), as events that last no time."""
+    events = (
+        GestureEvent(kind, number, affect, None, "gate", at_s, at_s)
+        for number, (at_s, affect) in enumerate(reactions, 1)
+        for kind in ("begun", "ended")
+    )
+    return SystemOutput(tuple(events))
 
 
 @dataclass
@@ -300,7 +317,10 @@ def run(
     people: list[str] = []
     for done, sitting in enumerate(sittings, 1):
         people.append(sitting.who)
-        for system, output in system_outputs(sitting.frames, model, baseline).items():
+        outputs = system_outputs(sitting.frames, model, baseline)
+        if sitting.reactions is not None:
+            outputs["toy"] = noted_output(sitting.reactions)
+        for system, output in outputs.items():
             made, stray = score(sitting, system, output, gestures)
             outcomes += made
             between.setdefault(system, []).append(stray)

@@ -46,11 +46,15 @@ class GestureTrial:
 
 @dataclass(frozen=True, eq=False)
 class Sitting:
-    """A session of one person: the whole stream and the gestures in it, in order."""
+    """A session of one person: the whole stream and the gestures in it, in order.
+
+    ``reactions`` are the toy's own, (time in s since the first frame, affect), as a person noted them; None: not noted.
+    """
 
     who: str
     frames: Frames
     trials: tuple[GestureTrial, ...]
+    reactions: tuple[tuple[float, str], ...] | None = None
 
 
 def virtual_numbers(people: int, first: int, provenance: Mapping[str, Any]) -> list[int]:

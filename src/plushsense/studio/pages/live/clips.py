@@ -223,15 +223,18 @@ class Clips:
             running = self._running
             if running is None or only not in (None, running):
                 return ""
-            self._running = None
             with contextlib.suppress(ValueError):
                 running.device.taps.remove(self._tap)
             running.ended = True
             assert running.writer is not None
             with running.lock:
                 running.writer.submit(_close_event(running.receiver))
-            running.writer.close()
-            running.session.close()
+            try:
+                running.writer.close()
+                running.session.close()
+            finally:
+                # Not before: a validation labels the clip as soon as it is no longer being recorded.
+                self._running = None
             self.failed = running.failed
         self.changed.notify()
         return running.key

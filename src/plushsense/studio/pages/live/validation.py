@@ -49,6 +49,7 @@ class ValidationStatus:
         label, repetition: the gesture that is prompted.
         left_s: whole seconds until the phase ends.
         done: number of trials that were made.
+        reactions: number of the toy's own reactions that were noted; None where they are not noted.
         result: folder of the last result, None before the first.
         failed: the error that ended the last validation, if any.
     """
@@ -60,6 +61,7 @@ class ValidationStatus:
     repetition: int = 1
     left_s: int = 0
     done: int = 0
+    reactions: int | None = None
     result: Path | None = None
     failed: PlushSenseError | None = None
 
@@ -77,6 +79,7 @@ class _Run:
     tune_on: Path | None
     device: TappedDevice
     trials: list[GestureTrial]
+    reactions: list[tuple[float, str]] | None = None
     until_s: float = 0.0
     start_s: float = 0.0
     performed: int = 0
@@ -96,11 +99,12 @@ class Validation:
 
     # Commands ---------------------------------------------------------------------------------------------------
 
-    def begin(self, subject: str, repetitions: int, tune_on: Path | None) -> None:
+    def begin(self, subject: str, repetitions: int, tune_on: Path | None, noted: bool = False) -> None:
         """Begin with the first trial: every gesture of the bundle but idle ones, ``repetitions`` times in a row.
 
         Args:
             tune_on: data set on whose people the rule baseline is tuned; None leaves the rules out.
+            noted: whether somebody notes the toy's own reactions with `react`.
 
         Raises:
             ConfigError: if no toy is read, or a clip or validation is under way. DatasetError: as for `Clips.begin`.
@@ -115,18 +119,19 @@ class Validation:
             labels = [g.label for g in bundle.gestures.gestures if not g.idle]
             plan = [(label, n) for label in labels for n in range(1, repetitions + 1)]
             person = clip.partition("/")[0]
-            run = _Run(person, clip, plan, bundle, choice.engine, choice.simulated, tune_on, device, [])
+            reactions: list[tuple[float, str]] | None = [] if noted else None
+            run = _Run(person, clip, plan, bundle, choice.engine, choice.simulated, tune_on, device, [], reactions)
             self._run = run
-            self.status = ValidationStatus(total=len(plan), result=self.status.result)
+            self.status = ValidationStatus(total=len(plan), reactions=0 if noted else None, result=self.status.result)
             self._prompt(run, 0, 0.0, None)
             device.taps.append(self._tap)
         self.changed.notify()
 
     def pause(self) -> None:
-        """Stop the prompts, or continue with the countdown of the same trial."""
+        """Stop the prompts, or continue with the countdown of the same trial; after a trial, wait for the next one."""
         with self._lock:
             run = self._run
-            if run is None or self.status.phase == "scoring":
+            if run is None or self.status.phase not in ("countdown", "doing", "paused"):
                 return
             if self.status.phase == "paused":
                 self._prompt(run, self.status.at, self._clips.recorded_s, None)
@@ -140,6 +145,15 @@ class Validation:
             run = self._run
             if run is not None and self.status.phase in ("countdown", "doing", "paused"):
                 self._next(run, self._clips.recorded_s, None)
+        self.changed.notify()
+
+    def react(self, affect: str) -> None:
+        """Note that the toy's own rules reacted just now; ``affect`` is "positive" or "negative"."""
+        with self._lock:
+            run = self._run
+            if run is not None and run.reactions is not None and self.status.phase != "scoring":
+                run.reactions.append((self._clips.recorded_s, affect))
+                self.status = replace(self.status, reactions=len(run.reactions))
         self.changed.notify()
 
     def stop(self) -> None:
@@ -276,7 +290,8 @@ class Validation:
         home = self._workspace
         out = home.new(FOLDER, home.free_name(FOLDER, run.subject))
         tune_on = open_dataset(home.inside(run.tune_on)) if run.tune_on is not None else None
-        sitting = Sitting(run.subject, frames, tuple(run.trials))
+        reactions = None if run.reactions is None else tuple(run.reactions)
+        sitting = Sitting(run.subject, frames, tuple(run.trials), reactions)
         live_protocol(run.bundle, [sitting], engine=run.engine, tune_on=tune_on, simulated=run.simulated, out=out)
         return out
 

@@ -6,12 +6,14 @@ import asyncio
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from nicegui import ui
 
 from plushsense.experiments.protocol.run import PAGE, TABLE, TRIALS
+from plushsense.experiments.protocol.score import NAMELESS
 from plushsense.studio.app.shell import Page, button, html, on_change, section, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.live.feedback_page import PersonFields
@@ -51,6 +53,7 @@ class _ValidationPanel:
             first = next(iter(datasets), "")
             self._rules = ui.select(rules, value=first, label=words("validation.rules")).classes("w-64")
             tag(self._rules, "validation-rules")
+            self._noted = tag(ui.checkbox(words("validation.noted")), "validation-noted")
             self._begin = button("validate", words("validation.begin"), self._start, "unelevated", icon="play_arrow")
         self._prompts = tag(ui.column().classes("w-full ps-card ps-next ps-small-gap"), "validation-prompts")
         with self._prompts:
@@ -69,6 +72,12 @@ class _ValidationPanel:
                     "validation-skip", words("validation.skip"), self._validation.skip, icon="skip_next"
                 )
                 button("validation-stop", words("validation.stop"), self._validation.stop, icon="stop")
+            self._reactions = ui.row().classes("w-full items-center ps-small-gap")
+            with self._reactions:
+                for affect in ("positive", "negative"):
+                    react = partial(self._validation.react, affect)
+                    button(f"validation-{affect}", words(f"validation.toy_{affect}"), react, "outline")
+                self._noted_count = tag(ui.label("").classes("ps-dim"), "validation-noted-count")
         with tag(ui.element("details").classes("w-full"), "validation-results") as self._past:
             summary(words("validation.results"))
             self._results = tag(
@@ -87,7 +96,9 @@ class _ValidationPanel:
         self._page.say("")
         tune_on = Path(self._rules.value) if self._rules.value else None
         with self._page.show_errors():
-            await asyncio.to_thread(self._validation.begin, subject, int(self._repetitions.value), tune_on)
+            await asyncio.to_thread(
+                self._validation.begin, subject, int(self._repetitions.value), tune_on, self._noted.value
+            )
             scroll_to("validation")
 
     def _update_button(self) -> None:
@@ -107,6 +118,9 @@ class _ValidationPanel:
         self._pause.set_text(words("validation.go_on" if status.phase == "paused" else "validation.pause"))
         for control in (self._pause, self._skip):
             control.set_enabled(status.phase in ("countdown", "doing", "paused"))
+        self._reactions.set_visibility(status.reactions is not None)
+        if status.reactions is not None:
+            self._noted_count.set_text(words("validation.noted_count", n=status.reactions))
         drawn = (status.label, status.result, status.failed)
         if drawn == self._drawn:
             return
@@ -153,6 +167,7 @@ def _result_table(words: Words, result: Mapping[str, Any]) -> None:
     """Add the table of a result: the trials of each gesture, as rules and network answered them."""
     systems = [row["system"] for row in result["systems"]]
     network = "hybrid" if "hybrid" in systems else "cnn"
+    nameless = [system for system in systems if system in NAMELESS]
     by = {(row["gesture"], row["system"]): row for row in result["by_gesture"]}
     everything = {row["system"]: row for row in result["rows"] if row["group"] == "all"}
     labels = list(dict.fromkeys(row["gesture"] for row in result["by_gesture"]))
@@ -167,14 +182,14 @@ def _result_table(words: Words, result: Mapping[str, Any]) -> None:
         one = row[network]
         likelihood = "–" if one["likelihood"] is None else words.number(one["likelihood"], 2)
         cells = [name]
-        if "rules" in systems:
-            rules = row["rules"]
-            cells += [f"{rules['activated']}/{rules['trials']}", seconds(rules["reaction_s"]["median"])]
+        for system in nameless:
+            answers = row[system]
+            cells += [f"{answers['activated']}/{answers['trials']}", seconds(answers["reaction_s"]["median"])]
         cells += [f"{one['activated']}/{one['trials']}", seconds(one["reaction_s"]["median"])]
         cells += [f"{one['named']}/{one['trials']}", seconds(one["gesture_s"]["median"]), likelihood]
         rows.append(cells)
     head = [words("log.gesture")]
-    head += [words("validation.rules_answered"), words("validation.rules_time")] if "rules" in systems else []
+    head += [words(f"validation.{system}_{what}") for system in nameless for what in ("answered", "time")]
     head += [words(f"validation.{key}") for key in ("answered", "answered_time", "named", "named_time", "likelihood")]
     if result["simulated"]:
         notice(words("shell.simulation")).style("box-sizing: border-box")
