@@ -79,7 +79,7 @@ def test_refusals_are_sentences(cli: Cli, dataset: Dataset, tmp_path: Path) -> N
         (("--models", "forests"), "Unknown model 'forests': accepted are quick,"),
         (("--features", "raw"), "Unknown features 'raw': accepted are statistics, flattened."),
         (("--models", "lstm:128"), "Did you mean 'lstm:units=128'?"),
-        (("--pca", "maybe"), "Unknown choice 'maybe' for PCA: accepted are both, no, yes."),
+        (("--pca", "maybe"), "Unknown choice 'maybe' for PCA: accepted are both, no, yes, unscaled, all."),
         (("--split", "windows"), "needs a number of folds"),
         (("--split", "windows:3,windows:3"), "given twice"),
         (("--split", ",", "--models", "knn"), "No split is given"),
@@ -100,6 +100,18 @@ def test_sets_and_names_join_in_the_order_of_the_table() -> None:
     assert chosen("network,bilstm:units=8,lstm:layers=2,lstm:units=32") == (
         "lstm", "lstm:layers=2", "bilstm:units=8", "network",
     )  # fmt: skip
+
+
+def test_pca_without_scaling_has_rows_of_its_own(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
+    words = ("baselines", dataset.path, "--split", "windows:2", "--models", "tree", "--features", "statistics")
+    found = cli(*words, "--pca", "all", "--workers", 1, "--out", tmp_path / "OUT", "--json").json
+    assert [row["pca"] for row in found["models"]] == [False, True, "unscaled"]
+    page = (tmp_path / "OUT" / "baselines.html").read_text(encoding="utf-8")
+    assert ">statistics, PCA<" in page and ">statistics, PCA unscaled<" in page
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "OUT" / "baselines.csv").read_text(encoding="utf-8"))))
+    assert [row["pca"] for row in rows] == ["False", "True", "unscaled"]
+    ran = cli(*words, "--pca", "unscaled", "--workers", 1)
+    assert "statistics, PCA unscaled" in ran.out and "2 of 2 fits (2 from before)" in ran.err
 
 
 def test_on_real_recordings_a_leaky_split_flatters_trees(cli: Cli, real_data: Path, tmp_path: Path) -> None:

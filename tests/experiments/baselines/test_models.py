@@ -20,7 +20,9 @@ from plushsense.experiments.baselines.models import (
     parse_recurrent,
     recurrent,
 )
+from plushsense.experiments.baselines.score import Pca
 from plushsense.training.spec import TrainSpec
+from plushsense.windows.cut import WindowSet
 from support.fakes import rhythms
 
 pytestmark = pytest.mark.usefixtures("scikit_learn")
@@ -28,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("scikit_learn")
 SAMPLES = 50
 
 
-def fitted(name: str = "knn", features: str = "statistics", pca: bool = False, seed: int = 0) -> FittedClassifier:
+def fitted(name: str = "knn", features: str = "statistics", pca: Pca = False, seed: int = 0) -> FittedClassifier:
     reader = ClassicalFit(name, features, pca, SAMPLES, seed)(rhythms(), rhythms(0))
     assert isinstance(reader, FittedClassifier)
     return reader
@@ -73,6 +75,27 @@ def test_scaling_and_pca_are_fitted_to_the_training_windows_only() -> None:
         kept = np.cumsum(np.sort(np.linalg.eigvalsh(np.cov(scaled.T)))[::-1])
         assert pca.n_components_ == int(np.searchsorted(kept / kept[-1], 0.95)) + 1 < flat.shape[1]
     assert np.array_equal(with_them(train), without(train))
+
+
+def test_an_unscaled_pca_reads_the_features_as_they_are_and_its_components_are_scaled() -> None:
+    train = rhythms()
+    # Planted: one sample with so much variance that nothing else counts, unless everything is scaled first.
+    train = replace(train, x=train.x.copy())
+    train.x[:, 0, 0] = np.random.default_rng(2).integers(-(10**6), 10**6, len(train))
+    unscaled, scaled = fitted_to(train, "unscaled"), fitted_to(train, True)
+    pca, scaler = unscaled.model[0], unscaled.model[1]
+    flat = FEATURES["flattened"](train, SAMPLES)
+    assert pca.mean_ == pytest.approx(flat.mean(axis=0)) and pca.n_components_ == 1
+    assert abs(pca.components_[0, 0]) > 0.999
+    assert scaled.model[1].n_components_ > 3
+    components = unscaled.model[:2].transform(flat)
+    assert components.std(axis=0) == pytest.approx(1.0) and scaler.n_features_in_ == 1
+
+
+def fitted_to(train: WindowSet, pca: Pca) -> FittedClassifier:
+    reader = ClassicalFit("knn", "flattened", pca, SAMPLES, 0)(train, rhythms(0))
+    assert isinstance(reader, FittedClassifier)
+    return reader
 
 
 def test_classical_programs_read_the_end_of_a_longer_window() -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ConfigError, check_known, need
-from plushsense.experiments.baselines.score import Contender, Reader
+from plushsense.experiments.baselines.score import UNSCALED, Contender, Pca, Reader
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler, statistics
@@ -101,7 +101,7 @@ class ClassicalFit:
 
     name: str
     features: str
-    pca: bool
+    pca: Pca
     samples: int
     seed: int
 
@@ -110,7 +110,9 @@ class ClassicalFit:
         enough_to_learn(train)
         steps = [_sklearn("preprocessing").StandardScaler()]
         if self.pca:
-            steps.append(_sklearn("decomposition").PCA(PCA_VARIANCE, svd_solver="full"))
+            # MATLAB's Classification Learner does not scale before PCA; some of its classifiers scale the components.
+            at = 0 if self.pca == UNSCALED else 1
+            steps.insert(at, _sklearn("decomposition").PCA(PCA_VARIANCE, svd_solver="full"))
         pipeline = _sklearn("pipeline").make_pipeline(*steps, BASELINES[self.name].make(self.seed))
         with warnings.catch_warnings():
             # The MLP stops after a fixed number of iterations; the user can do nothing about the warning.
@@ -165,7 +167,7 @@ def enough_to_learn(train: WindowSet) -> None:
 
 
 def classical(
-    names: Sequence[str], features: Sequence[str], pca: Sequence[bool], samples: int, seed: int
+    names: Sequence[str], features: Sequence[str], pca: Sequence[Pca], samples: int, seed: int
 ) -> list[Contender]:
     """Return a contender for each combination of ``names``, ``features`` and ``pca``, except those in `TOO_LONG`.
 

@@ -32,7 +32,7 @@ from plushsense.experiments.baselines.models import (
     recurrent,
     rockets,
 )
-from plushsense.experiments.baselines.score import Contender, Fit, Reader, compare
+from plushsense.experiments.baselines.score import UNSCALED, Contender, Fit, Pca, Reader, compare
 from plushsense.jobs.journal import job_id
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
@@ -58,7 +58,14 @@ SETS: dict[str, tuple[str, ...]] = {
     "classical": tuple(BASELINES),
     "all": (*BASELINES, *RECURRENT, NETWORK),
 }
-PCA: dict[str, tuple[bool, ...]] = {"both": (False, True), "no": (False,), "yes": (True,)}
+# "yes" scales before PCA, "unscaled" after it, as MATLAB's Classification Learner does.
+PCA: dict[str, tuple[Pca, ...]] = {
+    "both": (False, True),
+    "no": (False,),
+    "yes": (True,),
+    UNSCALED: (UNSCALED,),
+    "all": (False, True, UNSCALED),
+}
 
 
 @dataclass(frozen=True)
@@ -148,7 +155,7 @@ def _kind(model: str) -> str:
 def contenders(
     models: Sequence[str],
     features: Sequence[str],
-    pca: Sequence[bool],
+    pca: Sequence[Pca],
     config: RunConfig,
     arch: Arch,
     layout: Layout,
@@ -206,7 +213,7 @@ def baselines(
         splits: such as "leave-one-subject-out", "by-subject:5", "windows:5" (leaky); the gap between them is reported.
         models: names of `MODELS` and `SETS`, or such as "lstm:units=128:dropout=0.5" (see `chosen`).
         features: names of `FEATURES`, for the classical programs.
-        pca: "both", "no" or "yes", for the classical programs.
+        pca: key of `PCA`, for the classical programs.
         cluster: address of a Ray cluster that does the work instead of this machine's processes.
         out: a folder for the table as JSON and CSV, a page and a figure. If it holds a comparison of other settings or
             data, an error is raised unless ``overwrite``.
