@@ -233,8 +233,8 @@ def remarks(paper: Paper) -> list[str]:
         "Table 4 of the paper shows the best of nine schedules per network; ours is one (250 epochs, batches of 64).",
         "The mean macro-F1 over the people counts all 18 classes, as in the paper. ± is the standard deviation: over "
         "the people where one is left out (mean over the seeds), over the seeds or folds elsewhere.",
-        "The paper's 66.3 % with PCA is compared with PCA unscaled: MATLAB's Classification Learner, whose presets the "
-        "paper names, does not scale before PCA. The row “statistics, PCA” does, as usual.",
+        "The paper does not say whether it scaled before PCA. The names of its classifiers are those of MATLAB's "
+        "Classification Learner, which does not, so the paper's 66.3 % is printed beside PCA unscaled.",
         "The mean accuracy and recall over the people do not include recordings at rest without a person; the paper "
         "does not state where it counts them.",
     ]

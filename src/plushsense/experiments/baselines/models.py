@@ -234,7 +234,7 @@ def parse_recurrent(text: str) -> RecurrentSpec:
     """
     kind, *settings = text.split(":")
     pairs = [setting.rpartition("=")[::2] for setting in settings]
-    found = _recurrent(kind, pairs)
+    found = _with_settings(kind, pairs)
     if found is not None:
         return found
     # To suggest a valid text, values without a name are taken in the order of the settings.
@@ -242,7 +242,7 @@ def parse_recurrent(text: str) -> RecurrentSpec:
         (next(iter(difflib.get_close_matches(name, _LIMITS, 1)), key), value)
         for key, (name, value) in zip(_LIMITS, pairs, strict=False)
     ]
-    guess = _recurrent(kind, named) if len(named) == len(pairs) else None
+    guess = _with_settings(kind, named) if len(named) == len(pairs) else None
     limits = ", ".join(f":{key}=NUMBER ({low:g} to {high:g})" for key, (low, high) in _LIMITS.items())
     raise ConfigError(
         f"Model '{text}': after {kind}, accepted are {limits}, each at most once."
@@ -250,7 +250,7 @@ def parse_recurrent(text: str) -> RecurrentSpec:
     )
 
 
-def _recurrent(kind: str, settings: Sequence[tuple[str, ...]]) -> RecurrentSpec | None:
+def _with_settings(kind: str, settings: Sequence[tuple[str, ...]]) -> RecurrentSpec | None:
     """Return the network with some settings (name, value), or None if one is invalid."""
     found: dict[str, Any] = {}
     for name, value in settings:
