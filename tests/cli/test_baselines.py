@@ -58,14 +58,19 @@ def test_one_table_of_two_splits_and_what_is_left_behind(cli: Cli, dataset: Data
 def test_our_network_is_the_one_that_evaluate_scores(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
     settings = ("--filters", "4,4,4", "--epochs", 3, "--preset", "loso", "--workers", 1, "--json")
     scored = cli("evaluate", dataset.path, "--split", "by-subject:2", *settings, "--out", tmp_path / "E").json
-    asked = ("baselines", dataset.path, "--split", "by-subject:2", "--models", "network,lstm", *settings)
+    models = "network,lstm,lstm:units=8:dropout=0.5"
+    asked = ("baselines", dataset.path, "--split", "by-subject:2", "--models", models, *settings)
     found = cli(*asked, "--out", tmp_path / "B").json
     network = next(r for r in found["models"] if r["name"] == "network")
     assert network["accuracy"]["mean"] == pytest.approx(scored["accuracy"]["mean"]) and network["features"] == "windows"
     assert network["pooled"]["macro_f1"] == pytest.approx(scored["pooled"]["macro_f1"])
     # The bundle of so small a network: weights, and the words around them.
     assert 1_500 < network["size_bytes"] < 20_000 and found["gaps"] == []
-    assert {r["name"] for r in found["models"]} == {"lstm", "network"}
+    titles = {r["name"]: (r["title"], r["size_bytes"]) for r in found["models"] if r["name"] != "network"}
+    assert list(titles) == ["lstm", "lstm:units=8:dropout=0.5"] and titles["lstm"][0] == "LSTM (32)"
+    assert titles["lstm:units=8:dropout=0.5"][0] == "LSTM (8, dropout 0.5)"
+    assert titles["lstm:units=8:dropout=0.5"][1] < titles["lstm"][1] / 2
+    assert "LSTM (8, dropout 0.5)" in (tmp_path / "B" / "baselines.html").read_text(encoding="utf-8")
 
 
 def test_refusals_are_sentences(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
@@ -73,7 +78,8 @@ def test_refusals_are_sentences(cli: Cli, dataset: Dataset, tmp_path: Path) -> N
     for words, said in (
         (("--models", "forests"), "Unknown model 'forests': accepted are quick,"),
         (("--features", "raw"), "Unknown features 'raw': accepted are statistics, flattened."),
-        (("--pca", "maybe"), "Unknown choice 'maybe' for PCA: accepted are both, no, yes."),
+        (("--models", "lstm:128"), "Did you mean 'lstm:units=128'?"),
+        (("--pca", "maybe"), "Unknown choice 'maybe' for PCA: accepted are both, no, yes, unscaled, all."),
         (("--split", "windows"), "needs a number of folds"),
         (("--split", "windows:3,windows:3"), "given twice"),
         (("--split", ",", "--models", "knn"), "No split is given"),
@@ -91,6 +97,21 @@ def test_refusals_are_sentences(cli: Cli, dataset: Dataset, tmp_path: Path) -> N
 def test_sets_and_names_join_in_the_order_of_the_table() -> None:
     assert chosen("network, quick,tree") == (*(m for m in MODELS if m in SETS["quick"]), "network")
     assert set(chosen("all")) == set(MODELS) - {"minirocket", "multirocket-hydra"}
+    assert chosen("network,bilstm:units=8,lstm:layers=2,lstm:units=32") == (
+        "lstm", "lstm:layers=2", "bilstm:units=8", "network",
+    )  # fmt: skip
+
+
+def test_pca_without_scaling_has_rows_of_its_own(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
+    words = ("baselines", dataset.path, "--split", "windows:2", "--models", "tree", "--features", "statistics")
+    found = cli(*words, "--pca", "all", "--workers", 1, "--out", tmp_path / "OUT", "--json").json
+    assert [row["pca"] for row in found["models"]] == [False, True, "unscaled"]
+    page = (tmp_path / "OUT" / "baselines.html").read_text(encoding="utf-8")
+    assert ">statistics, PCA<" in page and ">statistics, PCA unscaled<" in page
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "OUT" / "baselines.csv").read_text(encoding="utf-8"))))
+    assert [row["pca"] for row in rows] == ["False", "True", "unscaled"]
+    ran = cli(*words, "--pca", "unscaled", "--workers", 1)
+    assert "statistics, PCA unscaled" in ran.out and "2 of 2 fits (2 from before)" in ran.err
 
 
 def test_on_real_recordings_a_leaky_split_flatters_trees(cli: Cli, real_data: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,9 @@ import pytest
 import plushsense as ps
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import parse_name, read_recording
+from plushsense.dataset.store import Dataset
+from plushsense.experiments.baselines.models import BASELINES
+from plushsense.experiments.baselines.run import baselines
 
 TESTS = Path(__file__).resolve().parents[1]
 
@@ -106,6 +110,30 @@ def test_the_table_is_made_and_goes_on_where_it_stood(
     assert script.main(words) == 0
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "DS" / "cache" / "folds").iterdir()} == folds
     assert capsys.readouterr().out == said
+
+
+def test_the_papers_result_with_pca_stands_beside_pca_without_scaling(
+    made: Path, script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[Any, ...]] = []
+
+    def small(dataset: Dataset, *, models: Any, **settings: Any) -> dict[str, Any]:
+        asked.append((*models, settings["features"], settings["pca"], settings["splits"]))
+        return baselines(dataset, **{**settings, "splits": ("windows:2",)}, models="forest", workers=1)
+
+    monkeypatch.setattr(script, "baselines", small)
+    monkeypatch.setitem(BASELINES, "forest", BASELINES["tree"])
+    rows = script.Paper(made / "archive", None, tmp_path, seeds=1, quick=False).baselines()
+    assert asked == [
+        ("forest", ("statistics",), "all", ("windows:5",)),
+        ("cubic-svm", "forest", "subspace-knn", ("flattened",), "no", ("windows:5",)),
+    ]
+    assert [(row.what.partition(" (leaky")[0], row.paper) for row in rows] == [
+        ("decision tree on statistics", "95.9 %"),
+        ("decision tree on statistics, PCA unscaled", "66.3 %"),
+        ("decision tree on statistics, PCA", "-"),
+        ("decision tree on flattened", "89.7 %"),
+    ]
 
 
 def test_without_a_mapping_the_people_are_asked_for(

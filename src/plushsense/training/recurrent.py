@@ -1,7 +1,7 @@
 """Recurrent networks for comparison: LSTM and BiLSTM, trained with the same schedule and seed as our networks.
 
-The paper tried both (section 3.3) without giving sizes. We use one layer of 32 units, with about as many parameters as
-the default network, and a dense layer on the last state (in a BiLSTM, of both directions).
+A dense layer reads the last state of the last layer (in a BiLSTM, of both directions). The dropout is where the
+authors' script has it, before the dense layer, and between the layers if there are several.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from torch.nn import functional as F
 
 # Part of every training's id: increase it when the same settings give another result.
 RECURRENT_VERSION = 1
-UNITS = 32
 # Windows at a time without gradients; smallest batch to train on, except the first.
 _READ, _FEW = 512, 8
 
@@ -36,14 +35,22 @@ _READ, _FEW = 512, 8
 class Recurrent(nn.Module):
     """LSTM from scaled windows (N, C, T) to logits (N, K)."""
 
-    def __init__(self, channels: int, classes: int, units: int, both_ways: bool) -> None:
+    def __init__(
+        self, channels: int, classes: int, both_ways: bool, units: int, layers: int = 1, dropout: float = 0.0
+    ) -> None:
         super().__init__()
-        self.cell = nn.LSTM(channels, units, batch_first=True, bidirectional=both_ways)
-        self.dense = nn.Linear(units * (1 + both_ways), classes)
+        self.directions = 1 + both_ways
+        # With one layer, PyTorch's LSTM has no place for a dropout, and warns.
+        between = dropout if layers > 1 else 0.0
+        self.cell = nn.LSTM(channels, units, layers, batch_first=True, dropout=between, bidirectional=both_ways)
+        self.dropout = nn.Dropout(dropout)
+        self.dense = nn.Linear(units * self.directions, classes)
 
     def forward(self, x: Tensor) -> Tensor:
-        _, (last, _) = self.cell(x.transpose(1, 2).contiguous())
-        return cast(Tensor, self.dense(torch.cat(tuple(last), dim=1)))
+        # States (layers * directions, N, units): those of the last layer are at the end.
+        _, (states, _) = self.cell(x.transpose(1, 2).contiguous())
+        last = torch.cat(tuple(states[-self.directions :]), dim=1)
+        return cast(Tensor, self.dense(self.dropout(last)))
 
 
 @dataclass(frozen=True)
@@ -71,11 +78,23 @@ class RecurrentReader:
 
 
 def fit_recurrent(
-    train: WindowSet, spec: TrainSpec, samples: int, *, both_ways: bool = False, units: int = UNITS
+    train: WindowSet,
+    spec: TrainSpec,
+    samples: int,
+    *,
+    both_ways: bool = False,
+    units: int,
+    layers: int = 1,
+    dropout: float = 0.0,
 ) -> RecurrentReader:
     """Train on the last ``samples`` of each window, for all epochs of ``spec``; the same seed gives the same weights.
 
-    Learning rates, batch size, augmentations and seed are those of ``spec``; ``patience`` is not used.
+    Learning rates, batch size, augmentations, scaling and seed are those of ``spec``; ``patience`` is not used.
+
+    Args:
+        both_ways: a BiLSTM instead of an LSTM.
+        units: number of units in each layer and direction.
+        dropout: share of values set to 0 in training, before the dense layer and between layers.
 
     Raises:
         TrainingError: without windows, or if the loss becomes NaN or infinite.
@@ -84,12 +103,12 @@ def fit_recurrent(
         raise TrainingError("There are no windows to train on: check the data set, the gestures and the split.")
     began = time.perf_counter()
     device = torch.device(resolve_device(spec).device)
-    scaler = Scaler.fit(train.x[:, :, -samples:])
+    scaler = Scaler.none(train.x.shape[1]) if spec.scaling == "none" else Scaler.fit(train.x[:, :, -samples:])
     x = torch.from_numpy(scaler.apply(train.x[:, :, -samples:])).to(device)
     y = torch.from_numpy(train.y).to(device)
     with torch.random.fork_rng(devices=[]), torch_threads(spec.threads):
         torch.manual_seed(spec.seed)
-        net = Recurrent(x.shape[1], len(train.labels), units, both_ways).to(device)
+        net = Recurrent(x.shape[1], len(train.labels), both_ways, units, layers, dropout).to(device)
         order = torch.Generator().manual_seed(spec.seed)
         augment = augmentations(spec.augment, Channels(train.vectors, scaler, device))
         adam = torch.optim.Adam(net.parameters(), lr=spec.learning_rate)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,15 @@ from plushsense.experiments.baselines.models import (
     FEATURES,
     ClassicalFit,
     FittedClassifier,
+    RecurrentSpec,
     classical,
     likelihoods,
+    parse_recurrent,
+    recurrent,
 )
+from plushsense.experiments.baselines.score import Pca
+from plushsense.training.spec import TrainSpec
+from plushsense.windows.cut import WindowSet
 from support.fakes import rhythms
 
 pytestmark = pytest.mark.usefixtures("scikit_learn")
@@ -23,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("scikit_learn")
 SAMPLES = 50
 
 
-def fitted(name: str = "knn", features: str = "statistics", pca: bool = False, seed: int = 0) -> FittedClassifier:
+def fitted(name: str = "knn", features: str = "statistics", pca: Pca = False, seed: int = 0) -> FittedClassifier:
     reader = ClassicalFit(name, features, pca, SAMPLES, seed)(rhythms(), rhythms(0))
     assert isinstance(reader, FittedClassifier)
     return reader
@@ -70,6 +77,27 @@ def test_scaling_and_pca_are_fitted_to_the_training_windows_only() -> None:
     assert np.array_equal(with_them(train), without(train))
 
 
+def test_an_unscaled_pca_reads_the_features_as_they_are_and_its_components_are_scaled() -> None:
+    train = rhythms()
+    # Planted: one sample with so much variance that nothing else counts, unless everything is scaled first.
+    train = replace(train, x=train.x.copy())
+    train.x[:, 0, 0] = np.random.default_rng(2).integers(-(10**6), 10**6, len(train))
+    unscaled, scaled = fitted_to(train, "unscaled"), fitted_to(train, True)
+    pca, scaler = unscaled.model[0], unscaled.model[1]
+    flat = FEATURES["flattened"](train, SAMPLES)
+    assert pca.mean_ == pytest.approx(flat.mean(axis=0)) and pca.n_components_ == 1
+    assert abs(pca.components_[0, 0]) > 0.999
+    assert scaled.model[1].n_components_ > 3
+    components = unscaled.model[:2].transform(flat)
+    assert components.std(axis=0) == pytest.approx(1.0) and scaler.n_features_in_ == 1
+
+
+def fitted_to(train: WindowSet, pca: Pca) -> FittedClassifier:
+    reader = ClassicalFit("knn", "flattened", pca, SAMPLES, 0)(train, rhythms(0))
+    assert isinstance(reader, FittedClassifier)
+    return reader
+
+
 def test_classical_programs_read_the_end_of_a_longer_window() -> None:
     long = rhythms(30, samples=80)
     past = np.random.default_rng(1).integers(-9000, 9000, (30, 2, 80 - SAMPLES))
@@ -112,6 +140,63 @@ def test_what_takes_too_long_is_left_out() -> None:
     assert len(asked) == 7
     assert ("boosting", "flattened", False) not in {(c.name, c.features, c.pca) for c in asked}
     assert all(c.key["seed"] == 3 and c.key["library"].startswith("scikit-learn ") for c in asked)
+
+
+@pytest.mark.parametrize(
+    ("text", "network", "name", "title"),
+    [
+        ("lstm", RecurrentSpec("lstm"), "lstm", "LSTM (32)"),
+        ("lstm:units=32:dropout=0", RecurrentSpec("lstm"), "lstm", "LSTM (32)"),
+        (
+            "lstm:dropout=.5:units=128", RecurrentSpec("lstm", 128, 1, 0.5),
+            "lstm:units=128:dropout=0.5", "LSTM (128, dropout 0.5)",
+        ),
+        (
+            "bilstm:units=512:layers=2:dropout=0.5", RecurrentSpec("bilstm", 512, 2, 0.5),
+            "bilstm:units=512:layers=2:dropout=0.5", "BiLSTM (512, 2 layers, dropout 0.5)",
+        ),
+    ],
+)  # fmt: skip
+def test_a_recurrent_network_is_written_with_its_settings(
+    text: str, network: RecurrentSpec, name: str, title: str
+) -> None:
+    assert parse_recurrent(text) == network == parse_recurrent(network.name)
+    assert (network.name, network.title) == (name, title)
+
+
+@pytest.mark.parametrize(
+    ("text", "nearest"),
+    [
+        ("lstm:128", "lstm:units=128"),
+        ("bilstm:512:2:0.5", "bilstm:units=512:layers=2:dropout=0.5"),
+        ("lstm:unit=64", "lstm:units=64"),
+        ("lstm:dropot=.5", "lstm:dropout=0.5"),
+        *((text, "") for text in ("lstm:", "lstm:units=0", "lstm:units=9999", "lstm:layers=9", "lstm:dropout=1")),
+        *((text, "") for text in ("lstm:dropout=nan", "lstm:units=8:units=9", "lstm:1:2:0.5:4", "bilstm:units=1.5")),
+    ],
+)
+def test_a_wrong_setting_of_a_recurrent_network_gets_one_sentence(text: str, nearest: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        parse_recurrent(text)
+    said = str(refused.value)
+    assert said.startswith(f"Model '{text}': after {text.partition(':')[0]}, accepted are :units=NUMBER (1 to 4096), ")
+    assert said.endswith(f"Did you mean '{nearest}'?" if nearest else "each at most once.")
+
+
+def test_ids_of_recurrent_trainings_hold_every_setting_and_the_default_is_that_of_before() -> None:
+    spec = TrainSpec(device="cpu")
+    names = ["lstm", "lstm:units=8", "lstm:layers=2", "lstm:dropout=0.5"]
+    default, *others = recurrent(names, 40, spec, [[0, 1]])
+    assert default.key == {"version": 1, "units": 32, "samples": 40, "vectors": [[0, 1]], "training": spec.key()}
+    assert [dict(other.key) for other in others] == [
+        {**default.key, **change} for change in ({"units": 8}, {"layers": 2}, {"dropout": 0.5})
+    ]
+    assert [c.name for c in (default, *others)] == names and default.title == "LSTM (32)"
+    (made,) = recurrent(["bilstm:units=6:layers=2:dropout=0.25"], 40, TrainSpec(epochs=1, device="cpu"), [])
+    reader: Any = made.fit(rhythms(30), rhythms(0))
+    cell = reader.net.cell
+    assert (cell.hidden_size, cell.num_layers, cell.bidirectional, cell.dropout) == (6, 2, True, 0.25)
+    assert reader.net.dropout.p == 0.25 and reader.samples == 40
 
 
 def test_what_is_refused() -> None:

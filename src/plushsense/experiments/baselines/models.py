@@ -1,16 +1,17 @@
-"""Classical classifiers to compare a network with, on statistics or flattened windows, with and without PCA.
+"""The programs to compare a network with: classical classifiers, recurrent networks and random convolutions.
 
-A baseline is a pipeline of scaling, optional PCA and a classifier of scikit-learn (extra ``baselines``), fitted only to
-the training windows of a fold. Names such as "cubic SVM" and "subspace kNN" come from MATLAB's Classification Learner,
-which the paper used (sections 3.4 and 4.5). The paper gives no settings; ours are in `BASELINES`.
+A classical one is a pipeline of scaling, optional PCA and a classifier of scikit-learn (extra ``baselines``), fitted
+only to the training windows of a fold. The paper (sections 3.4 and 4.5) gives no settings; ours are in `BASELINES`.
+Names such as "cubic SVM" and "subspace kNN" are presets of MATLAB's Classification Learner.
 """
 
 from __future__ import annotations
 
+import difflib
 import pickle
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -18,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ConfigError, check_known, need
-from plushsense.experiments.baselines.score import Contender, Reader
+from plushsense.experiments.baselines.score import UNSCALED, Contender, Pca, Reader
+from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler, statistics
 
@@ -99,7 +101,7 @@ class ClassicalFit:
 
     name: str
     features: str
-    pca: bool
+    pca: Pca
     samples: int
     seed: int
 
@@ -108,7 +110,9 @@ class ClassicalFit:
         enough_to_learn(train)
         steps = [_sklearn("preprocessing").StandardScaler()]
         if self.pca:
-            steps.append(_sklearn("decomposition").PCA(PCA_VARIANCE, svd_solver="full"))
+            # MATLAB's Classification Learner does not scale before PCA; some of its classifiers scale the components.
+            at = 0 if self.pca == UNSCALED else 1
+            steps.insert(at, _sklearn("decomposition").PCA(PCA_VARIANCE, svd_solver="full"))
         pipeline = _sklearn("pipeline").make_pipeline(*steps, BASELINES[self.name].make(self.seed))
         with warnings.catch_warnings():
             # The MLP stops after a fixed number of iterations; the user can do nothing about the warning.
@@ -163,7 +167,7 @@ def enough_to_learn(train: WindowSet) -> None:
 
 
 def classical(
-    names: Sequence[str], features: Sequence[str], pca: Sequence[bool], samples: int, seed: int
+    names: Sequence[str], features: Sequence[str], pca: Sequence[Pca], samples: int, seed: int
 ) -> list[Contender]:
     """Return a contender for each combination of ``names``, ``features`` and ``pca``, except those in `TOO_LONG`.
 
@@ -185,6 +189,126 @@ def classical(
         for name in names
         if (name, view, reduced) not in TOO_LONG
     ]
+
+
+# Title in tables, by kind.
+RECURRENT = {"lstm": "LSTM", "bilstm": "BiLSTM"}
+# Smallest and largest value of each setting; the largest number of units limits memory.
+_LIMITS: dict[str, tuple[float, float]] = {"units": (1, 4096), "layers": (1, 8), "dropout": (0, 0.99)}
+
+
+@dataclass(frozen=True)
+class RecurrentSpec:
+    """The form of an LSTM or BiLSTM: units in each layer and direction, layers, and the share that dropout sets to 0.
+
+    The default has about as many parameters as the default network. The authors' script has an LSTM of 128 units and a
+    BiLSTM of 512, each with a dropout of 0.5.
+    """
+
+    kind: str
+    units: int = 32
+    layers: int = 1
+    dropout: float = 0.0
+
+    def changes(self) -> dict[str, float]:
+        """Return the settings that differ from the default."""
+        return {f.name: value for f in fields(self)[1:] if (value := getattr(self, f.name)) != f.default}
+
+    @property
+    def name(self) -> str:
+        """The model as `parse_recurrent` reads it, without settings that are the default."""
+        return ":".join([self.kind, *(f"{key}={value}" for key, value in self.changes().items())])
+
+    @property
+    def title(self) -> str:
+        layers = f", {self.layers} layers" if self.layers > 1 else ""
+        dropout = f", dropout {self.dropout}" if self.dropout else ""
+        return f"{RECURRENT[self.kind]} ({self.units}{layers}{dropout})"
+
+
+def parse_recurrent(text: str) -> RecurrentSpec:
+    """Return the network of a text such as ``lstm``, or ``bilstm:units=512:layers=2:dropout=0.5``.
+
+    Raises:
+        ConfigError: for a setting that is unknown, given twice or out of range; the message has the nearest valid text.
+    """
+    kind, *settings = text.split(":")
+    pairs = [setting.rpartition("=")[::2] for setting in settings]
+    found = _with_settings(kind, pairs)
+    if found is not None:
+        return found
+    # To suggest a valid text, values without a name are taken in the order of the settings.
+    named = [
+        (next(iter(difflib.get_close_matches(name, _LIMITS, 1)), key), value)
+        for key, (name, value) in zip(_LIMITS, pairs, strict=False)
+    ]
+    guess = _with_settings(kind, named) if len(named) == len(pairs) else None
+    limits = ", ".join(f":{key}=NUMBER ({low:g} to {high:g})" for key, (low, high) in _LIMITS.items())
+    raise ConfigError(
+        f"Model '{text}': after {kind}, accepted are {limits}, each at most once."
+        + (f" Did you mean '{guess.name}'?" if guess else "")
+    )
+
+
+def _with_settings(kind: str, settings: Sequence[tuple[str, ...]]) -> RecurrentSpec | None:
+    """Return the network with some settings (name, value), or None if one is invalid."""
+    found: dict[str, Any] = {}
+    for name, value in settings:
+        if name not in _LIMITS or name in found:
+            return None
+        try:
+            number = float(value) if name == "dropout" else int(value)
+        except ValueError:
+            return None
+        low, high = _LIMITS[name]
+        if not low <= number <= high:
+            return None
+        found[name] = number
+    return RecurrentSpec(kind, **found)
+
+
+@dataclass(frozen=True)
+class RecurrentFit:
+    """A function that trains a recurrent network on the last ``samples`` of the windows."""
+
+    network: RecurrentSpec
+    spec: TrainSpec
+    samples: int
+
+    def __call__(self, train: WindowSet, validation: WindowSet, /) -> Reader:
+        """Train on ``train`` for all epochs; ``validation`` is not used."""
+        from plushsense.training.recurrent import fit_recurrent
+
+        form = self.network
+        return fit_recurrent(
+            train,
+            self.spec,
+            self.samples,
+            both_ways=form.kind == "bilstm",
+            units=form.units,
+            layers=form.layers,
+            dropout=form.dropout,
+        )
+
+
+def recurrent(names: Sequence[str], samples: int, spec: TrainSpec, vectors: Sequence[Sequence[int]]) -> list[Contender]:
+    """Return a contender for each text that `parse_recurrent` reads; ``vectors`` are channels for the augmentations.
+
+    Raises:
+        MissingExtraError: without PyTorch.
+    """
+    if not names:
+        return []
+    from plushsense.training.recurrent import RECURRENT_VERSION
+
+    made = []
+    for network in map(parse_recurrent, names):
+        # Settings that are the default are left out, so that the ids of earlier trainings stay the same.
+        key = {"version": RECURRENT_VERSION, "units": network.units, "samples": samples, "vectors": vectors}
+        key |= {"training": spec.key(), **network.changes()}
+        fit = RecurrentFit(network, spec, samples)
+        made.append(Contender(network.name, network.title, "windows", False, fit, key))
+    return made
 
 
 # Part of every job's id: increase it when a name comes to mean another program or other settings.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from plushsense.experiments.baselines.score import Pca, reads
 from plushsense.reports.figures import data_uri, new_figure
 from plushsense.reports.page import render_page
 from plushsense.reports.table import Column, Table, count, mean_sd, number
@@ -26,8 +27,8 @@ LEAKY = (
 )
 # Okabe and Ito's blue and vermillion; filled and open markers show the same difference without colour.
 _HONEST, _LEAKY = "#0072b2", "#d55e00"
-Program = tuple[str, str, bool]
-"""Name, features, and whether PCA reduces them."""
+Program = tuple[str, str, Pca]
+"""Name, features, and whether and how PCA reduces them."""
 
 
 def program_table(result: Mapping[str, Any]) -> Table:
@@ -49,7 +50,7 @@ def program_table(result: Mapping[str, Any]) -> Table:
         first = by_split[splits[0]]
         row = {
             "title": first["title"],
-            "reads": first["features"] + (", PCA" if first["pca"] else ""),
+            "reads": reads(first["features"], first["pca"]),
             "gap": f"{gaps[program]:+.3f}" if program in gaps else "",
             "size": size(first["size_bytes"]),
             "predict": milliseconds(first["predict_ms"]),
@@ -135,7 +136,7 @@ def figure(result: Mapping[str, Any]) -> Figure:
     for row in result["models"]:
         key = _program(row)
         at.setdefault(key, {})[row["split"]] = row["accuracy"]["mean"]
-        named[key] = f"{row['title']}, {row['features']}{', PCA' if row['pca'] else ''}"
+        named[key] = f"{row['title']}, {reads(row['features'], row['pca'])}"
     main = honest or leaky or ""
     order = sorted(at, key=lambda key: at[key][main])
     picture = new_figure(9.0, 1.5 + 0.24 * len(order))

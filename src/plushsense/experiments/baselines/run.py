@@ -21,8 +21,18 @@ from plushsense.core.layouts import Layout
 from plushsense.core.version import __version__
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.baselines.models import BASELINES, FEATURES, ROCKETS, TOO_LONG, classical, rockets
-from plushsense.experiments.baselines.score import Contender, Fit, Reader, compare
+from plushsense.experiments.baselines.models import (
+    BASELINES,
+    FEATURES,
+    RECURRENT,
+    ROCKETS,
+    TOO_LONG,
+    classical,
+    parse_recurrent,
+    recurrent,
+    rockets,
+)
+from plushsense.experiments.baselines.score import UNSCALED, Contender, Fit, Pca, Reader, compare
 from plushsense.jobs.journal import job_id
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
@@ -39,7 +49,6 @@ from plushsense.workflow.reporting import check_results, journal_of, machine
 SPLITS = ("leave-one-subject-out", "windows:5")
 TABLE, SHEET, PAGE, PICTURE = "baselines.json", "baselines.csv", "baselines.html", "baselines.png"
 
-RECURRENT = {"lstm": "LSTM (32)", "bilstm": "BiLSTM (32)"}
 NETWORK = "network"
 # By name: classical programs, recurrent networks, rockets (extra), and our own network.
 MODELS = (*BASELINES, *RECURRENT, *ROCKETS, NETWORK)
@@ -49,7 +58,14 @@ SETS: dict[str, tuple[str, ...]] = {
     "classical": tuple(BASELINES),
     "all": (*BASELINES, *RECURRENT, NETWORK),
 }
-PCA: dict[str, tuple[bool, ...]] = {"both": (False, True), "no": (False,), "yes": (True,)}
+# "yes" scales before PCA, "unscaled" after it, as MATLAB's Classification Learner does.
+PCA: dict[str, tuple[Pca, ...]] = {
+    "both": (False, True),
+    "no": (False,),
+    "yes": (True,),
+    UNSCALED: (UNSCALED,),
+    "all": (False, True, UNSCALED),
+}
 
 
 @dataclass(frozen=True)
@@ -85,20 +101,6 @@ class NetworkReader:
 
 
 @dataclass(frozen=True)
-class RecurrentFit:
-    """A function that trains an LSTM, or with ``both_ways`` a BiLSTM, on the last ``samples`` of the windows."""
-
-    spec: TrainSpec
-    samples: int
-    both_ways: bool
-
-    def __call__(self, train: WindowSet, validation: WindowSet, /) -> Reader:
-        from plushsense.training.recurrent import fit_recurrent
-
-        return fit_recurrent(train, self.spec, self.samples, both_ways=self.both_ways)
-
-
-@dataclass(frozen=True)
 class OnInputs:
     """A function that trains a program on some of the inputs of the windows."""
 
@@ -125,23 +127,35 @@ class OnInputsReader:
 
 
 def chosen(models: str | Sequence[str]) -> tuple[str, ...]:
-    """Return the programs in ``models`` (names of `MODELS` and `SETS`; a text has commas) in the order of `MODELS`.
+    """Return the programs in ``models`` in the order of `MODELS`.
+
+    Args:
+        models: names of `MODELS` and `SETS`, or recurrent networks with settings (see `parse_recurrent`); a text has
+            commas.
 
     Raises:
-        ConfigError: for an unknown name; the message suggests the nearest one.
+        ConfigError: for an unknown name or setting; the message suggests the nearest one.
     """
     given = [m.strip() for m in models.split(",")] if isinstance(models, str) else list(models)
     names: set[str] = set()
     for one in given:
-        check_known(one, (*SETS, *MODELS), "model", ConfigError)
-        names |= set(SETS.get(one, (one,)))
-    return tuple(name for name in MODELS if name in names)
+        if _kind(one) in RECURRENT:
+            names.add(parse_recurrent(one).name)
+        else:
+            check_known(one, (*SETS, *MODELS), "model", ConfigError)
+            names |= set(SETS.get(one, (one,)))
+    return tuple(sorted(names, key=lambda name: (MODELS.index(_kind(name)), name)))
+
+
+def _kind(model: str) -> str:
+    """Return the name of a program without settings."""
+    return model.partition(":")[0]
 
 
 def contenders(
     models: Sequence[str],
     features: Sequence[str],
-    pca: Sequence[bool],
+    pca: Sequence[Pca],
     config: RunConfig,
     arch: Arch,
     layout: Layout,
@@ -156,19 +170,14 @@ def contenders(
     spec, samples = config.training, layout.samples(config.windows.window_s)
     made = classical([m for m in models if m in BASELINES], features, pca, samples, spec.seed)
     made += rockets([m for m in models if m in ROCKETS], samples, spec.seed)
-    if NETWORK in models or set(models) & set(RECURRENT):
+    recurrent_names = [m for m in models if _kind(m) in RECURRENT]
+    if NETWORK in models or recurrent_names:
         need("torch", extra="train")
         from plushsense.training.fit import resolve_device
 
         spec = resolve_device(spec)
     vectors = [list(v) for v in windows.vectors]
-    for name in (m for m in models if m in RECURRENT):
-        from plushsense.training.recurrent import RECURRENT_VERSION, UNITS
-
-        key = {"version": RECURRENT_VERSION, "units": UNITS, "samples": samples, "vectors": vectors}
-        key["training"] = spec.key()
-        fit = RecurrentFit(spec, samples, name == "bilstm")
-        made.append(Contender(name, RECURRENT[name], "windows", False, fit, key))
+    made += recurrent(recurrent_names, samples, spec, vectors)
     if tuple(inputs) != windows.inputs:
         made = [replace(one, fit=OnInputs(one.fit, tuple(inputs))) for one in made]
     if NETWORK in models:
@@ -202,9 +211,9 @@ def baselines(
     Args:
         config, settings: as for `evaluate`; its split is not used.
         splits: such as "leave-one-subject-out", "by-subject:5", "windows:5" (leaky); the gap between them is reported.
-        models: names of `MODELS` and `SETS`.
+        models: names of `MODELS` and `SETS`, or such as "lstm:units=128:dropout=0.5" (see `chosen`).
         features: names of `FEATURES`, for the classical programs.
-        pca: "both", "no" or "yes", for the classical programs.
+        pca: key of `PCA`, for the classical programs.
         cluster: address of a Ray cluster that does the work instead of this machine's processes.
         out: a folder for the table as JSON and CSV, a page and a figure. If it holds a comparison of other settings or
             data, an error is raised unless ``overwrite``.

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,16 @@ _VERSION = 2
 _TIMED, _WARM = 20, 3
 # Processor time of this process, which uses one thread, so that other programs on the machine hardly influence it.
 _clock = time.process_time
+
+
+Pca = bool | Literal["unscaled"]
+"""Whether PCA reduces the features of a program; "unscaled" is a PCA of features that were not scaled before."""
+UNSCALED: Final = "unscaled"
+
+
+def reads(features: str, pca: Pca) -> str:
+    """Return what a program reads, for tables: ``statistics, PCA unscaled``."""
+    return features + (", PCA" if pca else "") + (" unscaled" if pca == UNSCALED else "")
 
 
 class Reader(Protocol):
@@ -62,14 +72,14 @@ class Contender:
     name: str
     title: str
     features: str
-    pca: bool
+    pca: Pca
     fit: Fit
     key: Mapping[str, Any]
 
     @property
     def words(self) -> str:
         """Title, features and PCA in one line, for progress and messages."""
-        return f"{self.title}, {self.features}{', PCA' if self.pca else ''}"
+        return f"{self.title}, {reads(self.features, self.pca)}"
 
 
 @dataclass(frozen=True)
