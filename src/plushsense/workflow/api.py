@@ -6,6 +6,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -165,10 +166,12 @@ class Trained:
     history: list[dict[str, Any]]
     scores: dict[str, Any]
     seconds: float = 0.0
+    generation: Generation | None = None
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Save the bundle."""
-        return self.bundle.save(Path(path))
+        """Save the bundle; raise ForgottenError if a person was removed from the data set since it was opened."""
+        with nullcontext() if self.generation is None else self.generation.writing():
+            return self.bundle.save(Path(path))
 
     def figure(self) -> Figure:
         """Draw loss and accuracy over the epochs."""
@@ -320,7 +323,8 @@ def train(
     # `forget` cannot find an unsaved bundle: raise an error if a person was removed during the training.
     dataset.generation.check()
     history = with_accuracy(fitted.history, apart)
-    return Trained(bundle, history, scores, fitted.seconds + (state.before_s if state else 0.0))
+    seconds = fitted.seconds + (state.before_s if state else 0.0)
+    return Trained(bundle, history, scores, seconds, dataset.generation)
 
 
 def _reporting(progress: EpochProgress | None, apart: bool, **more: str) -> EpochProgress:

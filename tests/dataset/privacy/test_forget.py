@@ -7,17 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filelock import FileLock, Timeout
 
 from plushsense.core.errors import DatasetError, ForgottenError
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset import index
+from plushsense.dataset.importing import importers
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS, Mark, append_marks, read_marks
 from plushsense.dataset.privacy import forget as room
 from plushsense.dataset.privacy.forget import FORGOTTEN, UNDER_WAY, RemovalRecord, forget, plan_removal, read_removals
-from plushsense.dataset.store import read_people
+from plushsense.dataset.store import LOCK, read_people, writing_around
 
 ACCEL = load_layout("accel-3")
 INDEX = {"recordings.csv", "streams.csv", "index.json"}
@@ -305,3 +307,47 @@ def test_nothing_is_written_while_a_removal_is_not_finished(folder: Path, monkey
         before.check()
     with open_dataset(folder).generation.writing():
         pass
+
+
+def test_no_mark_about_a_removed_person_is_written(folder: Path) -> None:
+    before = open_dataset(folder)
+    forget(folder, "P1")
+    with pytest.raises(ForgottenError):
+        before.append_marks([Mark("P1/Wave_1000000000000_50", "exclude", "me", "tardy")])
+    assert "tardy" not in (folder / MARKS).read_text()
+    open_dataset(folder).append_marks([Mark("P2/Wave_1000000000000_50", "exclude", "me", "tardy")])
+    assert "tardy" in (folder / MARKS).read_text()
+
+
+def test_an_import_holds_the_lock_while_it_writes(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    held = list[str]()
+
+    def spy(real: Any, name: str) -> Any:
+        def write(*args: Any) -> Any:
+            with pytest.raises(Timeout), FileLock(folder / LOCK, timeout=0):
+                raise AssertionError(name)
+            held.append(name)
+            return real(*args)
+
+        return write
+
+    for name in ("write_people", "write_marks"):
+        monkeypatch.setattr(importers, name, spy(getattr(importers, name), name))
+    source = folder.parent / "more" / "P3"
+    source.mkdir(parents=True)
+    lines = (folder.parent / "src" / "P1" / f"Wave_{10**12}_50.csv").read_text().splitlines()
+    (source / f"Wave_{10**12}_49.csv").write_text("\n".join(lines[:-1]))
+    people = folder.parent / "people.csv"
+    people.write_text("subject,age_group\nP3,child\n")
+    import_recordings(source.parent, folder, add_to=True, people=people)
+    assert held == ["write_marks", "write_people"] and "P3" in read_people(folder)
+
+
+def test_what_is_derived_from_results_is_not_written_after_a_removal(folder: Path) -> None:
+    inside, outside = (writing_around(place) for place in (folder / "evaluations" / "with", folder.parent))
+    forget(folder, "P1")
+    with pytest.raises(ForgottenError), inside():
+        raise AssertionError
+    with outside():
+        pass
+    assert not (folder.parent / LOCK).exists()
