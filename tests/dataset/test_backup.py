@@ -4,6 +4,7 @@ import hashlib
 import json
 import random
 import stat
+import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
@@ -12,13 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plushsense.core.errors import DatasetError
+from plushsense.core.errors import DatasetError, ForgottenError
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, recording_filename, write_recording
 from plushsense.dataset.backup import MANIFEST, backup, check_backup, restore
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
+from plushsense.dataset.privacy.forget import forget
 
 ACCEL = load_layout("accel-3")
 
@@ -246,3 +248,36 @@ def test_a_member_that_says_another_packing_is_damage(folder: Path, tmp_path: Pa
     with pytest.raises(DatasetError, match="damaged"):
         restore(tmp_path / "bad.zip", tmp_path / "R")
     assert not (tmp_path / "R").exists()
+
+
+KILLED = """
+import os, sys
+from plushsense.dataset.backup import backup, restore
+what, one, other = sys.argv[1:]
+(backup if what == "backup" else restore)(one, other, progress=lambda done, total: os._exit(9))
+"""
+
+
+@pytest.mark.parametrize("what", ["backup", "restore"])
+def test_what_a_killed_run_left_goes_with_the_next(folder: Path, tmp_path: Path, what: str) -> None:
+    place = tmp_path / "out"
+    backup(folder, place / "a.zip")
+    arguments = [str(folder), str(place / "b.zip")] if what == "backup" else [str(place / "a.zip"), str(place / "b")]
+    assert subprocess.run([sys.executable, "-c", KILLED, what, *arguments]).returncode == 9
+    (left,) = place.glob(".*")
+    assert left.name.startswith(f".{Path(arguments[1]).name}-unfinished-")
+    backup(folder, place / "c.zip")
+    assert sorted(p.name for p in place.iterdir()) == ["a.zip", "c.zip"]
+
+
+def test_who_is_removed_meanwhile_is_in_no_backup(folder: Path, tmp_path: Path) -> None:
+    backup(folder, tmp_path / "a.zip")
+    forgotten = list[str]()
+
+    def meanwhile(done: int, total: int) -> None:
+        if done == total and not forgotten:
+            forgotten.append(forget(folder, "ana").subject)
+
+    with pytest.raises(ForgottenError):
+        backup(folder, tmp_path / "b.zip", progress=meanwhile)
+    assert sorted(p.name for p in tmp_path.glob("*.zip")) == ["a.zip"]

@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.files import new_folder, replacing_file
+from plushsense.core.files import new_folder, replacing_file, work_folder
 from plushsense.dataset.files import list_files
 from plushsense.dataset.importing.archives import DAMAGED, zip_entry
 from plushsense.dataset.index import open_dataset, rebuild_index
@@ -89,7 +89,7 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
             "hash": source.hash,
             "files": files,
         }
-        with replacing_file(target) as part:
+        with work_folder(target) as work, replacing_file(target, within=work) as part:
             with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
                 for path in paths:
                     files.append(_store(archive, folder, path))
@@ -98,6 +98,7 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
                 text = json.dumps(manifest, ensure_ascii=False, indent=0) + "\n"
                 archive.writestr(zip_entry(MANIFEST), text.encode("utf-8"))
             _verify(part, lambda n: report(total // 2 + n, total))
+            source.generation.check()
             if target.exists():
                 message = f"'{target}' appeared meanwhile: a backup never replaces another; give a new name."
                 raise DatasetError(message, reason="name_exists", name=target.name)

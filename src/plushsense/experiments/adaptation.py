@@ -6,7 +6,6 @@ import hashlib
 import itertools
 import json
 import os
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, nearest
+from plushsense.core.files import temporary_folder
 from plushsense.dataset.files import CACHE
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import as_dataset
@@ -316,8 +316,8 @@ def adapt(
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
     if (before := given.adapted_to) is not None:
         warn(f"the bundle is adapted to {before}: it is adapted again from its original")
-    with tempfile.TemporaryDirectory(prefix="plushsense-") as place:
-        dataset = _dataset(recordings, given, Path(place))
+    with temporary_folder() as place:
+        dataset = _dataset(recordings, given, place)
         person = _person(dataset, subject)
         corrections = [] if feedback is None else read_corrections(feedback)
         if others := sorted({c.subject for c in corrections} - {person}):

@@ -19,7 +19,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from plushsense.core.errors import ConfigError, DatasetError, FileFormatError
-from plushsense.core.files import write_file
+from plushsense.core.files import work_folder, write_file
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
@@ -410,13 +410,13 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], SourceScan]] = {
 @contextmanager
 def _temporary_folders(dest: Path) -> Iterator[Callable[[str], Path]]:
     """Yield a function that creates folders beside ``dest`` for unpacked or converted files; remove them at the end."""
+    real = dest.resolve()
     with ExitStack() as stack:
 
         def create(purpose: str) -> Path:
-            real = dest.resolve()
             place = next(p for p in real.parents if p.is_dir())
-            folder = Path(tempfile.mkdtemp(prefix=f".{real.name}-{purpose}-", dir=place))
-            stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            folder = stack.enter_context(work_folder(place / real.name)) / purpose
+            folder.mkdir()
             return folder
 
         yield create
