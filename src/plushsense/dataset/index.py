@@ -185,12 +185,16 @@ def build_index(folder: Path, head: DatasetHead, progress: Progress | None = Non
     streams: list[_RawFile] = []
     recordings: list[_RawFile] = []
     for done, (kind, path) in enumerate(files):
+        name = path.relative_to(folder).as_posix()
+        if (shown := name.encode(errors="backslashreplace").decode()) != name:
+            message = f"'{shown}' in '{folder}' has a name that is no text: rename it."
+            raise DatasetError(message, reason="name_no_text", file=shown)
         reader = read_stream if kind == STREAMS else read_recording
         try:
             data = read_bytes(path)
             result = reader(path, head.layout, data)
         except FileFormatError as cause:
-            unreadable[path.relative_to(folder).as_posix()] = Sentence.of(cause)
+            unreadable[name] = Sentence.of(cause)
             continue
         subject = path.relative_to(folder / kind).parts[0]
         read = _RawFile(path, subject, result, hashlib.sha256(data).hexdigest())
