@@ -288,7 +288,7 @@ def test_who_is_removed_meanwhile_is_in_no_backup(folder: Path, tmp_path: Path) 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
 @pytest.mark.parametrize("name", [b"n\xfcte.txt", b"a:b.txt", b"a\\b.txt"])
 def test_a_name_that_could_not_be_restored_is_refused_at_once(folder: Path, tmp_path: Path, name: bytes) -> None:
-    Path(os.fsdecode(os.path.join(os.fsencode(folder), name))).touch()
+    (folder / os.fsdecode(name)).touch()
     with pytest.raises(DatasetError, match="rename it") as refused:
         backup(folder, tmp_path / "a.zip")
     str(refused.value).encode()

@@ -180,7 +180,7 @@ JUMP_MS = 1000
 
 
 SLOWEST = 2.0
-"""Longest that a second of the toy's clock may take, in seconds of the computer; limits hold with a clock that stands."""
+"""Longest that a second of the toy's clock may take, in seconds; a clock that stands counts as that slow."""
 
 
 class ReceivedFrame(NamedTuple):
