@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 from filelock import FileLock
 
 from plushsense.core.errors import DatasetError, nearest
-from plushsense.core.toml import load_table
+from plushsense.core.toml import load_table, loads_json
 
 MARKS = "marks.jsonl"
 BY_HAND, SUGGESTED = "hand", "suggested"
@@ -279,7 +279,7 @@ class MarksFollower:
 
     def _take(self, line: bytes, number: int, states: dict[str, MarkState]) -> None:
         try:
-            table: Any = json.loads(line.decode("utf-8"))
+            table: Any = loads_json(line.decode("utf-8"))
         except (ValueError, RecursionError):
             return
         where = f"'{self._path}' line {number}"

@@ -25,7 +25,7 @@ import tomli_w
 
 from plushsense.core.errors import DatasetError, MissingExtraError, need
 from plushsense.core.sentences import Sentence
-from plushsense.core.toml import read_toml
+from plushsense.core.toml import loads_json, read_toml
 from plushsense.dataset.files import normalize_code
 from plushsense.dataset.privacy.pseudonyms import FIRST_MS, shifted_number, shifted_text
 from plushsense.dataset.store import HEAD, PersonInfo
@@ -237,7 +237,7 @@ def read_lines(path: Path) -> Iterator[tuple[int, Any]]:
         if not piece.strip():
             continue
         try:
-            yield number, json.loads(piece.decode("utf-8-sig"))
+            yield number, loads_json(piece.decode("utf-8-sig"))
         except (ValueError, RecursionError):
             yield number, None
 
