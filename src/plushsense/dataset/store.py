@@ -225,9 +225,14 @@ R = TypeVar("R", bound=_Row)
 
 
 def read_index(path: Path, kind: type[R]) -> list[R]:
-    """Read the rows of an index file."""
-    with path.open(encoding="utf-8", newline="") as file:
-        return [kind.from_text(row, path.name) for row in csv.DictReader(file)]
+    """Read the rows of an index file; raise DatasetError if it is damaged."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return [kind.from_text(row, path.name) for row in csv.DictReader(file)]
+    except (UnicodeDecodeError, csv.Error) as cause:
+        raise DatasetError(
+            f"The index '{path.name}' is damaged ({cause}): delete it, it is rebuilt from the recordings."
+        ) from None
 
 
 @dataclass(frozen=True)
