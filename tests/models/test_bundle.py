@@ -19,7 +19,7 @@ from plushsense.core.gestures import load_gestures
 from plushsense.core.layouts import load_layout
 from plushsense.models import bundle as room
 from plushsense.models.arch import Arch
-from plushsense.models.bundle import Bundle
+from plushsense.models.bundle import Bundle, known_people
 from plushsense.models.reference import random_weights
 from plushsense.windows.features import Scaler
 from support.bundles import contents, signed
@@ -265,3 +265,9 @@ def test_any_content_with_a_right_checksum_loads_or_is_refused() -> None:
         except BundleError:
             pass
     assert 20 < loaded < 580
+
+
+def test_people_are_codes_or_a_number() -> None:
+    assert known_people({"subjects": ["a", "none"], "validation_subjects": ["b"]}) == {"a", "b"}
+    assert known_people({"subjects": ["a"], "validation_subjects": ["b"]}, ["validation_subjects"]) == {"b"}
+    assert known_people({"subjects": 3, "validation_subjects": 2}) == set()

@@ -139,9 +139,8 @@ def _indexed(folder: Path, head: DatasetHead, generation: Generation) -> Dataset
     files = indexed_files(folder)
     known = {s.id: s for s in streams}
     right = all(_is_stream_of(s, files) for s in streams) and all(_is_recording_of(r, files, known) for r in recordings)
-    rows = (*recordings, *streams)
     distinct = len(known) == len(streams) and len({r.id for r in recordings}) == len(recordings)
-    if not right or not distinct or {row.file for row in rows} != set(files):
+    if not right or not distinct or {r.file for r in recordings} | {s.file for s in streams} != set(files):
         return None
     return Dataset(folder, head, recordings, streams, generation)
 

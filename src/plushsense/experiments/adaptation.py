@@ -40,6 +40,7 @@ from plushsense.scoring.splits import Fold, parse_split, purge
 from plushsense.windows.cut import WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, silent, windows_for
+from plushsense.workflow.reporting import keep_bundle
 
 Predictor = Callable[[WindowSet], NDArray[np.floating[Any]]]
 """Returns the probabilities (N, K) of windows."""
@@ -500,8 +501,7 @@ def evaluate_adapting(
             },
             kept,
         )
-        with dataset.generation.writing():
-            bundle.save(path)
+        keep_bundle(bundle, path, dataset)
         tell(f"trained for {fold.name}, {fitted.seconds:.0f} s")
         return bundle
 

@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -68,6 +68,7 @@ class _Scores:
     windows: int | None = None
     split: str | None = None
     leaky: bool | None = None
+    nobody: dict[str, Any] | None = None
     int8: dict[str, Any] = field(default_factory=dict)
 
 
@@ -297,9 +298,12 @@ class Bundle:
         return bytes(save_tensors(weights, metadata={"plushsense": _canonical(head)}))
 
 
-def known_people(provenance: Mapping[str, Any]) -> set[str]:
-    """Return the codes of the people in the training and validation data, without "nobody" and unknown people."""
-    listed = [provenance.get(key) for key in _PEOPLE]
+def known_people(provenance: Mapping[str, Any], keys: Sequence[str] = _PEOPLE) -> set[str]:
+    """Return the codes of the people in the training and validation data, without "nobody" and unknown people.
+
+    An export states only their number, so that there are none.
+    """
+    listed = [provenance.get(key) for key in keys]
     codes = {str(code) for each in listed if isinstance(each, list | tuple) for code in each}
     return codes - {NOBODY, UNKNOWN_SUBJECT}
 

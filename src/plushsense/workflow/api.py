@@ -39,7 +39,7 @@ from plushsense.evaluation.scores import compute_scores as score_predictions
 from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possible
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
-from plushsense.models.bundle import Bundle
+from plushsense.models.bundle import Bundle, known_people
 from plushsense.models.reference import softmax
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import parse_split
@@ -445,7 +445,7 @@ def validation_predictions(bundle: Bundle, dataset: Dataset | str | os.PathLike[
             ``data_changed``), or has none of their recordings.
     """
     dataset = as_dataset(dataset)
-    people = set(bundle.provenance.get("validation_subjects", ())) - {NOBODY, UNKNOWN_SUBJECT}
+    people = known_people(bundle.provenance, ["validation_subjects"])
     if bundle.provenance.get("split") != WHOLE_PEOPLE or not people:
         raise DatasetError("This network has no validation people: evaluate it instead.", reason="no_validation_people")
     if bundle.provenance.get("dataset_hash") != dataset.hash:

@@ -74,7 +74,7 @@ from plushsense.workflow.preparation import (
     silent,
     windows_for,
 )
-from plushsense.workflow.reporting import check_results, journal_of
+from plushsense.workflow.reporting import check_results, journal_of, keep_bundle
 
 
 @dataclass(frozen=True)
@@ -146,9 +146,7 @@ class TrainStreams:
             origin,
             calibrated,
         )
-        with dataset.generation.writing():
-            self.folder.mkdir(parents=True, exist_ok=True)
-            bundle.save(path)
+        keep_bundle(bundle, path, dataset)
         return bundle
 
     def key(self) -> dict[str, Any]:
