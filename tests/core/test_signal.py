@@ -161,3 +161,11 @@ def test_a_gap_that_would_fill_the_memory_is_refused(rate_hz: float, gap_ms: int
     with pytest.raises(LayoutError, match="gap_ms"):
         Layout.from_dict(table | {"rate_hz": rate_hz, "gap_ms": gap_ms})
     assert Layout.from_dict(table | {"rate_hz": 100.0, "gap_ms": 60_000}).gap_ms == 60_000
+
+
+def test_the_axes_of_a_vector_are_of_one_kind() -> None:
+    table = load_layout("accel-3").to_dict()
+    channels = [dict(c) for c in table["channels"]]
+    channels[0]["kind"] = "other"
+    with pytest.raises(LayoutError, match="different kinds"):
+        Layout.from_dict(table | {"channels": channels})

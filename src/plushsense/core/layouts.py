@@ -161,11 +161,12 @@ class Layout:
             )
         for derived in self.derived:
             yield from self._problems_of(derived)
+        kinds = {c.name: c.kind for c in self.channels}
         for vector in self.vectors:
             if len(vector) != 3:
                 yield f"a vector has three axes, not {len(vector)}."
-            for name in vector:
-                self.index(name)
+            if len({kinds[self.names[self.index(name)]] for name in vector}) > 1:
+                yield f"the axes {', '.join(vector)} of a vector are of different kinds: give them one."
 
     def _problems_of(self, derived: Derived) -> Iterator[str]:
         if derived.kind not in ("magnitude", "gravity"):
