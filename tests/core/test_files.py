@@ -1,14 +1,16 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
+import tempfile
 import threading
 from pathlib import Path
 
 import pytest
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.files import PART, new_folder, replacing_file, write_file
+from plushsense.core.files import PART, new_folder, replacing_file, temporary_folder, work_folder, write_file
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows refuses to replace a file that is being replaced")
@@ -86,3 +88,26 @@ def test_a_folder_is_filled_where_it_is_empty_and_refused_where_it_is_not(tmp_pa
     with pytest.raises(DatasetError, match="already holds something"), new_folder(tmp_path / "out", DatasetError):
         pass
     assert names(tmp_path) == ["out"]
+
+
+def test_what_a_killed_program_left_goes_at_the_next_start_and_nothing_of_a_live_one(tmp_path: Path) -> None:
+    with work_folder(tmp_path / "other") as live:
+        (live / "raw.csv").write_text("x")
+        # A copy of the folder has a lock that nobody holds, as after a kill.
+        shutil.copytree(live, tmp_path / ".other-unfinished-killed")
+        (tmp_path / ".old-unfinished-1").mkdir()
+        with new_folder(tmp_path / "out", DatasetError) as work:
+            assert work.parent.parent == tmp_path
+        assert names(tmp_path) == sorted([live.name, ".old-unfinished-1", "out"])
+        assert names(live) == ["owner.lock", "raw.csv"]
+    assert names(tmp_path) == [".old-unfinished-1", "out"]
+
+
+def test_temporary_copies_of_a_killed_program_go_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with temporary_folder() as one:
+        (one / "raw.csv").write_text("x")
+        shutil.copytree(one, tmp_path / ".plushsense-unfinished-killed")
+        with temporary_folder() as other:
+            assert names(tmp_path) == sorted([one.name, other.name])
+    assert names(tmp_path) == []

@@ -151,3 +151,21 @@ def test_columns_by_label_by_header_and_by_position() -> None:
 )
 def test_a_stream_that_does_not_fit(labels: list[str], width: int, reason: str) -> None:
     assert str(load_layout("accel-3").match_columns(labels, width)).startswith(reason)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "gap_ms"), [(50.0, 0), (50.0, -1), (50.0, 60_001), (10_000.0, 6_001), (50.0, 10**12)]
+)
+def test_a_gap_that_would_fill_the_memory_is_refused(rate_hz: float, gap_ms: int) -> None:
+    table = load_layout("accel-3").to_dict()
+    with pytest.raises(LayoutError, match="gap_ms"):
+        Layout.from_dict(table | {"rate_hz": rate_hz, "gap_ms": gap_ms})
+    assert Layout.from_dict(table | {"rate_hz": 100.0, "gap_ms": 60_000}).gap_ms == 60_000
+
+
+def test_the_axes_of_a_vector_are_of_one_kind() -> None:
+    table = load_layout("accel-3").to_dict()
+    channels = [dict(c) for c in table["channels"]]
+    channels[0]["kind"] = "other"
+    with pytest.raises(LayoutError, match="different kinds"):
+        Layout.from_dict(table | {"channels": channels})

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import pytest
 
 from plushsense.core.errors import ConfigError, LayoutError
-from plushsense.core.toml import check_table, load_table
+from plushsense.core.toml import check_table, load_table, loads_json
 
 
 @dataclass(frozen=True)
@@ -108,3 +108,16 @@ def test_a_partial_table_gives_what_fits_and_all_problems() -> None:
 def test_the_library_is_imported_when_it_is_needed() -> None:
     code = "import sys, plushsense.core.layouts as m; assert 'cattrs' not in sys.modules; m.load_layout('accel-3')"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ('"a \\ud800 b"', "a \ufffd b"),
+        ('{"\\uDC00": ["\\uD83D\\uDE00", {"x": "\\ud800\\ud800"}]}', {"\ufffd": ["😀", {"x": "\ufffd\ufffd"}]}),
+        ('"\\\\ud800"', "\\ud800"),
+        ("[1, null, true, 1.5]", [1, None, True, 1.5]),
+    ],
+)
+def test_half_characters_of_json_are_replaced(text: str, value: object) -> None:
+    assert loads_json(text) == value

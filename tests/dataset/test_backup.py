@@ -2,8 +2,10 @@
 
 import hashlib
 import json
+import os
 import random
 import stat
+import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
@@ -12,13 +14,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plushsense.core.errors import DatasetError
+from plushsense.core.errors import DatasetError, ForgottenError
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, recording_filename, write_recording
 from plushsense.dataset.backup import MANIFEST, backup, check_backup, restore
+from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
+from plushsense.dataset.privacy.forget import forget
 
 ACCEL = load_layout("accel-3")
 
@@ -246,3 +250,77 @@ def test_a_member_that_says_another_packing_is_damage(folder: Path, tmp_path: Pa
     with pytest.raises(DatasetError, match="damaged"):
         restore(tmp_path / "bad.zip", tmp_path / "R")
     assert not (tmp_path / "R").exists()
+
+
+KILLED = """
+import os, sys
+from plushsense.dataset.backup import backup, restore
+what, one, other = sys.argv[1:]
+(backup if what == "backup" else restore)(one, other, progress=lambda done, total: os._exit(9))
+"""
+
+
+@pytest.mark.parametrize("what", ["backup", "restore"])
+def test_what_a_killed_run_left_goes_with_the_next(folder: Path, tmp_path: Path, what: str) -> None:
+    place = tmp_path / "out"
+    backup(folder, place / "a.zip")
+    arguments = [str(folder), str(place / "b.zip")] if what == "backup" else [str(place / "a.zip"), str(place / "b")]
+    assert subprocess.run([sys.executable, "-c", KILLED, what, *arguments]).returncode == 9
+    (left,) = place.glob(".*")
+    assert left.name.startswith(f".{Path(arguments[1]).name}-unfinished-")
+    backup(folder, place / "c.zip")
+    assert sorted(p.name for p in place.iterdir()) == ["a.zip", "c.zip"]
+
+
+def test_who_is_removed_meanwhile_is_in_no_backup(folder: Path, tmp_path: Path) -> None:
+    backup(folder, tmp_path / "a.zip")
+    forgotten = list[str]()
+
+    def meanwhile(done: int, total: int) -> None:
+        if done == total and not forgotten:
+            forgotten.append(forget(folder, "ana").subject)
+
+    with pytest.raises(ForgottenError):
+        backup(folder, tmp_path / "b.zip", progress=meanwhile)
+    assert sorted(p.name for p in tmp_path.glob("*.zip")) == ["a.zip"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+@pytest.mark.parametrize("name", [b"n\xfcte.txt", b"a:b.txt", b"a\\b.txt"])
+def test_a_name_that_could_not_be_restored_is_refused_at_once(folder: Path, tmp_path: Path, name: bytes) -> None:
+    (folder / os.fsdecode(name)).touch()
+    with pytest.raises(DatasetError, match="rename it") as refused:
+        backup(folder, tmp_path / "a.zip")
+    str(refused.value).encode()
+    assert not (tmp_path / "a.zip").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_a_recording_whose_name_is_no_text_is_named(folder: Path) -> None:
+    place = folder / "recordings" / "ana"
+    next(place.glob("*.csv")).rename(place / os.fsdecode(b"W\xfcve_1_50.csv"))
+    (folder / "index.json").unlink()
+    with pytest.raises(DatasetError, match="rename it"):
+        open_dataset(folder)
+
+
+def test_a_backup_larger_than_allowed_is_not_restored(folder: Path, tmp_path: Path) -> None:
+    size = backup(folder, tmp_path / "a.zip").bytes
+    for limits in (UnpackLimits(total_bytes=size - 1), UnpackLimits(files=3)):
+        with pytest.raises(DatasetError, match="are allowed"):
+            restore(tmp_path / "a.zip", tmp_path / "b", limits=limits)
+    restore(tmp_path / "a.zip", tmp_path / "b", limits=UnpackLimits(total_bytes=size))
+
+
+def test_a_negative_size_is_damage(folder: Path, tmp_path: Path) -> None:
+    backup(folder, tmp_path / "a.zip")
+    with zipfile.ZipFile(tmp_path / "a.zip") as archive:
+        members = {info.filename: archive.read(info) for info in archive.infolist()}
+    manifest = json.loads(members[MANIFEST])
+    manifest["files"][0]["bytes"] = -(1 << 40)
+    members[MANIFEST] = json.dumps(manifest).encode()
+    with zipfile.ZipFile(tmp_path / "b.zip", "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    with pytest.raises(DatasetError, match="its manifest lacks something"):
+        restore(tmp_path / "b.zip", tmp_path / "b")

@@ -14,7 +14,7 @@ from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import CsvFormat, load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset import index
-from plushsense.dataset.files import is_index_fresh
+from plushsense.dataset.files import current_stamp, is_index_fresh, write_stamp
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import change_head, open_dataset
 from plushsense.dataset.marks import Mark, append_marks
@@ -231,3 +231,42 @@ def test_a_change_of_the_head_is_atomic_and_keeps_the_index(folder: Path, monkey
     with pytest.raises(DatasetError, match="No space left") as refused:
         change_head(folder, lambda head: replace(head, licence="MIT"))
     assert refused.value.reason == "head_not_written" and (folder / "dataset.toml").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("recordings/ana/Shake_1_60.csv", "../secret.csv"),
+        ("recordings/ana/Shake_1_60.csv", "/etc/hostname"),
+        ("recordings/ana/Shake_1_60.csv", "recordings/ana/Shake_2_60.csv"),
+        ("ana/Shake_1_60,", "ana/Shake_2_60,"),
+        (",ana,", ",ben,"),
+        (",0,60,0,60,", ",0,999999999,0,60,"),
+        (",0,60,0,60,", ",-5,60,0,60,"),
+        (",0,60,0,60,", ",0,60,40,20,"),
+        (",0,60,0,60,", ",0,60,0,1" + "0" * 5000 + ","),
+        (",,-1,", ",,7,"),
+        (",,-1,", ",x,-1,"),
+        ("100.000", "nan"),
+        ("100.000", "\x00"),
+        ("Shake", "\udcff"),
+        ("\n", "\n,"),
+    ],
+)
+def test_a_damaged_index_with_a_right_stamp_is_made_anew(folder: Path, old: str, new: str) -> None:
+    expected = open_dataset(folder).recordings
+    path = folder / "recordings.csv"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8", errors="surrogateescape")
+    write_stamp(folder, current_stamp(folder))
+    assert open_dataset(folder).recordings == expected
+    assert path.read_text() == text
+
+
+def test_an_index_without_a_raw_file_is_made_anew(folder: Path) -> None:
+    expected = open_dataset(folder).recordings
+    path = folder / "recordings.csv"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+    write_stamp(folder, current_stamp(folder))
+    assert open_dataset(folder).recordings == expected

@@ -123,3 +123,21 @@ def test_inputs_that_spread_over_all_32_bits_are_scaled_too() -> None:
     network = integer_network(calibrated(wide, x))
     codes = network.inputs.apply(x.transpose(0, 2, 1))
     assert codes.min() < 8 and codes.max() > 247 and 120 < codes.mean() < 135
+
+
+@pytest.mark.parametrize("key", ["low", "high", "tops", "means"])
+@pytest.mark.parametrize("value", [1e19, -1e19, 1e300, -1e300, 10**400, 1e-300])
+def test_a_calibration_out_of_range_gives_a_sentence_and_no_wrong_number(key: str, value: float) -> None:
+    bundle = calibrated(make(), windows())
+    table = bundle.calibration | {key: [*bundle.calibration[key]]}
+    if key in ("low", "high"):
+        table[key][1] = value
+    else:
+        table[key][1] = [value, *table[key][1][1:]]
+    try:
+        with np.errstate(all="ignore"):
+            image = integer_model(replace(bundle, calibration=table)).to_bytes()
+    except BundleError as refused:
+        assert "again" in str(refused) or "fewer taps" in str(refused) or "accepted are" in str(refused)
+    else:
+        assert len(image) == len(integer_model(bundle).to_bytes()), "a value that saturates is no fault"

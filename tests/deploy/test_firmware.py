@@ -191,6 +191,50 @@ def test_noise_is_read_as_the_computer_reads_it(packages: Packages, tmp_path: Pa
         assert 100 < len(found) < 590
 
 
+ODD_NUMBERS = (
+    *(b"-0", b"+0", b"-1", b"", b"+", b"-", b"--1", b"0x10", b"1_0", b"\xd9\xa3", b"1.", b".5", b"1e2", b"1E+99"),
+    *(b"9" * n for n in (15, 16, 17, 18, 19, 25, 300)),
+    *(b"0" * n + b"7" for n in (17, 18, 40)),
+    *(b"1." + b"0" * n + b"1" for n in (16, 17, 18, 200)),
+    *(b"2147483648", b"4294967296", b"9007199254740992", b"9007199254740993"),
+)
+ODD_GAPS = (b" ", b"\t", b",;", b" , ", b"\v", b"\f", b"\0", b":", b" " * 250, b" " * 700)
+
+
+def test_computer_and_toy_read_one_grammar(packages: Packages, tmp_path: Path, c_compiler: str) -> None:
+    """Odd numbers at every place of a line, odd separators and long lines: both find the same frames."""
+    rng = np.random.default_rng(7)
+    for layout in LAYOUTS:
+        out, model = packages[layout]
+        library = tmp_path / f"{layout}.so"
+        run(c_compiler, "-shared", "-fPIC", out / ARDUINO / "src" / "plush_wire.c", "-o", library)
+        wire = ctypes.CDLL(str(library))
+        channels, lines = model.layout.n_channels, [b""]
+        for k in range(2000):
+            row = [*rng.integers(-3000, 3000, channels).tolist()]
+            fields = format_line(model.layout, row, 10 * k, 10).split()
+            gaps = [b" "] * (len(fields) - 1)
+            if k % 4 == 1:
+                fields[rng.integers(len(fields))] = ODD_NUMBERS[rng.integers(len(ODD_NUMBERS))]
+            elif k % 4 == 2:
+                gaps[rng.integers(len(gaps))] = ODD_GAPS[rng.integers(len(ODD_GAPS))]
+            elif k % 4 == 3:
+                at = rng.integers(len(fields))
+                fields[at] = bytes(rng.choice(list(b"0123456789+-.eE \t\v"), rng.integers(1, 8)).tolist())
+            lines.append(b"".join(part for pair in zip(fields, [*gaps, b""], strict=True) for part in pair))
+        talk = b"\n".join([*lines, b""])
+        state, ms, values = ctypes.create_string_buffer(4096), ctypes.c_uint32(), (ctypes.c_int32 * channels)()
+        expected = [
+            (f.device_ms % 2**32, *(max(-(2**31), min(v, 2**31 - 1)) for v in f.values))
+            for f in LineParser(model.layout, joining=True).feed(talk)
+        ]
+        found = [
+            (ms.value, *values) for c in talk if wire.plush_wire_read(state, ctypes.c_char(c), ctypes.byref(ms), values)
+        ]
+        assert found == expected
+        assert 700 < len(found) < 1800
+
+
 def test_decimals_of_any_length_are_read_as_the_computer_reads_them(
     packages: Packages, tmp_path: Path, c_compiler: str
 ) -> None:

@@ -73,3 +73,20 @@ def test_streams_by_name_or_where_that_is_not_unique_by_source() -> None:
     assert f"lsl://one%20{tail}" in urls
     assert urls[f"lsl://source:amp%20{tail}"].startswith("EEG, 8 channels, 0 Hz, on ")
     assert len(urls) == 3
+
+
+def test_without_the_network_nothing_is_sent_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = list[str]()
+
+    def search(scan_s: float) -> opening.DeviceListing:
+        asked.append("x")
+        return opening.DeviceListing()
+
+    monkeypatch.setattr(
+        opening, "SEARCHES", {"LSL": "support.nowhere:search", "Serial ports": "support.nowhere:search"}
+    )
+    monkeypatch.setattr(opening.pkgutil, "resolve_name", lambda name: search)
+    list_devices(0.1, network=False)
+    assert asked == ["x"]
+    list_devices(0.1)
+    assert asked == ["x"] * 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import PlushSenseError
+from plushsense.jobs import journal as room
 from plushsense.jobs.journal import Journal, job_id
 
 RESULT = {"probabilities": np.arange(600, dtype=np.float32).reshape(100, 6), "history": [{"epoch": 1}], "s": 0.5}
@@ -85,3 +87,22 @@ def test_where_nothing_may_be_written_nothing_is(tmp_path: Path) -> None:
     with pytest.raises(PlushSenseError, match="not any more"):
         journal.save("b", RESULT)
     assert [p.name for p in journal.folder.iterdir()] == ["a.npz"]
+
+
+@pytest.mark.parametrize(("code", "refused"), [(errno.EROFS, False), (errno.EACCES, False), (errno.ENOSPC, True)])
+def test_a_read_only_disk_stores_nothing_and_a_full_one_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, refused: bool
+) -> None:
+    @contextmanager
+    def fails(path: Path) -> Iterator[Path]:
+        raise OSError(code, "no")
+        yield path
+
+    monkeypatch.setattr(room, "replacing_file", fails)
+    journal = Journal(tmp_path)
+    if refused:
+        with pytest.raises(PlushSenseError, match="cannot be kept"):
+            journal.save("a", RESULT)
+    else:
+        journal.save("a", RESULT)
+    assert not journal.has("a")

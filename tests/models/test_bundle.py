@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import os
+import random
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,10 @@ from plushsense.core.gestures import load_gestures
 from plushsense.core.layouts import load_layout
 from plushsense.models import bundle as room
 from plushsense.models.arch import Arch
-from plushsense.models.bundle import Bundle
+from plushsense.models.bundle import Bundle, known_people
 from plushsense.models.reference import random_weights
 from plushsense.windows.features import Scaler
+from support.bundles import contents, signed
 
 
 def make(**changes: Any) -> Bundle:
@@ -190,3 +193,81 @@ def test_provenance_is_plain_values(tmp_path: Path) -> None:
         make(provenance={"x": object()}).save(tmp_path / "n.plush")
     with pytest.raises(dataclasses.FrozenInstanceError):
         make().arch = None  # type: ignore[misc, assignment]
+
+
+DENSE = {"dense.weight": np.zeros((5, 4)).tolist(), "dense.bias": [0.0] * 5}
+
+
+@pytest.mark.parametrize(
+    ("where", "value"),
+    [
+        *(
+            (name, value)
+            for name in ("decision", "provenance", "windowing", "layout", "personal")
+            for value in (1.5, [])
+        ),
+        ("provenance.scores", [0.5]),
+        ("provenance.scores.accuracy", "high"),
+        ("provenance.subjects", {"P1": 1}),
+        ("provenance.training", "loso"),
+        ("windowing.window_s", "2.5"),
+        ("windowing.anywhere", {"every_s": []}),
+        ("layout.name", "half \ud800"),
+        ("layout.gap_ms", 0),
+        ("layout.gap_ms", 10**9),
+        ("scaling.scale", [0.0, 0.1, 0.1]),
+        ("scaling.scale", [-1.0, 0.1, 0.1]),
+        ("scaling.scale", [1e300, 0.1, 0.1]),
+        ("scaling.offset", [1e300, 0.0, 0.0]),
+        ("scaling.offset", [10**400, 0.0, 0.0]),
+        ("personal", {"original": {"dense.weight": [[1.0]], "dense.bias": [1.0]}}),
+        ("personal", {"uncorrected": {"dense.bias": [0.0] * 5}}),
+        ("personal", {"subject": 7, "original": DENSE}),
+    ],
+)
+def test_values_out_of_range_are_refused_at_load(where: str, value: object) -> None:
+    content, weights = contents(make().to_bytes())
+    table, *more = where.split(".")
+    inner = content
+    for step in (table, *more)[:-1]:
+        inner = inner[step]
+    inner[(table, *more)[-1]] = value
+    content["clock"]["gap_ms"] = content["layout"]["gap_ms"] if isinstance(content["layout"], dict) else 100
+    with pytest.raises(BundleError):
+        Bundle.from_bytes(signed(content, weights))
+
+
+def test_an_earlier_layer_that_fits_is_accepted() -> None:
+    content, weights = contents(make().to_bytes())
+    content["personal"] = {"subject": "S1", "original": DENSE, "uncorrected": DENSE}
+    assert Bundle.from_bytes(signed(content, weights)).adapted_to == "S1"
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [path, *(place for key, each in inner for place in places(each, (*path, key)))]
+
+
+def test_any_content_with_a_right_checksum_loads_or_is_refused() -> None:
+    content, weights = contents(make(personal={"subject": "S1", "original": DENSE}).to_bytes())
+    odd = [None, True, "x", "\udc00", [], {}, [1], {"a": 1}, -1, 0, 10**30, 10**400, 1e308, 1e-300]
+    rng, loaded = random.Random(4), 0
+    for _ in range(600):
+        changed = copy.deepcopy(content)
+        *inside, last = rng.choice(places(changed)[1:])
+        table = changed
+        for step in inside:
+            table = table[step]
+        table[last] = rng.choice(odd)
+        try:
+            repr(Bundle.from_bytes(signed(changed, weights)).without_people().to_bytes())
+            loaded += 1
+        except BundleError:
+            pass
+    assert 20 < loaded < 580
+
+
+def test_people_are_codes_or_a_number() -> None:
+    assert known_people({"subjects": ["a", "none"], "validation_subjects": ["b"]}) == {"a", "b"}
+    assert known_people({"subjects": ["a"], "validation_subjects": ["b"]}, ["validation_subjects"]) == {"b"}
+    assert known_people({"subjects": 3, "validation_subjects": 2}) == set()

@@ -25,6 +25,7 @@ from plushsense.devices.base import Device, Frame, now_ms
 from plushsense.devices.opening import open_device
 from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.recording import states as machine
+from plushsense.recording import takes
 from plushsense.recording.plan import load_protocol
 from plushsense.recording.recorder import Recorder, prompt_virtual
 from plushsense.recording.session import OpenSession
@@ -353,6 +354,27 @@ def test_a_hole_that_ends_a_recording_is_stated_once(tmp_path: Path) -> None:
     (gap,) = beside["gaps"]
     assert gap["reason"] == "nothing came"
     assert 1400 <= gap["missing_ms"] < 3000
+
+
+class Standing(Device):
+    """A toy in real time whose clock stands still."""
+
+    def read(self) -> list[Frame] | None:
+        time.sleep(0.005)
+        return [Frame(now_ms(), 7, (0,) * LAYOUT.n_channels)]
+
+
+def test_a_clock_that_stands_ends_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(takes, "SLOWEST", 0.1)
+    with (
+        Standing("x", LAYOUT) as toy,
+        Recorder.open(tmp_path, toy, head(countdown_s=0.5, shortest_s=0.0, longest_s=1.0)) as r,
+    ):
+        until(lambda: r.status().rows > 5)
+        r.space()
+        assert r.wait("recording", timeout_s=5), "the countdown ends, too"
+        assert r.wait("idle", timeout_s=5)
+        assert json.loads((tmp_path / r.status().file).with_suffix(".json").read_text())["ended"] == "longest"
 
 
 class Breaking(Device):

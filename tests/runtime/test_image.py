@@ -165,9 +165,6 @@ def other(model: IntegerModel, **changes: Any) -> IntegerModel:
 def test_what_a_toy_cannot_hold() -> None:
     model = plain_model()
     layout, gestures = model.layout, model.gestures.gestures
-    for gap_ms in (0, -5, (1 << 22) + 1):
-        with pytest.raises(BundleError, match="accepts 1 to 4194304 ms"):
-            other(model, layout=dataclasses.replace(layout, gap_ms=gap_ms))
     odd = dataclasses.replace(layout, rate_hz=104.0)  # a period of 9615 us: 200 units a ms
     other(model, layout=dataclasses.replace(odd, gap_ms=20971)).to_bytes()
     with pytest.raises(BundleError, match="at 104 Hz the toy accepts 1 to 20971 ms"):

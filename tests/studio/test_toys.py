@@ -23,16 +23,16 @@ def toys(tmp_path: Path) -> Toys:
 
 
 def test_looking_does_not_wait_and_rings(toys: Toys, monkeypatch: pytest.MonkeyPatch) -> None:
-    looks, may_look = list[float](), threading.Event()
+    looks, may_look = list[tuple[float, bool]](), threading.Event()
 
-    def later(scan_s: float) -> DeviceListing:
-        looks.append(scan_s)
+    def later(scan_s: float, network: bool) -> DeviceListing:
+        looks.append((scan_s, network))
         assert may_look.wait(30)
-        return list_devices(scan_s)
+        return list_devices(scan_s, network=network)
 
     monkeypatch.setattr(room, "list_devices", later)
     # Both return although nothing may be found yet, and the second joins the first.
-    toys.search(0.2)
+    toys.search(0.2, network=False)
     toys.search(0.2)
     assert toys.searching and not toys.searched
     may_look.set()
@@ -41,7 +41,7 @@ def test_looking_does_not_wait_and_rings(toys: Toys, monkeypatch: pytest.MonkeyP
         assert time.monotonic() < end
         time.sleep(0.02)
     assert [d.kind for d in toys.listing.devices][-1] == "virtual"
-    assert looks == [0.2]
+    assert looks == [(0.2, False)]
 
 
 def test_a_person_of_the_virtual_toy(toys: Toys) -> None:

@@ -9,17 +9,19 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 import plushsense as ps
-from plushsense.core.errors import ArchError, ArrayError, ConfigError
-from plushsense.core.gestures import load_gestures
+from plushsense.core.errors import ArchError, ArrayError, BundleError, ConfigError
+from plushsense.core.gestures import Gesture, GestureSet, load_gestures
 from plushsense.core.layouts import load_layout
 from plushsense.dataset.store import Dataset
 from plushsense.models.reference import softmax
+from plushsense.workflow.estimator import labels_from
 
 sklearn = pytest.importorskip("sklearn", minversion="1.6")
 
@@ -324,3 +326,11 @@ def test_forget_finds_a_classifier_that_was_told_whose_windows_they_are(dataset:
     found = trained_on(dataset.path, "P2", [tmp_path])
     assert [f.certain for f in found] == [False]
     assert "arrays given to PlushClassifier" in found[0].message
+
+
+@pytest.mark.parametrize("dtype", [65536, "V99999999", "x", None, "<U999999"])
+def test_class_labels_that_do_not_fit_are_refused(dtype: object) -> None:
+    gestures = GestureSet("two", (Gesture("a"), Gesture("b")))
+    provenance = {"estimator": {"labels": ["a", "b"], "dtype": dtype}}
+    with pytest.raises(BundleError):
+        labels_from(SimpleNamespace(provenance=provenance, gestures=gestures))  # type: ignore[arg-type]

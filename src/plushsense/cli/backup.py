@@ -40,8 +40,10 @@ def _check(args: argparse.Namespace) -> int:
 
 def run_restore(args: argparse.Namespace) -> int:
     from plushsense.dataset.backup import restore
+    from plushsense.dataset.importing.archives import UnpackLimits
 
-    dataset = restore(args.file, args.dest, progress=ProgressReporter("restoring"))
+    limits = UnpackLimits.of_gigabytes(args.max_gb)
+    dataset = restore(args.file, args.dest, progress=ProgressReporter("restoring"), limits=limits)
     result = {
         "dataset": args.dest,
         "recordings": len(dataset.recordings),

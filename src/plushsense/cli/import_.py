@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
         add_to=args.add,
         adopt_proposals=args.adopt,
         columns=_columns(args.column),
-        limits=None if args.max_gb is None else UnpackLimits(total_bytes=_whole_bytes(args.max_gb)),
+        limits=UnpackLimits.of_gigabytes(args.max_gb),
     )
     result = done.to_dict()
     if not args.json:
@@ -60,9 +60,3 @@ def run(args: argparse.Namespace) -> int:
         f"{done.seconds:.1f} s",
     )
     return 0
-
-
-def _whole_bytes(gigabytes: float) -> int:
-    if not 0 < gigabytes < 1e6:
-        raise ConfigError(f"--max-gb is {gigabytes:g}: give a number above 0.")
-    return int(gigabytes * 1e9)

@@ -38,10 +38,13 @@ class Parser(argparse.ArgumentParser):
 
 
 def utf8() -> None:
-    """Set the encoding of standard output and standard error to UTF-8, regardless of the console's code page."""
-    for stream, errors in ((sys.stdout, "strict"), (sys.stderr, "backslashreplace")):
+    """Set the encoding of standard output and standard error to UTF-8, regardless of the console's code page.
+
+    What is no text, such as bytes in the name of a file, is escaped, in a way that is valid in JSON.
+    """
+    for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(encoding="utf-8", errors=errors)
+            stream.reconfigure(encoding="utf-8", errors="backslashreplace")
 
 
 def say(text: str) -> None:

@@ -85,7 +85,7 @@ def _removal_lines(result: Forgotten) -> list[str]:
     lines += [f"  {path}" for path in paths]
     if len(plan.files) > _MOST_FILES:
         lines.append(f"  … and {len(plan.files) - _MOST_FILES} more files")
-    lines += [f"still contains the code, check it: {path}" for path in plan.mentions]
+    lines += [f"contains the code or cannot be read, check it: {path}" for path in plan.mentions]
     lines += [f"bundle: {b.bundle}: {b.message}" for b in result.bundles]
     lines += [f"corrections of this code, delete them: {path}" for path in result.feedback]
     lines += [f"discarded recordings of this code, delete them: {path}" for path in result.discarded]

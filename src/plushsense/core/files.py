@@ -11,11 +11,15 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from plushsense.core.errors import BadInput
 
 PART = ".part"
 """Suffix of files being written; files with it that a killed program left behind can be deleted."""
 _UNFINISHED = "-unfinished-"
+_OWNER = "owner.lock"
+_TEMPORARY = "plushsense"
 
 
 def unfinished(dest: Path) -> str:
@@ -28,6 +32,64 @@ def is_unfinished(name: str) -> bool:
     return name.startswith(".") and _UNFINISHED in name
 
 
+def abandoned_folders(place: Path) -> list[Path]:
+    """Return the work folders in ``place`` that no process uses any more, as a killed program leaves them."""
+    found = [entry for entry in place.glob(f".*{_UNFINISHED}*") if (entry / _OWNER).is_file()]
+    return sorted(entry for entry in found if not is_in_use(entry))
+
+
+def abandoned_temporary_folders() -> list[Path]:
+    """Return the folders of `temporary_folder` that no process uses any more."""
+    place = Path(tempfile.gettempdir())
+    return [folder for folder in abandoned_folders(place) if folder.name.startswith(unfinished(place / _TEMPORARY))]
+
+
+def is_in_use(folder: Path) -> bool:
+    """Return whether a process uses a work folder; it cannot be known on a disk without locks, and is True there.
+
+    Folders of earlier versions have no lock file and count as not in use.
+    """
+    try:
+        if (folder / _OWNER).is_file():
+            # Nothing else is in it until its owner has locked it.
+            if [entry.name for entry in folder.iterdir()] == [_OWNER]:
+                return True
+            with FileLock(folder / _OWNER, timeout=0):
+                pass
+    except (OSError, Timeout, NotImplementedError):
+        return True
+    return False
+
+
+@contextlib.contextmanager
+def work_folder(dest: Path) -> Iterator[Path]:
+    """Yield a new folder beside ``dest`` for unfinished files, which is deleted when the block ends.
+
+    It has a unique name and contains a lock file, which is held meanwhile. Those beside ``dest`` that killed programs
+    left are deleted first.
+    """
+    place = dest.resolve().parent
+    for left in abandoned_folders(place):
+        shutil.rmtree(left, ignore_errors=True)
+    folder = Path(tempfile.mkdtemp(prefix=unfinished(dest), dir=place))
+    lock = FileLock(folder / _OWNER)
+    try:
+        # On a disk without locks, nobody can take the folder for an abandoned one.
+        with contextlib.suppress(OSError, NotImplementedError):
+            lock.acquire()
+        yield folder
+    finally:
+        lock.release()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """Yield a `work_folder` in the system's folder for temporary files, for copies of personal data."""
+    with work_folder(Path(tempfile.gettempdir()) / _TEMPORARY) as folder:
+        yield folder
+
+
 def write_file(path: Path, content: str | bytes, *, private: bool = False) -> None:
     """Write a file atomically (see `replacing_file`); text is encoded as UTF-8, with line ends unchanged."""
     with replacing_file(path, private=private) as part:
@@ -35,7 +97,7 @@ def write_file(path: Path, content: str | bytes, *, private: bool = False) -> No
 
 
 @contextlib.contextmanager
-def replacing_file(path: Path, *, private: bool = False) -> Iterator[Path]:
+def replacing_file(path: Path, *, private: bool = False, within: Path | None = None) -> Iterator[Path]:
     """Yield a path beside ``path`` to write to; it replaces ``path`` when the block ends without an exception.
 
     Readers see either the old file or the new one, even after a power failure or with several writers at once. After
@@ -43,11 +105,12 @@ def replacing_file(path: Path, *, private: bool = False) -> Iterator[Path]:
 
     Args:
         private: make the file readable by its owner only (mode 600, where the system has file modes).
+        within: a folder on the same disk in which to write instead, such as a `work_folder` for large files.
 
     Raises:
         OSError: when the file cannot be written; on Windows also while another program has ``path`` open.
     """
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PART}")
+    part = (within or path.parent) / f".{path.name}.{secrets.token_hex(4)}{PART}"
     try:
         if private:
             os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
@@ -95,15 +158,14 @@ def syncing_folder(folder: Path) -> Iterator[Callable[[], None]]:
 
 @contextlib.contextmanager
 def new_folder(dest: Path, error: type[BadInput], last: str = "") -> Iterator[Path]:
-    """Yield a work folder beside ``dest`` that becomes ``dest`` when the block ends, and is deleted after an exception.
+    """Yield a folder in a `work_folder` that becomes ``dest`` when the block ends, and is deleted after an exception.
 
-    Each work folder has a unique name. If ``dest`` is an existing empty folder (such as ``.``, or a link to one), the
-    files are moved into it, with the file ``last`` moved last.
+    If ``dest`` is an existing empty folder (such as ``.``, or a link to one), the files are moved into it, with the
+    file ``last`` moved last.
 
     Raises:
         error: when ``dest`` exists and is not an empty folder, or cannot be written.
     """
-    scratch: Path | None = None
     try:
         if dest.is_symlink() and not dest.exists():
             raise error(f"'{dest}' is a broken link: give a new or empty folder.")
@@ -112,17 +174,17 @@ def new_folder(dest: Path, error: type[BadInput], last: str = "") -> Iterator[Pa
             message = f"'{dest}' already holds something: give a new or empty folder, nothing is overwritten."
             raise error(message, reason="name_exists", name=dest.name)
         real.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=unfinished(real), dir=real.parent))
-        work = scratch / (real.name or "folder")
-        work.mkdir()
-        yield work
-        if real.is_dir():
-            for entry in sorted(work.iterdir(), key=lambda p: p.name == last):
-                os.replace(entry, real / entry.name)
-        else:
-            os.replace(work, real)
-        with syncing_folder(real.parent) as sync:
-            sync()
+        with work_folder(real) as scratch:
+            work = scratch / (real.name or "folder")
+            work.mkdir()
+            yield work
+            if real.is_dir():
+                for entry in sorted(work.iterdir(), key=lambda p: p.name == last):
+                    os.replace(entry, real / entry.name)
+            else:
+                os.replace(work, real)
+            with syncing_folder(real.parent) as sync:
+                sync()
     except OSError as cause:
         where, why = f" at '{cause.filename}'" if cause.filename else "", cause.strerror or str(cause)
         raise error(
@@ -131,9 +193,6 @@ def new_folder(dest: Path, error: type[BadInput], last: str = "") -> Iterator[Pa
             name=dest.name,
             why=why,
         ) from None
-    finally:
-        if scratch is not None:
-            shutil.rmtree(scratch, ignore_errors=True)
 
 
 def free_path(path: Path, content: bytes) -> Path:

@@ -22,6 +22,7 @@ GRAVITY_FRACTION_BITS = 4
 GRAVITY_STATE_BITS = 10  # fraction bits of the running mean itself
 GRAVITY_S = 0.64  # time constant of the running mean; chosen on 14 people (bench/people.py)
 ACCELERATION = "acceleration"
+MOST_GAP_MS, MOST_GAP_SAMPLES = 60_000, 60_000
 _INT32 = (-2147483648.0, 2147483647.0)
 
 
@@ -153,13 +154,19 @@ class Layout:
             yield "a network needs inputs: fill in inputs."
         if not 1.0 <= self.rate_hz <= 10_000.0:
             yield f"rate_hz is {self.rate_hz}; accepted are 1 to 10000."
+        elif not 1 <= self.gap_ms <= MOST_GAP_MS or self.gap_ms * self.rate_hz > 1000 * MOST_GAP_SAMPLES:
+            yield (
+                f"gap_ms is {self.gap_ms}: accepted are 1 to {MOST_GAP_MS}, and at most {MOST_GAP_SAMPLES} samples, as "
+                "all samples of a gap are computed at once."
+            )
         for derived in self.derived:
             yield from self._problems_of(derived)
+        kinds = {c.name: c.kind for c in self.channels}
         for vector in self.vectors:
             if len(vector) != 3:
                 yield f"a vector has three axes, not {len(vector)}."
-            for name in vector:
-                self.index(name)
+            if len({kinds[self.names[self.index(name)]] for name in vector}) > 1:
+                yield f"the axes {', '.join(vector)} of a vector are of different kinds: give them one."
 
     def _problems_of(self, derived: Derived) -> Iterator[str]:
         if derived.kind not in ("magnitude", "gravity"):
@@ -318,6 +325,8 @@ class Layout:
         Raises:
             LayoutError: for an unknown or missing key, or a value of the wrong type or out of range.
         """
+        if not isinstance(table, dict):
+            raise LayoutError(f"The {where} is {table!r}: accepted is a table.")
         given = table.get("channels")
         # Wrong types are skipped here, since `load_table` reports them.
         names = [c.get("name") for c in given if isinstance(c, dict)] if isinstance(given, list | tuple) else []

@@ -1,4 +1,4 @@
-"""Read TOML files strictly: refuse unknown keys, and values whose type is not that of the dataclass field.
+"""Read TOML files, and JSON, strictly: refuse unknown keys, and values whose type is not that of the dataclass field.
 
 `cattrs` creates the dataclasses; this module sets the rules (the only conversion is from whole number to float) and
 formats the error messages.
@@ -7,6 +7,7 @@ formats the error messages.
 from __future__ import annotations
 
 import functools
+import json
 import math
 import numbers
 import re
@@ -52,6 +53,26 @@ def read_named(name_or_path: str | Path, folder: str, kind: str, error: type[Bad
             f"or give the path of a TOML file.{nearest(text, known)}"
         )
     return read_toml(path, kind, error), text
+
+
+def loads_json(text: str) -> Any:
+    """Return the value of a JSON text; half surrogate pairs, which no file in UTF-8 can hold, become U+FFFD.
+
+    Raises:
+        ValueError, RecursionError: like `json.loads`.
+    """
+    value = json.loads(text)
+    return _whole_characters(value) if "\\ud" in text.lower() else value
+
+
+def _whole_characters(value: Any) -> Any:
+    if isinstance(value, str):
+        return value.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
+    if isinstance(value, list):
+        return [_whole_characters(item) for item in value]
+    if isinstance(value, dict):
+        return {_whole_characters(key): _whole_characters(item) for key, item in value.items()}
+    return value
 
 
 def read_toml(path: Path, kind: str, error: type[BadInput]) -> dict[str, Any]:

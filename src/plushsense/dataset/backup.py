@@ -19,9 +19,9 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.files import new_folder, replacing_file
+from plushsense.core.files import new_folder, replacing_file, work_folder
 from plushsense.dataset.files import list_files
-from plushsense.dataset.importing.archives import DAMAGED, zip_entry
+from plushsense.dataset.importing.archives import DAMAGED, UnpackLimits, zip_entry
 from plushsense.dataset.index import open_dataset, rebuild_index
 from plushsense.dataset.store import HEAD, Dataset, Progress
 
@@ -77,6 +77,11 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
         target.parent.mkdir(parents=True, exist_ok=True)
         listed = [f for f in list_files(folder) if f.kind not in _LEFT_OUT]
         paths = [f.path for f in listed if f.kind != "link"]
+        for path in paths:
+            if _name_refusal(path.as_posix()):
+                name = path.as_posix().encode(errors="backslashreplace").decode()
+                message = f"'{name}' in '{folder}' has a name that a backup cannot hold on every system: rename it."
+                raise DatasetError(message, reason="backup_name", file=name)
         total = 2 * sum((folder / path).stat().st_size for path in paths)
         done = 0
         files: list[dict[str, Any]] = []
@@ -89,7 +94,7 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
             "hash": source.hash,
             "files": files,
         }
-        with replacing_file(target) as part:
+        with work_folder(target) as work, replacing_file(target, within=work) as part:
             with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
                 for path in paths:
                     files.append(_store(archive, folder, path))
@@ -98,6 +103,7 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
                 text = json.dumps(manifest, ensure_ascii=False, indent=0) + "\n"
                 archive.writestr(zip_entry(MANIFEST), text.encode("utf-8"))
             _verify(part, lambda n: report(total // 2 + n, total))
+            source.generation.check()
             if target.exists():
                 message = f"'{target}' appeared meanwhile: a backup never replaces another; give a new name."
                 raise DatasetError(message, reason="name_exists", name=target.name)
@@ -133,15 +139,22 @@ def is_backup(file: str | Path) -> bool:
         return False
 
 
-def restore(file: str | Path, dest: str | Path, progress: Progress | None = None) -> Dataset:
+def restore(
+    file: str | Path, dest: str | Path, progress: Progress | None = None, limits: UnpackLimits | None = None
+) -> Dataset:
     """Restore a data set into a new or empty folder, completely or not at all.
 
+    Args:
+        limits: limits of the number of files and of their size; the expansion ratio is not limited.
+
     Raises:
-        DatasetError: for a damaged backup, for one with paths outside of ``dest``, or if ``dest`` is not empty.
+        DatasetError: for a damaged backup, for one with paths outside of ``dest`` or beyond the ``limits``, or if
+            ``dest`` is not empty.
     """
     path, folder = Path(file), Path(dest)
     with _open_backup(path) as (archive, manifest):
         total = sum(entry["bytes"] for entry in manifest["files"])
+        (limits or UnpackLimits()).check(path, len(manifest["files"]), total)
         done = 0
         with new_folder(folder, DatasetError, last=HEAD) as work:
             for entry in manifest["files"]:
@@ -234,15 +247,22 @@ def _open_backup(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]
         yield archive, manifest
 
 
+def _name_refusal(name: str) -> str:
+    """Return the reason why a path cannot be in a backup; "" if it can."""
+    if name.startswith("/") or "\\" in name or re.match(r"[A-Za-z]:", name) or "\0" in name:
+        return "an absolute path or one of another system"
+    if any(part in ("", ".", "..") for part in name.split("/")):
+        return "a folder, or a path that leaves its place"
+    if name.encode(errors="replace").decode() != name:
+        return "a name that is no text"
+    return ""
+
+
 def _refusal(info: zipfile.ZipInfo) -> str:
     """Return the reason why a member must not be unpacked; "" if it may."""
-    name = info.filename
-    parts = name.split("/")
     # zipfile cuts a name at a zero byte; ``orig_filename`` keeps it.
-    if name.startswith("/") or "\\" in name or re.match(r"[A-Za-z]:", name) or "\0" in info.orig_filename:
-        return "an absolute path or one of another system"
-    if any(part in ("", ".", "..") for part in parts):
-        return "a folder, or a path that leaves its place"
+    if reason := _name_refusal(info.orig_filename if "\0" in info.orig_filename else info.filename):
+        return reason
     kind = stat.S_IFMT(info.external_attr >> 16)
     if kind not in (0, stat.S_IFREG):
         return "a link or no plain file"
@@ -269,6 +289,7 @@ def _manifest_of(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
         whole = all(isinstance(table[k], kind) for k, kind in kinds.items()) and all(
             isinstance(entry[k], kind) for entry in table["files"] for k, kind in entry_kinds.items()
         )
+        whole = whole and all(entry["bytes"] >= 0 for entry in table["files"])
         if not whole:
             raise ValueError("its manifest lacks something")
     except _NO_MANIFEST as cause:

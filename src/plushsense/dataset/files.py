@@ -77,6 +77,11 @@ def is_index_fresh(folder: Path) -> bool:
     return _read_stamp(folder) == current_stamp(folder) | {"index": _index_hashes(folder)}
 
 
+def indexed_files(folder: Path) -> dict[str, int]:
+    """Return the size in bytes of each file of the stamp on disk, by name; call it only if the stamp is right."""
+    return {name: size for name, size, _ in _read_stamp(folder)["files"]}
+
+
 def is_same_raw_data(folder: Path, now: dict[str, Any]) -> bool:
     """Return whether the index is complete and, except for the marks, was built from the files of the stamp ``now``."""
     return _read_stamp(folder) | {"marks": now["marks"]} == now | {"index": _index_hashes(folder)}

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 import os
-from collections.abc import Callable, Iterable
+import re
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ from plushsense.dataset.files import (
     STAMP,
     STREAMS_INDEX,
     current_stamp,
+    indexed_files,
     is_index_fresh,
     is_same_raw_data,
     missing_files,
@@ -47,6 +50,8 @@ from plushsense.dataset.store import (
     write_index,
 )
 from plushsense.recording.takes import measured_rate_hz
+
+_SHA256 = re.compile("[0-9a-f]{64}")
 
 
 @dataclass
@@ -77,8 +82,8 @@ def open_dataset(path: str | Path) -> Dataset:
     head = DatasetHead.read(folder)
     try:
         generation = Generation.of(folder)
-        if is_index_fresh(folder):
-            return _indexed(folder, head, generation)
+        if is_index_fresh(folder) and (dataset := _indexed(folder, head, generation)) is not None:
+            return dataset
         if missing := missing_files(folder):
             raise DatasetError(
                 f"'{folder}' lacks {len(missing)} raw file{'s' if len(missing) > 1 else ''} that it had "
@@ -89,12 +94,11 @@ def open_dataset(path: str | Path) -> Dataset:
                 file=missing[0],
             )
         stamp = current_stamp(folder)
-        if is_same_raw_data(folder, stamp):
-            # Only the marks changed, so the raw files need not be read again.
-            built = IndexBuild(_indexed(folder, head, generation))
-            built.dataset.recordings = apply_marks(built.dataset.recordings, read_marks(folder), head.gestures)
-        else:
-            built = build_index(folder, head)
+        # If only the marks changed, the raw files need not be read again.
+        dataset = _indexed(folder, head, generation) if is_same_raw_data(folder, stamp) else None
+        if dataset is not None:
+            dataset.recordings = apply_marks(dataset.recordings, read_marks(folder), head.gestures)
+        built = build_index(folder, head) if dataset is None else IndexBuild(dataset)
     except OSError as cause:
         raise DatasetError(
             f"'{folder}' cannot be read: {cause.strerror or cause} ({cause.filename}).",
@@ -125,10 +129,59 @@ def open_dataset(path: str | Path) -> Dataset:
     return built.dataset
 
 
-def _indexed(folder: Path, head: DatasetHead, generation: Generation) -> Dataset:
-    """Return the data set as its index on disk describes it."""
-    recordings = read_index(folder / RECORDINGS_INDEX, RecordingInfo)
-    return Dataset(folder, head, recordings, read_index(folder / STREAMS_INDEX, StreamInfo), generation)
+def _indexed(folder: Path, head: DatasetHead, generation: Generation) -> Dataset | None:
+    """Return the data set as its index on disk describes it; None if the index is damaged."""
+    try:
+        recordings = read_index(folder / RECORDINGS_INDEX, RecordingInfo)
+        streams = read_index(folder / STREAMS_INDEX, StreamInfo)
+    except DatasetError:
+        return None
+    files = indexed_files(folder)
+    known = {s.id: s for s in streams}
+    right = all(_is_stream_of(s, files) for s in streams) and all(_is_recording_of(r, files, known) for r in recordings)
+    distinct = len(known) == len(streams) and len({r.id for r in recordings}) == len(recordings)
+    if not right or not distinct or {r.file for r in recordings} | {s.file for s in streams} != set(files):
+        return None
+    return Dataset(folder, head, recordings, streams, generation)
+
+
+def _is_stream_of(info: StreamInfo, files: Mapping[str, int]) -> bool:
+    """Return whether a row of the index describes one of the raw ``files`` (sizes by name), with values in range."""
+    expected = _stem(info.file, STREAMS)
+    return (
+        info.id == expected
+        and info.subject == expected.partition("/")[0]
+        and 0 < info.rows <= files.get(info.file, 0)
+        and 0 <= info.restarts <= info.rows
+        and 0.0 <= info.seconds < math.inf
+        and _SHA256.fullmatch(info.sha256) is not None
+    )
+
+
+def _is_recording_of(info: RecordingInfo, files: Mapping[str, int], streams: Mapping[str, StreamInfo]) -> bool:
+    """Do the same as `_is_stream_of` for a recording, in a file of its own or in one of ``streams``, by id."""
+    part_of = info.file.startswith(f"{STREAMS}/")
+    stream = streams.get(info.stream)
+    home = info.stream if part_of else _stem(info.file, RECORDINGS)
+    return (
+        (info.id.startswith(f"{home}#") if part_of else info.id == home)
+        and info.subject in (home.partition("/")[0], NOBODY)
+        and (stream is not None or (not info.stream and not part_of))
+        and (not part_of or (stream is not None and info.file == stream.file))
+        and 0 < info.rows <= files.get(info.file, 0)
+        and 0 <= info.start <= info.stop <= info.rows
+        and info.first_row >= 0
+        and (not part_of or (stream is not None and info.first_row + info.rows <= stream.rows))
+        and -1 <= info.stream_row < (stream.rows if stream is not None else 0)
+        and max(abs(info.start_ms), abs(info.epoch_ms)) < 1 << 62
+        and 0.0 <= info.rate_hz < math.inf
+        and _SHA256.fullmatch(info.sha256) is not None
+    )
+
+
+def _stem(file: str, kind: str) -> str:
+    """Return the path of a raw file below the folder ``kind``, without its suffix; "" for another file."""
+    return file.removeprefix(f"{kind}/").rpartition(".")[0] if file.startswith(f"{kind}/") else ""
 
 
 def rebuild_index(folder: Path, head: DatasetHead | None = None, progress: Progress | None = None) -> IndexBuild:
@@ -185,12 +238,16 @@ def build_index(folder: Path, head: DatasetHead, progress: Progress | None = Non
     streams: list[_RawFile] = []
     recordings: list[_RawFile] = []
     for done, (kind, path) in enumerate(files):
+        name = path.relative_to(folder).as_posix()
+        if (shown := name.encode(errors="backslashreplace").decode()) != name:
+            message = f"'{shown}' in '{folder}' has a name that is no text: rename it."
+            raise DatasetError(message, reason="name_no_text", file=shown)
         reader = read_stream if kind == STREAMS else read_recording
         try:
             data = read_bytes(path)
             result = reader(path, head.layout, data)
         except FileFormatError as cause:
-            unreadable[path.relative_to(folder).as_posix()] = Sentence.of(cause)
+            unreadable[name] = Sentence.of(cause)
             continue
         subject = path.relative_to(folder / kind).parts[0]
         read = _RawFile(path, subject, result, hashlib.sha256(data).hexdigest())

@@ -27,7 +27,6 @@ from plushsense.dataset.marks import (
     LabelledStretch,
     Mark,
     MarkState,
-    append_marks,
     apply_mark,
     match_ids,
     read_marks,
@@ -149,7 +148,7 @@ def label_stretches(
             now[s.stream] = after
             marks.append(mark)
             new.append(s)
-    append_marks(dataset.path, marks)
+    dataset.append_marks(marks)
     return new
 
 
@@ -184,7 +183,7 @@ def relabel(
         new = "" if label == known[identity].recorded else label
         if new != standing.get(identity, MarkState()).gesture:
             marks.append(Mark(identity, "relabel", author_name(who), why, gesture=new))
-    append_marks(dataset.path, marks)
+    dataset.append_marks(marks)
     return tuple(mark.recording for mark in marks)
 
 
@@ -195,7 +194,7 @@ def unlabel(
     standing = read_marks(dataset.path).get(stream.id, MarkState()).stretches
     changed = sum(s.outside(start, stop) != [s] for s in standing)
     if changed:
-        append_marks(dataset.path, [Mark(stream.id, "unlabel", author_name(who), why, start=start, stop=stop)])
+        dataset.append_marks([Mark(stream.id, "unlabel", author_name(who), why, start=start, stop=stop)])
     return changed
 
 

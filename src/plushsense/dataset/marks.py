@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from fnmatch import fnmatchcase
@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 from filelock import FileLock
 
 from plushsense.core.errors import DatasetError, nearest
-from plushsense.core.toml import load_table
+from plushsense.core.toml import load_table, loads_json
 
 MARKS = "marks.jsonl"
 BY_HAND, SUGGESTED = "hand", "suggested"
@@ -150,11 +150,37 @@ def mark_line(mark: Mark) -> str:
     return json.dumps(table, ensure_ascii=False) + "\n"
 
 
-def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
+def append_marks(folder: Path, marks: Iterable[Mark], check: Callable[[], None] | None = None) -> None:
     """Append marks under a file lock, so that several programs can write marks at the same time.
+
+    Args:
+        check: called while the lock is held, before anything is written; an exception prevents it. For marks about an
+            open data set, that is `dataset.store.Generation.check` (`Dataset.append_marks`).
 
     Raises:
         DatasetError: for a mark with contradictory values, or a folder that cannot be written.
+    """
+    marks = tuple(marks)
+    if not marks:
+        return
+    try:
+        with FileLock(folder / (MARKS + ".lock"), timeout=_LOCK_S):
+            if check is not None:
+                check()
+            write_marks(folder, marks)
+    except OSError as cause:
+        raise DatasetError(
+            f"'{folder / MARKS}' cannot be written: {cause.strerror or cause}.",
+            reason="marks_not_written",
+            why=cause.strerror or str(cause),
+        ) from None
+
+
+def write_marks(folder: Path, marks: Iterable[Mark]) -> None:
+    """Append marks while the caller holds the lock of the data set, see `append_marks`.
+
+    Raises:
+        DatasetError: for a mark with contradictory values.
     """
     lines = []
     for mark in marks:
@@ -163,21 +189,13 @@ def append_marks(folder: Path, marks: Iterable[Mark]) -> None:
         lines.append(mark_line(replace(mark, when=when)))
     if not lines:
         return
-    path = folder / MARKS
-    try:
-        with FileLock(folder / (MARKS + ".lock"), timeout=_LOCK_S), path.open("a+b") as file:
-            # An incomplete last line must not merge with the next mark.
-            if file.seek(0, os.SEEK_END) > 0:
-                file.seek(-1, os.SEEK_END)
-                if file.read(1) != b"\n":
-                    lines.insert(0, "\n")
-            file.write("".join(lines).encode("utf-8"))
-    except OSError as cause:
-        raise DatasetError(
-            f"'{path}' cannot be written: {cause.strerror or cause}.",
-            reason="marks_not_written",
-            why=cause.strerror or str(cause),
-        ) from None
+    with (folder / MARKS).open("a+b") as file:
+        # An incomplete last line must not merge with the next mark.
+        if file.seek(0, os.SEEK_END) > 0:
+            file.seek(-1, os.SEEK_END)
+            if file.read(1) != b"\n":
+                lines.insert(0, "\n")
+        file.write("".join(lines).encode("utf-8"))
 
 
 def read_marks(folder: Path) -> dict[str, MarkState]:
@@ -261,7 +279,7 @@ class MarksFollower:
 
     def _take(self, line: bytes, number: int, states: dict[str, MarkState]) -> None:
         try:
-            table: Any = json.loads(line.decode("utf-8"))
+            table: Any = loads_json(line.decode("utf-8"))
         except (ValueError, RecursionError):
             return
         where = f"'{self._path}' line {number}"

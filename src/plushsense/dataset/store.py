@@ -19,7 +19,7 @@ import html
 import io
 import json
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -35,7 +35,7 @@ from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames, ReadResult, read_recording, read_stream
 from plushsense.core.toml import load_table, read_toml
 from plushsense.dataset.about import About
-from plushsense.dataset.marks import MARKS, LabelledStretch, MarkState, read_marks
+from plushsense.dataset.marks import MARKS, LabelledStretch, Mark, MarkState, append_marks, read_marks
 
 FORMAT_VERSION = 1
 HEAD = "dataset.toml"
@@ -116,6 +116,15 @@ class Generation:
             yield
         finally:
             lock.release()
+
+
+def writing_around(path: Path) -> Callable[[], AbstractContextManager[None]]:
+    """Return `Generation.writing` of the data set whose folder contains ``path``; if none does, it has no effect.
+
+    Call this before results in ``path`` are read, for code that derives others from them without the data set.
+    """
+    folder = next((p for p in path.resolve().parents if (p / HEAD).is_file()), None)
+    return nullcontext if folder is None else Generation.of(folder).writing
 
 
 @dataclass(frozen=True)
@@ -216,9 +225,14 @@ R = TypeVar("R", bound=_Row)
 
 
 def read_index(path: Path, kind: type[R]) -> list[R]:
-    """Read the rows of an index file."""
-    with path.open(encoding="utf-8", newline="") as file:
-        return [kind.from_text(row, path.name) for row in csv.DictReader(file)]
+    """Read the rows of an index file; raise DatasetError if it is damaged."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return [kind.from_text(row, path.name) for row in csv.DictReader(file)]
+    except (UnicodeDecodeError, csv.Error) as cause:
+        raise DatasetError(
+            f"The index '{path.name}' is damaged ({cause}): delete it, it is rebuilt from the recordings."
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -385,6 +399,15 @@ class Dataset:
                 first, last = r.stream_row + r.start, r.stream_row + r.stop
                 pieces = [rest for piece in pieces for rest in piece.outside(first, last)]
         return pieces
+
+    def append_marks(self, marks: Iterable[Mark]) -> None:
+        """Append marks, unless a person was removed since the data set was opened; this object is not updated.
+
+        Raises:
+            ForgottenError: like `Generation.check`.
+            DatasetError: like `plushsense.dataset.marks.append_marks`.
+        """
+        append_marks(self.path, marks, self.generation.check)
 
     def read(self, recording: RecordingInfo) -> Frames:
         """Read the rows of one recording that remain after trimming."""

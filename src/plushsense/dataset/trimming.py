@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.index import as_dataset
-from plushsense.dataset.marks import BY_HAND, SUGGESTED, Mark, MarkState, append_marks, match_ids, read_marks
+from plushsense.dataset.marks import BY_HAND, SUGGESTED, Mark, MarkState, match_ids, read_marks
 from plushsense.dataset.onset import CONTEXT_S, Suggestion, suggest
 from plushsense.dataset.quality.checking import author_name
 from plushsense.dataset.store import Dataset, Progress, RecordingInfo
@@ -168,7 +168,7 @@ def accept_suggestions(
         else:
             end = stop if stop < info.rows else -1
             marks.append(Mark(info.id, "trim", who, why, start=start, stop=end, how=SUGGESTED))
-    append_marks(dataset.path, marks)
+    dataset.append_marks(marks)
     return AcceptedTrims(tuple(m.recording for m in marks), tuple(already), tuple(not_visible), tuple(by_hand))
 
 
@@ -211,7 +211,7 @@ def set_rows(dataset: Dataset, trim: Trim, start: int, stop: int, who: str, why:
     if trim.state == "adjusted" and trim.current_rows() == (start, stop):
         return False
     end = stop if stop < info.rows else -1
-    append_marks(dataset.path, [Mark(info.id, "trim", who, why, start=start, stop=end, how=BY_HAND)])
+    dataset.append_marks([Mark(info.id, "trim", who, why, start=start, stop=end, how=BY_HAND)])
     return True
 
 
@@ -225,7 +225,7 @@ def undo_trims(dataset: Dataset, recordings: Sequence[RecordingInfo], who: str, 
     """Undo the trims of ``recordings``, accepted or set by hand; return the ids of those that had one."""
     marks = read_marks(dataset.path)
     trimmed = tuple(r.id for r in recordings if marks.get(r.id, MarkState()).trimmed)
-    append_marks(dataset.path, [Mark(identity, "untrim", who, why) for identity in trimmed])
+    dataset.append_marks([Mark(identity, "untrim", who, why) for identity in trimmed])
     return trimmed
 
 

@@ -87,7 +87,7 @@ class Ranges:
                 f"The calibration in the bundle lacks {missing} (it was made by an earlier PlushSense): train it "
                 "again, or give the data set that it was trained on, with plushsense export BUNDLE OUT --dataset DS."
             ) from None
-        except (TypeError, ValueError) as cause:
+        except (TypeError, ValueError, OverflowError) as cause:
             raise BundleError(f"The calibration in the bundle cannot be read ({cause}): train again.") from None
 
     def check(self, arch: Arch) -> None:
@@ -234,7 +234,12 @@ def _input_scale(scaler: Scaler, low: Floats, unit: Floats) -> InputScale:
     rows = []
     for offset, scale, start, size in zip(scaler.offset, scaler.scale, low, unit, strict=True):
         ratio = float(scale / size)
-        middle = round(float(offset + (start + 127.5 * size) / scale))
+        center = float(offset + (start + 127.5 * size) / scale)
+        if not abs(center) < 1 << 31:
+            raise BundleError(
+                f"The scaling and the calibration of an input do not fit (offset {center:g}): train again."
+            )
+        middle = round(center)
         before, multiplier, after = split_ratio(ratio, 128 / ratio + 1, 22, 16)
         there = ((middle - offset) * scale - start) / size
         rows.append((middle, before, multiplier, round((there + 0.5) * 2.0**after), after))

@@ -43,6 +43,7 @@ SEARCHES: dict[str, str] = {
     "LSL": "plushsense.devices.lsl:search_streams",
 }
 """For each transport, ``module:function`` of a function (seconds to search) that returns a `DeviceListing`."""
+_BY_NETWORK = ("LSL",)
 
 EXAMPLES = (
     "serial:///dev/ttyUSB0?baud=115200, serial://COM3, ble://AA:BB:CC:DD:EE:FF, ble://name:PlushName, tcp://host:port, "
@@ -221,8 +222,10 @@ class DeviceListing:
         return asdict(self)
 
 
-def list_devices(scan_s: float = SCAN_S) -> DeviceListing:
+def list_devices(scan_s: float = SCAN_S, *, network: bool = True) -> DeviceListing:
     """Search for toys on all transports at once, for ``scan_s`` seconds.
+
+    Without ``network``, nothing is sent to it: LSL streams, which are found by multicast, are left out.
 
     All serial ports and LSL streams are listed, and Bluetooth devices that advertise the Nordic UART service or have a
     name like a toy's. A missing package or adapter gives a note, not an error.
@@ -248,11 +251,12 @@ def list_devices(scan_s: float = SCAN_S) -> DeviceListing:
             message = f"{scheme} cannot be used: {' '.join(str(cause).split())}."
             results[scheme] = DeviceListing(notes=[Sentence(message, reason="search_failed", kind=scheme)])
 
-    threads = [threading.Thread(target=look, args=item, daemon=True) for item in SEARCHES.items()]
+    searches = {scheme: search for scheme, search in SEARCHES.items() if network or scheme not in _BY_NETWORK}
+    threads = [threading.Thread(target=look, args=item, daemon=True) for item in searches.items()]
     for thread in threads:
         thread.start()
     listing = DeviceListing()
-    for thread, scheme in zip(threads, SEARCHES, strict=True):
+    for thread, scheme in zip(threads, searches, strict=True):
         thread.join(scan_s + _GRACE_S)
         late = Sentence(f"{scheme} did not answer within {scan_s + _GRACE_S:g} s.", reason="search_failed", kind=scheme)
         part = results.get(scheme) or DeviceListing(notes=[late])

@@ -14,7 +14,8 @@ from plushsense.devices.base import Counters, Frame, LossCounter
 
 _INTEGER = re.compile(rb"[+-]?[0-9]{1,18}\Z")
 _DECIMAL = re.compile(rb"[+-]?(?:[0-9]{1,18}(?:\.[0-9]{0,18})?|\.[0-9]{1,18})(?:[eE][+-]?[0-9]{1,2})?\Z")
-_SEPARATORS = bytes.maketrans(b",;\t", b"   ")
+# Other white space, which `bytes.split` would take for a separator, becomes a byte that no number has.
+_SEPARATORS = bytes.maketrans(b",;\t\v\f", b"   \0\0")
 _LIMIT = 2**53
 _LONGEST_DELAY_MS = 2**31
 # So many lines of another width in a row are not lines that were cut or joined.
@@ -39,7 +40,8 @@ class LineParser:
     Fields are separated by any number of spaces, tabs, commas or semicolons, lines by ``\\n``, ``\\r`` or both. If the
     layout's wire has no ``device_ms``, the clock is the sum of the delays, so lost lines do not show in it; a line with
     a delay above 2³¹ ms is malformed. Values of channels with a step of 1 must be integers; others may be decimals.
-    Empty lines are ignored.
+    Numbers have at most 18 digits (before and after a point), and clocks no minus. Empty lines are ignored. The toy's C
+    (``plush_wire_read``) reads the same.
 
     Args:
         layout: the layout of the lines.
@@ -179,16 +181,16 @@ class LineParser:
         if len(fields) != self._fields:
             return None
         if self._plain is not None and self._plain.match(line) is not None:
-            plain = [int(field) for field in fields]
             at, delay = self._clock_at, self._delay_at
-            if (at >= 0 and plain[at] < 0) or (delay >= 0 and plain[delay] < 0):
+            if (at >= 0 and fields[at].startswith(b"-")) or (delay >= 0 and fields[delay].startswith(b"-")):
                 return None
+            plain = [int(field) for field in fields]
             return None if at < 0 and plain[delay] > _LONGEST_DELAY_MS else plain
         numbers = [0] * self._fields
         for at in (self._clock_at, self._delay_at):
             if at >= 0:
-                number = _integer(fields[at])
-                if number is None or number < 0:
+                number = None if fields[at].startswith(b"-") else _integer(fields[at])
+                if number is None:
                     return None
                 numbers[at] = number
         if self._clock_at < 0 and numbers[self._delay_at] > _LONGEST_DELAY_MS:

@@ -6,7 +6,6 @@ import hashlib
 import itertools
 import json
 import os
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, nearest
+from plushsense.core.files import temporary_folder
 from plushsense.dataset.files import CACHE
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import as_dataset
@@ -40,6 +40,7 @@ from plushsense.scoring.splits import Fold, parse_split, purge
 from plushsense.windows.cut import WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, silent, windows_for
+from plushsense.workflow.reporting import keep_bundle
 
 Predictor = Callable[[WindowSet], NDArray[np.floating[Any]]]
 """Returns the probabilities (N, K) of windows."""
@@ -316,8 +317,8 @@ def adapt(
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
     if (before := given.adapted_to) is not None:
         warn(f"the bundle is adapted to {before}: it is adapted again from its original")
-    with tempfile.TemporaryDirectory(prefix="plushsense-") as place:
-        dataset = _dataset(recordings, given, Path(place))
+    with temporary_folder() as place:
+        dataset = _dataset(recordings, given, place)
         person = _person(dataset, subject)
         corrections = [] if feedback is None else read_corrections(feedback)
         if others := sorted({c.subject for c in corrections} - {person}):
@@ -500,8 +501,7 @@ def evaluate_adapting(
             },
             kept,
         )
-        with dataset.generation.writing():
-            bundle.save(path)
+        keep_bundle(bundle, path, dataset)
         tell(f"trained for {fold.name}, {fitted.seconds:.0f} s")
         return bundle
 

@@ -6,6 +6,7 @@ atomically: a run that is killed leaves complete results or none.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import pickle
@@ -83,6 +84,7 @@ def portable(error: Exception) -> Exception:
 Result = Mapping[str, Any]
 
 _JSON = "json"
+_NOT_WRITABLE = (errno.EROFS, errno.EACCES, errno.EPERM)
 
 
 def job_id(job: Mapping[str, Any]) -> str:
@@ -168,8 +170,10 @@ class Journal:
     def save(self, job: str, result: Result) -> None:
         """Save the result of a job atomically. Values other than arrays must be JSON-serialisable.
 
+        A folder that cannot be written, as on a read-only disk, stores nothing: what is interrupted begins again.
+
         Raises:
-            PlushSenseError: if the folder is not writable, or writing is no longer allowed.
+            PlushSenseError: if the disk is full or fails, or writing is no longer allowed.
             TypeError, ValueError: for values that cannot be saved.
         """
         arrays = {name: value for name, value in result.items() if isinstance(value, np.ndarray)}
@@ -182,7 +186,7 @@ class Journal:
                     np.savez(file, allow_pickle=False, **{_JSON: packed}, **arrays)
         except OSError as cause:
             # Windows does not replace a file that is open, but then the result exists already.
-            if self.find(job) is None:
+            if cause.errno not in _NOT_WRITABLE and self.find(job) is None:
                 raise PlushSenseError(
                     f"A result cannot be kept in {self.folder} ({cause.strerror or cause}): make room or the folder "
                     "writable, then run again; finished jobs are kept."

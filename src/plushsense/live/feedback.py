@@ -25,6 +25,7 @@ import numpy as np
 from plushsense.core.errors import BadInput, BundleError, DatasetError, nearest
 from plushsense.core.files import write_file
 from plushsense.core.recorder_csv import Frames
+from plushsense.core.toml import loads_json
 from plushsense.live.adaptation import DENSE, Examples, Floats, judge, with_one
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import softmax
@@ -74,7 +75,7 @@ class Correction:
     @classmethod
     def from_line(cls, line: str) -> Correction:
         """Restore a correction from `to_line`; raise ValueError, TypeError or KeyError if it is not one."""
-        table = json.loads(line)
+        table = loads_json(line)
         rows = np.array(table.pop("rows"), dtype=np.int64).reshape(-1, 1 + len(table["channels"]))
         found = cls(**{**table, "channels": tuple(table["channels"])}, frames=Frames(rows[:, 1:], rows[:, 0]))
         if not 0.0 <= found.begun_s <= found.ended_s:

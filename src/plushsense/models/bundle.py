@@ -10,8 +10,8 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from plushsense.core.errors import BadInput, BundleError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
+from plushsense.core.toml import check_table
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.models.arch import Arch
 from plushsense.models.reference import Network, check_weights
@@ -34,6 +35,63 @@ FORMAT = "plushsense-bundle"
 VERSION = 1
 _PEOPLE = ("subjects", "validation_subjects")
 _AGAIN = "copy it again from where it came, or train again"
+
+
+# Offsets and scales beyond them cannot come from 32-bit values.
+_MOST_OFFSET, _SCALES = 2.0**40, (1e-15, 1e9)
+_DENSE = ("dense.weight", "dense.bias")
+
+
+@dataclass(frozen=True)
+class _Origin:
+    """The types of those keys of ``provenance`` that are read again; people are counts in an export."""
+
+    subjects: tuple[str, ...] | int = ()
+    validation_subjects: tuple[str, ...] | int = ()
+    dataset: str | None = None
+    dataset_hash: str | None = None
+    split: str | None = None
+    preset: str | None = None
+    code_version: str | None = None
+    simulated: bool | None = None
+    training: dict[str, Any] = field(default_factory=dict)
+    scores: dict[str, Any] = field(default_factory=dict)
+    estimator: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Scores:
+    """The types of those keys of the scores in ``provenance`` that are read again."""
+
+    accuracy: float | None = None
+    macro_f1: float | None = None
+    windows: int | None = None
+    split: str | None = None
+    leaky: bool | None = None
+    nobody: dict[str, Any] | None = None
+    int8: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Adaptation:
+    """The types of those keys of ``personal`` that are read again."""
+
+    subject: str | None = None
+    leave_one_recording_out: dict[str, dict[str, Any]] = field(default_factory=dict)
+    original: dict[str, Any] = field(default_factory=dict)
+    uncorrected: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Windowing:
+    """The types of those keys of ``windowing`` that are read again."""
+
+    window_s: float = 0.0
+    step_s: float = 0.0
+    context: str = ""
+    span_s: float = 0.0
+    longest_factor: float = 0.0
+    anywhere: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -76,6 +134,13 @@ class Bundle:
                 raise BundleError(f"The bundle does not fit together: {found} {name}, the network needs {needed}.")
         if not (np.isfinite(self.scaler.offset).all() and np.isfinite(self.scaler.scale).all()):
             raise BundleError("The bundle's scaling holds a value that is not finite: train again.")
+        low, high = _SCALES
+        scales, offsets = np.asarray(self.scaler.scale), np.asarray(self.scaler.offset)
+        if ((scales < low) | (scales > high)).any() or (np.abs(offsets) > _MOST_OFFSET).any():
+            raise BundleError(
+                f"The bundle's scaling is out of range (scales {low:g} to {high:g}, offsets to ±{_MOST_OFFSET:g}): "
+                "train again."
+            )
 
     def __repr__(self) -> str:
         filters = "/".join(str(f) for f in self.arch.filters)
@@ -157,6 +222,7 @@ class Bundle:
         if not isinstance(content, dict) or head.get("sha256") != _digest(_canonical(content), weights):
             raise BundleError(f"{_damaged(path)} (its checksum does not match).")
         try:
+            _check_tables(content)
             bundle = cls(
                 Arch.from_dict(content["arch"]),
                 weights,
@@ -171,14 +237,26 @@ class Bundle:
             )
             implied = bundle._implied()
             changed = [key for key in implied if content.get(key) != implied[key]]
-        except (BadInput, KeyError, TypeError, ValueError) as cause:
-            raise BundleError(f"The bundle '{path}' cannot be used: {cause}") from None
+            bundle._check_earlier()
+        except KeyError as missing:
+            raise BundleError(f"The bundle '{path}' cannot be used: it lacks {missing}.") from None
+        except (BadInput, TypeError, ValueError, OverflowError) as cause:
+            why = "a text in it has half a character" if isinstance(cause, UnicodeEncodeError) else cause
+            raise BundleError(f"The bundle '{path}' cannot be used: {why}") from None
         if changed:
             was, now = content.get(changed[0]), implied[changed[0]]
             raise BundleError(
                 f"The bundle '{path}' was written under other rules ({changed[0]} was {was}, is {now}): train again."
             )
         return bundle
+
+    def _check_earlier(self) -> None:
+        """Raise BundleError if the layer before an adaptation does not fit the network."""
+        for key in ("original", "uncorrected"):
+            if earlier := self.personal.get(key):
+                with np.errstate(over="ignore"):
+                    layer = {name: np.array(earlier[name], dtype=np.float32) for name in _DENSE}
+                check_weights(self.arch, {**self.weights, **layer})
 
     def _implied(self) -> dict[str, Any]:
         """Return values that follow from the parts, for programs in other languages."""
@@ -220,9 +298,12 @@ class Bundle:
         return bytes(save_tensors(weights, metadata={"plushsense": _canonical(head)}))
 
 
-def known_people(provenance: Mapping[str, Any]) -> set[str]:
-    """Return the codes of the people in the training and validation data, without "nobody" and unknown people."""
-    listed = [provenance.get(key) for key in _PEOPLE]
+def known_people(provenance: Mapping[str, Any], keys: Sequence[str] = _PEOPLE) -> set[str]:
+    """Return the codes of the people in the training and validation data, without "nobody" and unknown people.
+
+    An export states only their number, so that there are none.
+    """
+    listed = [provenance.get(key) for key in keys]
     codes = {str(code) for each in listed if isinstance(each, list | tuple) for code in each}
     return codes - {NOBODY, UNKNOWN_SUBJECT}
 
@@ -259,6 +340,27 @@ def _without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
     counted = {key: provenance[key] for key in _PEOPLE if isinstance(provenance.get(key), int)}
     others = {key: plain(value) for key, value in provenance.items() if key not in _PEOPLE}
     return others | counted | {key: len(codes) for key, codes in people.items()}
+
+
+def _check_tables(content: Mapping[str, Any]) -> None:
+    """Raise BundleError if tables in the content of a bundle have values of wrong types; further keys are allowed."""
+    # All texts must be fit for files in UTF-8.
+    json.dumps(content, ensure_ascii=False).encode()
+    tables = ("arch", "layout", "scaling", "gestures", "windowing", "decision", "provenance", "calibration", "personal")
+    for name in tables:
+        if not isinstance(content.get(name, {}), dict):
+            raise BundleError(f"{name} is {content[name]!r}: accepted is a table.")
+    origin = content["provenance"]
+    for name, table, kind in (
+        ("windowing", content["windowing"], _Windowing),
+        ("personal", content.get("personal", {}), _Adaptation),
+        ("provenance", origin, _Origin),
+        ("scores", origin.get("scores") if isinstance(origin.get("scores"), dict) else {}, _Scores),
+    ):
+        known = {f.name for f in fields(kind)}
+        _, problems = check_table({key: value for key, value in table.items() if key in known}, kind, name)
+        if problems:
+            raise BundleError(problems[0])
 
 
 def _header(data: bytes, path: str | Path) -> dict[str, Any]:

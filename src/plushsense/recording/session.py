@@ -19,6 +19,7 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import HOST_MS, Layout
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
 from plushsense.core.sentences import Sentence
+from plushsense.core.toml import loads_json
 from plushsense.devices.base import now_ms
 from plushsense.recording.plan import Protocol
 from plushsense.recording.session_files import (
@@ -394,7 +395,7 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
             progress.discarded.setdefault(key, []).insert(0, path.name)
             continue
         try:
-            sidecar = json.loads(path.with_suffix(SIDECAR).read_text(encoding="utf-8"))
+            sidecar = loads_json(path.with_suffix(SIDECAR).read_text(encoding="utf-8"))
             key = _key(sidecar)
         except (OSError, ValueError, AttributeError):
             key = None

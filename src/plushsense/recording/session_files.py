@@ -18,7 +18,7 @@ from typing import Any
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.files import write_file
-from plushsense.core.toml import load_table
+from plushsense.core.toml import load_table, loads_json
 
 SESSION_HEAD = "session.json"
 SESSION_LOG = "session.jsonl"
@@ -55,7 +55,7 @@ class SessionHead:
         """Read the head of the session in ``folder``; None if there is none, DatasetError if it is damaged."""
         path = folder / SESSION_HEAD
         try:
-            table = json.loads(path.read_text(encoding="utf-8"))
+            table = loads_json(path.read_text(encoding="utf-8"))
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError, RecursionError) as cause:
@@ -105,7 +105,7 @@ def read_events(folder: Path) -> Iterator[SessionEvent]:
         raise DatasetError(message, reason="session_damaged", name=folder.name) from None
     for line in filter(None, lines):
         try:
-            table = json.loads(line.decode("utf-8"))
+            table = loads_json(line.decode("utf-8"))
             yield SessionEvent(str(table.pop("what")), int(table.pop("at_ms")), table)
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
             continue

@@ -3,7 +3,8 @@
 `plushsense.recording.recorder` adds the commands. One thread reads the toy's frames, those of the background writer
 write them; at real time the reader never waits for the disk. All durations of a session are measured by the toy's own
 clock, so that a virtual toy at twenty times the speed counts down in a twentieth of the time, and a toy that is
-unplugged during the countdown does not start an empty recording.
+unplugged during the countdown does not start an empty recording. A real toy's clock that stands or is much too slow
+counts as half as fast as the computer's, so that every recording ends.
 """
 
 from __future__ import annotations
@@ -267,6 +268,7 @@ class RecordingMachine:
         self._receiver = FrameReceiver(device, session.layout, speed, progress.rows, progress.host_ms)
         self._take: RecordingTake | None = None
         self._since_ms = 0.0
+        self._since_s = time.monotonic()
         self._state: RecorderState = "idle"
         self._paused = False
         self._message = Sentence()
@@ -351,7 +353,7 @@ class RecordingMachine:
             # The stream may have failed while a recording was still being saved.
             state, message = "stopped", self._failed
         self._state = state
-        self._since_ms = self._receiver.toy_ms
+        self._since_ms, self._since_s = self._receiver.toy_ms, time.monotonic()
         self._message = message or Sentence()
         self._changes.append(state)
         self._changed.notify_all()
@@ -360,8 +362,8 @@ class RecordingMachine:
         return time.monotonic() - self._take.from_s if self._take is not None else 0.0
 
     def _passed_s(self) -> float:
-        """Return the seconds since the state was entered, by the toy's clock."""
-        return (self._receiver.toy_ms - self._since_ms) / 1000.0
+        """Return the seconds since the state was entered, by the toy's clock, see `FrameReceiver.passed_s`."""
+        return self._receiver.passed_s(self._since_ms, self._since_s)
 
     def _advance(self, message: Sentence | None = None, from_start: bool = False) -> None:
         """Go to the next step to record; finish the session if none is left."""

@@ -179,6 +179,10 @@ JUMP_MS = 1000
 """If the toy's clock advances by this much more than the elapsed time, it was misread or set: ignore the step."""
 
 
+SLOWEST = 2.0
+"""Longest that a second of the toy's clock may take, in seconds; a clock that stands counts as that slow."""
+
+
 class ReceivedFrame(NamedTuple):
     """Frame with the times to write, the number of frames missing before it, and the gap before it, if any."""
 
@@ -246,6 +250,18 @@ class FrameReceiver:
         if quality.signal == "none" and not self.away and now_s - self._last_malformed_s <= AWAY_S:
             return SignalQuality(signal="unreadable")
         return quality
+
+    def passed_s(self, since_ms: float, since_s: float) -> float:
+        """Return the seconds since a moment by the toy's clock; it counts as at most `SLOWEST` times too slow.
+
+        Args:
+            since_ms: ``toy_ms`` at the moment.
+            since_s: `time.monotonic` at the moment.
+        """
+        passed_s = (self.toy_ms - since_ms) / 1000.0
+        if self._real and not self.silent:
+            passed_s = max(passed_s, (time.monotonic() - since_s) / SLOWEST)
+        return passed_s
 
     def now_ms(self) -> int:
         """Return the current time on the clock of the rows' time stamps."""

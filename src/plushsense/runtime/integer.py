@@ -119,7 +119,8 @@ class IntegerNetwork:
                 )
             most = 255 * (arch.pooled if part is self.dense else 1)
             reach = np.abs(part.weights.astype(np.int64)).reshape(len(part.bias), -1).sum(axis=1) * most
-            if part.weights.size and int((np.abs(part.bias) + reach).max()) > _SUM_LIMIT:
+            # In floats, since biases of 64 bits may overflow.
+            if part.weights.size and (np.abs(part.bias.astype(np.float64)) + reach).max() > _SUM_LIMIT:
                 raise BundleError(f"A sum of layer {n} of {arch.title} could leave 32 bits: use fewer taps or filters.")
         if arch.step > 257:
             raise BundleError(

@@ -271,7 +271,9 @@ def run_backup(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 def run_restore(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Restore the backup ``file`` as the new data set ``dest`` with the name ``name``."""
-    dataset = restore(spec["file"], spec["dest"], progress=reporter.count)
+    # One of the studio's own backups: only the disk limits it.
+    limits = UnpackLimits(max(1, shutil.disk_usage(Path(spec["file"]).parent).free), files=1 << 30)
+    dataset = restore(spec["file"], spec["dest"], progress=reporter.count, limits=limits)
     write_file(dataset.path / HEAD, replace(dataset.head, name=spec["name"]).to_toml())
     return {
         "dataset": str(spec["dest"]),

@@ -6,6 +6,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,7 +39,7 @@ from plushsense.evaluation.scores import compute_scores as score_predictions
 from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possible
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
-from plushsense.models.bundle import Bundle
+from plushsense.models.bundle import Bundle, known_people
 from plushsense.models.reference import softmax
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import parse_split
@@ -165,10 +166,12 @@ class Trained:
     history: list[dict[str, Any]]
     scores: dict[str, Any]
     seconds: float = 0.0
+    generation: Generation | None = None
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Save the bundle."""
-        return self.bundle.save(Path(path))
+        """Save the bundle; raise ForgottenError if a person was removed from the data set since it was opened."""
+        with nullcontext() if self.generation is None else self.generation.writing():
+            return self.bundle.save(Path(path))
 
     def figure(self) -> Figure:
         """Draw loss and accuracy over the epochs."""
@@ -320,7 +323,8 @@ def train(
     # `forget` cannot find an unsaved bundle: raise an error if a person was removed during the training.
     dataset.generation.check()
     history = with_accuracy(fitted.history, apart)
-    return Trained(bundle, history, scores, fitted.seconds + (state.before_s if state else 0.0))
+    seconds = fitted.seconds + (state.before_s if state else 0.0)
+    return Trained(bundle, history, scores, seconds, dataset.generation)
 
 
 def _reporting(progress: EpochProgress | None, apart: bool, **more: str) -> EpochProgress:
@@ -441,7 +445,7 @@ def validation_predictions(bundle: Bundle, dataset: Dataset | str | os.PathLike[
             ``data_changed``), or has none of their recordings.
     """
     dataset = as_dataset(dataset)
-    people = set(bundle.provenance.get("validation_subjects", ())) - {NOBODY, UNKNOWN_SUBJECT}
+    people = known_people(bundle.provenance, ["validation_subjects"])
     if bundle.provenance.get("split") != WHOLE_PEOPLE or not people:
         raise DatasetError("This network has no validation people: evaluate it instead.", reason="no_validation_people")
     if bundle.provenance.get("dataset_hash") != dataset.hash:

@@ -15,7 +15,6 @@ from plushsense.core.errors import BundleError, ConfigError, DatasetError
 from plushsense.core.files import write_file
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.index import as_dataset, open_dataset
-from plushsense.dataset.marks import append_marks
 from plushsense.dataset.privacy.forget import RemovalPlan, plan_removal
 from plushsense.dataset.privacy.forget import forget as remove_person
 from plushsense.dataset.publishing.checking import StageProgress
@@ -141,7 +140,7 @@ def decide(
     if accept:
         marks += checking.acceptances(check_dataset(dataset, limits=limits), accept, who=name, why=why)
     if marks:
-        append_marks(dataset.path, marks)
+        dataset.append_marks(marks)
         dataset = as_dataset(dataset.path)
     return check_dataset(dataset, only=only, limits=limits, progress=progress), len(marks)
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from plushsense.core.errors import ArrayError, need
+from plushsense.core.errors import ArrayError, BundleError, need
 from plushsense.core.gestures import Gesture, GestureSet, plain_label
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, Channel, CsvFormat, Layout, load_layout
 from plushsense.core.version import __version__
@@ -204,11 +204,21 @@ def labels_table(classes: NDArray[Any]) -> dict[str, Any]:
 
 
 def labels_from(bundle: Bundle) -> NDArray[Any]:
-    """Restore the class labels of a bundle with their type; without a stored table, return its gestures' labels."""
+    """Restore the class labels of a bundle with their type; without a stored table, return its gestures' labels.
+
+    Raises:
+        BundleError: for a stored table that does not fit.
+    """
     table = bundle.provenance.get("estimator", {})
     if "labels" not in table:
         return np.array(bundle.gestures.labels)
-    return np.array(table["labels"], dtype=np.dtype(table["dtype"]))
+    try:
+        kind = np.dtype(table["dtype"])
+        if kind.itemsize > 1 << 16 or len(table["labels"]) != len(bundle.gestures):
+            raise ValueError("another number or size of labels")
+        return np.array(table["labels"], dtype=kind)
+    except (KeyError, TypeError, ValueError, OverflowError) as cause:
+        raise BundleError(f"The bundle's class labels cannot be read ({cause}): train again.") from None
 
 
 if TYPE_CHECKING or importlib.util.find_spec("sklearn") is None:

@@ -6,10 +6,11 @@ import json
 import os
 import platform
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import BadInput, ConfigError
+from plushsense.core.errors import BadInput, BundleError, ConfigError
 from plushsense.core.files import write_file
 from plushsense.core.version import __version__
 from plushsense.dataset.files import CACHE
@@ -69,6 +70,16 @@ def journal_of(dataset: Dataset, kind: str) -> Journal:
     Writing to it raises ForgottenError if a person was removed since ``dataset`` was opened (`dataset.generation`).
     """
     return Journal(dataset.path / CACHE / kind, dataset.generation.writing)
+
+
+def keep_bundle(bundle: Bundle, path: Path, dataset: Dataset) -> None:
+    """Save a bundle in the cache of its data set; do nothing if that cannot be written, as it can be trained again.
+
+    Raises:
+        ForgottenError: like `journal_of`.
+    """
+    with dataset.generation.writing(), suppress(BundleError):
+        bundle.save(path)
 
 
 def machine(*more: str) -> str:

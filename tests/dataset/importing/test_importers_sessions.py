@@ -155,5 +155,5 @@ def test_codes_that_leave_the_folder_and_texts_that_no_file_holds(tmp_path: Path
     assert {p.name for p in (tmp_path / "in").iterdir()} == {"DS"}
     assert {r.session for r in done.dataset.recordings} == {"session-again-2"}
     (person,) = read_people(tmp_path / "in" / "DS").values()
-    assert person.gender == "?"
+    assert person.gender == "\ufffd"
     assert "\n" not in person.age_group

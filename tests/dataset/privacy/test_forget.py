@@ -1,23 +1,31 @@
 """A person leaves a data set: all of theirs, and nothing of anybody else's."""
 
+import gzip
+import io
 import json
+import lzma
 import shutil
+import tempfile
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from filelock import FileLock, Timeout
 
 from plushsense.core.errors import DatasetError, ForgottenError
+from plushsense.core.files import temporary_folder, work_folder
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset import index
+from plushsense.dataset.importing import importers
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS, Mark, append_marks, read_marks
 from plushsense.dataset.privacy import forget as room
 from plushsense.dataset.privacy.forget import FORGOTTEN, UNDER_WAY, RemovalRecord, forget, plan_removal, read_removals
-from plushsense.dataset.store import read_people
+from plushsense.dataset.store import LOCK, read_people, writing_around
 
 ACCEL = load_layout("accel-3")
 INDEX = {"recordings.csv", "streams.csv", "index.json"}
@@ -305,3 +313,121 @@ def test_nothing_is_written_while_a_removal_is_not_finished(folder: Path, monkey
         before.check()
     with open_dataset(folder).generation.writing():
         pass
+
+
+def test_no_mark_about_a_removed_person_is_written(folder: Path) -> None:
+    before = open_dataset(folder)
+    forget(folder, "P1")
+    with pytest.raises(ForgottenError):
+        before.append_marks([Mark("P1/Wave_1000000000000_50", "exclude", "me", "tardy")])
+    assert "tardy" not in (folder / MARKS).read_text()
+    open_dataset(folder).append_marks([Mark("P2/Wave_1000000000000_50", "exclude", "me", "tardy")])
+    assert "tardy" in (folder / MARKS).read_text()
+
+
+def test_an_import_holds_the_lock_while_it_writes(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    held = list[str]()
+
+    def spy(real: Any, name: str) -> Any:
+        def write(*args: Any) -> Any:
+            with pytest.raises(Timeout), FileLock(folder / LOCK, timeout=0):
+                raise AssertionError(name)
+            held.append(name)
+            return real(*args)
+
+        return write
+
+    for name in ("write_people", "write_marks"):
+        monkeypatch.setattr(importers, name, spy(getattr(importers, name), name))
+    source = folder.parent / "more" / "P3"
+    source.mkdir(parents=True)
+    lines = (folder.parent / "src" / "P1" / f"Wave_{10**12}_50.csv").read_text().splitlines()
+    (source / f"Wave_{10**12}_49.csv").write_text("\n".join(lines[:-1]))
+    people = folder.parent / "people.csv"
+    people.write_text("subject,age_group\nP3,child\n")
+    import_recordings(source.parent, folder, add_to=True, people=people)
+    assert held == ["write_marks", "write_people"] and "P3" in read_people(folder)
+
+
+def test_what_is_derived_from_results_is_not_written_after_a_removal(folder: Path) -> None:
+    inside, outside = (writing_around(place) for place in (folder / "evaluations" / "with", folder.parent))
+    forget(folder, "P1")
+    with pytest.raises(ForgottenError), inside():
+        raise AssertionError
+    with outside():
+        pass
+    assert not (folder.parent / LOCK).exists()
+
+
+def test_leftovers_of_any_program_are_named_but_nothing_of_a_live_one(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scratch = tmp_path_factory.mktemp("scratch")
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    with work_folder(folder.parent / "restored") as live, work_folder(folder) as own, temporary_folder() as temporary:
+        for place, name in ((live, ".restored-unfinished-killed"), (temporary, ".plushsense-unfinished-killed")):
+            (place / "raw.csv").write_text("P1")
+            shutil.copytree(place, place.parent / name)
+        (own / "raw.csv").write_text("P1")
+        kept = {place.name for place in (live, own)}
+        plan = forget(folder, "P1")
+        assert plan.leftovers == ("../.restored-unfinished-killed", f"{scratch}/.plushsense-unfinished-killed")
+        assert {p.name for p in folder.parent.glob(".*-unfinished-*")} == kept
+        assert [p.name for p in scratch.iterdir()] == [temporary.name]
+
+
+def zipped(*names: str) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in names:
+            archive.writestr(name, "with P1\n" * 100)
+    return out.getvalue()
+
+
+def array(values: list[str], pack: Any = np.save) -> bytes:
+    out = io.BytesIO()
+    pack(out, np.array(values))
+    return out.getvalue()
+
+
+KINDS = {
+    "plot.svg": b"<svg><text>P1</text></svg>",
+    "run.log": b"12:00 evaluating P1\n",
+    "settings.yaml": b"people: [P1, P2]\n",
+    "no-suffix": b"P1",
+    "utf16.txt": "with P1".encode("utf-16"),
+    "table.bin": b"\x00\x01\xff\x80 P1.\x00\x02",
+    "late.log": b"x" * (1 << 20) + b" and P1 at the end",
+    "edge.log": b"x" * ((1 << 20) - 10) + b"    and P1 across the edge",
+    "more.log.gz": gzip.compress(b"evaluating P1"),
+    "more.log.xz": lzma.compress(b"evaluating P1"),
+    "copy.zip": zipped("notes.txt"),
+    "people.npy": array(["P2", "P1"]),
+    "people.npz": array(["P2", "P1"], np.savez_compressed),
+    "sealed.7z": b"7z\xbc\xaf\x27\x1c" + bytes(20),
+    "torn.gz": gzip.compress(bytes(range(256)))[:-20],
+}
+OTHERS = {
+    "other.log": b"evaluating P11 and P2, 1P1, P1a\n",
+    "numbers.npy": array([1, 2]),  # type: ignore[list-item]
+    "blank": b"",
+}
+
+
+def test_files_of_any_kind_that_hold_the_code_are_named(folder: Path) -> None:
+    place = folder / "results"
+    place.mkdir()
+    for name, content in (KINDS | OTHERS).items():
+        (place / name).write_bytes(content)
+    (folder / "evaluations" / "without" / "note.yaml").write_text("not P1")
+    before = {"evaluations/without/note.yaml", *(f"results/{name}" for name in KINDS)}
+    mentions = set(plan_removal(folder, "P1").mentions)
+    assert {m for m in mentions if m.startswith(("results/", "evaluations/"))} == before
+
+
+def test_the_predictions_of_an_evaluation_elsewhere_in_the_data_set_are_named(folder: Path) -> None:
+    polars = pytest.importorskip("polars")
+    polars.DataFrame({"subject": ["P2", "P1"], "y": [1, 2]}).write_parquet(folder / "predictions.parquet")
+    polars.DataFrame({"subject": ["P2", "P11"], "y": [1, 2]}).write_parquet(folder / "others.parquet")
+    mentions = plan_removal(folder, "P1").mentions
+    assert "predictions.parquet" in mentions and "others.parquet" not in mentions

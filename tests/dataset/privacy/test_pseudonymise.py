@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -337,3 +338,19 @@ def test_real_recordings_keep_their_numbers(real_data: Path, tmp_path: Path) -> 
         assert np.array_equal(old.read(a).device_ms, done.dataset.read(b).device_ms)
         assert (a.stream_row, a.flags) == (b.stream_row, b.flags)
     assert done.findings == []
+
+
+def test_half_characters_in_session_files_stop_nothing(tmp_path: Path, session_writer: Callable[..., Path]) -> None:
+    folder = session_writer(tmp_path / "src", redo=[0])
+    log = folder / "session.jsonl"
+    log.write_text(
+        log.read_text().replace("sneezed", "\\ud800 sneezed") + '{"what": "note", "at_ms": 1, "text": "\\udc00"}\n'
+    )
+    ds = import_recordings(tmp_path / "src", tmp_path / "DS").dataset
+    assert "\ufffd sneezed" in (ds.path / MARKS).read_text("utf-8")
+    with (ds.path / MARKS).open("a") as file:
+        file.write(
+            json.dumps({"recording": ds.recordings[1].id, "action": "exclude", "who": "me", "why": "\ud800"}) + "\n"
+        )
+    done = pseudonymise(ds.path, tmp_path / "P", key=tmp_path / "key.csv")
+    assert any("\ufffd" in p.read_text("utf-8") for p in done.dataset.path.rglob("session.jsonl"))

@@ -61,6 +61,28 @@ class UnpackLimits:
             if not 0 < getattr(self, key) < 2**60:
                 raise ConfigError(f"The archive limit {key} is {getattr(self, key)}; it must be above 0.")
 
+    @classmethod
+    def of_gigabytes(cls, gigabytes: float | None) -> UnpackLimits:
+        """Return the limits with a total of ``gigabytes``; None for the default."""
+        if gigabytes is None:
+            return cls()
+        if not 0 < gigabytes < 1e6:
+            raise ConfigError(f"--max-gb is {gigabytes:g}: give a number above 0.")
+        return cls(total_bytes=int(gigabytes * 1e9))
+
+    def check(self, path: Path, files: int, total_bytes: int) -> None:
+        """Raise DatasetError if the archive ``path`` would unpack to more files or bytes than are allowed."""
+        if files > self.files or total_bytes > self.total_bytes:
+            raise DatasetError(
+                f"'{path}' would unpack to {files} files and {total_bytes / 1e9:.1f} GB; {self.files} files and "
+                f"{self.total_bytes / 1e9:g} GB are allowed: if you trust it, allow more (--max-gb) or unpack it "
+                "yourself.",
+                reason="zip_too_large",
+                name=path.name,
+                files=self.files,
+                gb=f"{self.total_bytes / 1e9:g}",
+            )
+
 
 def zip_entry(name: str) -> zipfile.ZipInfo:
     """Return a zip entry with constant time and mode, so that zips of the same files are equal byte by byte."""
@@ -154,17 +176,7 @@ def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list
         ) from None
     with archive:
         members = [m for m in archive.infolist() if not m.filename.endswith("/")]
-        total = sum(m.file_size for m in members)
-        if len(members) > limits.files or total > limits.total_bytes:
-            raise DatasetError(
-                f"'{path}' would unpack to {len(members)} files and {total / 1e9:.1f} GB; {limits.files} files and "
-                f"{limits.total_bytes / 1e9:g} GB are allowed: if you trust it, allow more (--max-gb) or unpack it "
-                "yourself.",
-                reason="zip_too_large",
-                name=path.name,
-                files=limits.files,
-                gb=f"{limits.total_bytes / 1e9:g}",
-            )
+        limits.check(path, len(members), sum(m.file_size for m in members))
         seen: set[str] = set()
         room = limits.total_bytes
         for info in members:

@@ -19,7 +19,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from plushsense.core.errors import ConfigError, DatasetError, FileFormatError
-from plushsense.core.files import write_file
+from plushsense.core.files import work_folder, write_file
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
@@ -62,7 +62,7 @@ from plushsense.dataset.importing.tables import STREAM_ROLE, check_roles, read_t
 from plushsense.dataset.importing.truncation import CHOSEN, choices_of, original_of, split_backups, truncation_marks
 from plushsense.dataset.importing.xdf import person_and_session, read_xdf
 from plushsense.dataset.index import open_dataset, rebuild_index
-from plushsense.dataset.marks import MARKS, Mark, append_marks, read_marks
+from plushsense.dataset.marks import MARKS, Mark, read_marks, write_marks
 from plushsense.dataset.privacy.forget import read_removals
 from plushsense.dataset.store import (
     HEAD,
@@ -177,24 +177,24 @@ def add_to_dataset(
         there = read_people(dest)
         listed, notes = merge_people(there, search.people, people, subjects)
         account.check()
-        # Writing the people's table would restore a person who was removed meanwhile.
-        dataset.generation.check()
         new = set(account.kept)
-        if head.gestures != dataset.head.gestures:
-            write_file(dest / HEAD, head.to_toml())
-        marks = _new_marks(dest, account.set_aside_reasons())
-        both = (*dataset.recordings, *built.dataset.recordings)
-        trims, remarks = truncation_marks(search.choices, both, account.sources, read_marks(dest))
-        append_marks(dest, marks := marks + trims)
-        if {p.subject: p for p in listed} != there:
-            write_people(dest, listed)
-        # Move companions first, so that a recording in the data set always has its sidecar.
-        for file in sorted(new, key=lambda f: (f.lower().endswith(".csv"), f)):
-            target = dest / file
-            target.parent.mkdir(parents=True, exist_ok=True)
-            if target.exists() and file not in copier.grown:
-                raise DatasetError(f"'{target}' appeared during the import and is not overwritten: import again.")
-            os.replace(work / file, target)
+        # Without the lock, marks and the people's table could restore a person who is removed meanwhile.
+        with dataset.generation.writing():
+            if head.gestures != dataset.head.gestures:
+                write_file(dest / HEAD, head.to_toml())
+            marks = _new_marks(dest, account.set_aside_reasons())
+            both = (*dataset.recordings, *built.dataset.recordings)
+            trims, remarks = truncation_marks(search.choices, both, account.sources, read_marks(dest))
+            write_marks(dest, marks := marks + trims)
+            if {p.subject: p for p in listed} != there:
+                write_people(dest, listed)
+            # Move companions first, so that a recording in the data set always has its sidecar.
+            for file in sorted(new, key=lambda f: (f.lower().endswith(".csv"), f)):
+                target = dest / file
+                target.parent.mkdir(parents=True, exist_ok=True)
+                if target.exists() and file not in copier.grown:
+                    raise DatasetError(f"'{target}' appeared during the import and is not overwritten: import again.")
+                os.replace(work / file, target)
         rebuilt = rebuild_index(dest, head).dataset if new or marks else open_dataset(dest)
     come = sorted(set(rebuilt.subjects) - set(dataset.subjects))
     notes += remarks + _returning_people_warning(dest, come)
@@ -410,13 +410,13 @@ FORMATS: dict[str, Callable[[Path, ImportOptions], SourceScan]] = {
 @contextmanager
 def _temporary_folders(dest: Path) -> Iterator[Callable[[str], Path]]:
     """Yield a function that creates folders beside ``dest`` for unpacked or converted files; remove them at the end."""
+    real = dest.resolve()
     with ExitStack() as stack:
 
         def create(purpose: str) -> Path:
-            real = dest.resolve()
             place = next(p for p in real.parents if p.is_dir())
-            folder = Path(tempfile.mkdtemp(prefix=f".{real.name}-{purpose}-", dir=place))
-            stack.callback(shutil.rmtree, folder, ignore_errors=True)
+            folder = stack.enter_context(work_folder(place / real.name)) / purpose
+            folder.mkdir()
             return folder
 
         yield create

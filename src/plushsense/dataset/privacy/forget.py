@@ -21,7 +21,15 @@ from typing import Any
 from filelock import FileLock
 
 from plushsense.core.errors import DatasetError, nearest
-from plushsense.core.files import PART, is_unfinished, unfinished, write_file
+from plushsense.core.files import (
+    PART,
+    abandoned_folders,
+    abandoned_temporary_folders,
+    is_in_use,
+    is_unfinished,
+    unfinished,
+    write_file,
+)
 from plushsense.core.gestures import NOBODY
 from plushsense.core.toml import load_table, read_toml
 from plushsense.dataset.files import (
@@ -36,7 +44,7 @@ from plushsense.dataset.files import (
 )
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS
-from plushsense.dataset.privacy.redaction import NamePatterns
+from plushsense.dataset.privacy.redaction import NamePatterns, texts_in
 from plushsense.dataset.store import (
     FORGOTTEN,
     HEAD,
@@ -75,9 +83,10 @@ class RemovalPlan:
 
     ``files`` are the person's files, of which ``raw`` are raw; ``marks`` counts the marks about the person, ``listed``
     is whether the people's table contains them. ``caches`` and ``evaluations`` may derive from their data; ``mentions``
-    are files that stay and contain the code; ``published`` is the DOI of the data set. ``leftovers`` are unfinished
-    files of killed programs in the data set or beside it (``../``). If ``absent``, the data set does not contain the
-    person (any more), and only derived files are removed.
+    are files that stay and contain the code, or cannot be read; ``published`` is the DOI of the data set.
+    ``leftovers`` are unfinished files of killed programs in the data set, beside it (``../``), or in the system's
+    folder for temporary files. If ``absent``, the data set does not contain the person (any more), and only derived
+    files are removed.
     """
 
     subject: str
@@ -169,6 +178,7 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
         )
     leftovers = _leftovers(folder, files)
     evaluations = sorted((folder / EVALUATIONS).iterdir()) if (folder / EVALUATIONS).is_dir() else []
+    used = tuple(f"{EVALUATIONS}/{e.name}" for e in evaluations if _uses_person(e, subject))
     about_head = read_toml(folder / HEAD, "data set", DatasetError).get("about")
     raw = sum(f.kind == "raw" for f in own)
     return RemovalPlan(
@@ -178,24 +188,29 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
         len(about),
         bool(_row_of(subject, table)),
         (CACHE,) if (folder / CACHE).exists() else (),
-        tuple(f"{EVALUATIONS}/{e.name}" for e in evaluations if _uses_person(e, subject)),
-        tuple(_mentions(folder, files, subject, leftovers)),
+        used,
+        tuple(_mentions(folder, files, subject, (CACHE, *used, *leftovers))),
         str(about_head.get("doi", "")) if isinstance(about_head, dict) else "",
         leftovers,
         absent,
     )
 
 
-def _mentions(folder: Path, files: Iterable[DatasetFile], subject: str, leftovers: tuple[str, ...]) -> Iterator[str]:
-    """Yield the files that contain the code of a person and are not removed."""
+def _mentions(folder: Path, files: Iterable[DatasetFile], subject: str, removed: tuple[str, ...]) -> Iterator[str]:
+    """Yield the files that stay, and contain the code of a person or cannot be read; ``removed`` are places."""
     names = NamePatterns({subject: ""})
     for file in files:
         path = file.path.as_posix()
-        removed = file.person == subject or f"{path}/".startswith(tuple(f"{left}/" for left in leftovers))
-        derived = file.kind in ("raw", "index", "cache", "evaluation", "link", "working", "people")
-        if removed or derived or path in (UNDER_WAY, FORGOTTEN):
+        goes = file.person == subject or f"{path}/".startswith(tuple(f"{place}/" for place in removed))
+        goes = goes or (len(file.path.parts) == 1 and file.path.suffix == PART)
+        if goes or file.kind in ("raw", "index", "link", "people") or path in (UNDER_WAY, FORGOTTEN):
             continue
-        if names.find_in(path) or names.find_in(_text_of(folder / path, skip=subject if path == MARKS else "")):
+        texts = iter([_other_marks(folder, subject)]) if path == MARKS else texts_in(folder / path)
+        try:
+            found = bool(names.find_in(path)) or any(names.find_in(t) or subject in t.splitlines() for t in texts)
+        except (OSError, ValueError):
+            found = True
+        if found:
             yield path
 
 
@@ -275,13 +290,19 @@ def _rewrite_marks(folder: Path, subject: str) -> None:
 
 
 def _leftovers(folder: Path, files: Iterable[DatasetFile]) -> tuple[str, ...]:
-    """Return unfinished files and folders that killed programs left in the data set or beside it."""
-    out = {f"../{entry.name}" for entry in folder.resolve().parent.glob(f"{glob.escape(unfinished(folder))}*")}
+    """Return unfinished files and folders that killed programs left in the data set, beside it, or as temporary ones.
+
+    Those that a process still uses are not among them.
+    """
+    place = folder.resolve().parent
+    beside = [f for f in place.glob(f"{glob.escape(unfinished(folder))}*") if not is_in_use(f)]
+    out = {f"../{entry.name}" for entry in (*abandoned_folders(place), *beside)}
+    out |= {entry.as_posix() for entry in abandoned_temporary_folders() if entry.parent != place}
     for file in files:
         parts = file.path.parts
-        inside = [i for i, part in enumerate(parts) if is_unfinished(part)]
-        if inside:
-            out.add("/".join(parts[: inside[0] + 1]))
+        inside = ["/".join(parts[: i + 1]) for i, part in enumerate(parts) if is_unfinished(part)]
+        if inside and not is_in_use(folder / inside[0]):
+            out.add(inside[0])
         elif parts[0] == EVALUATIONS and file.path.suffix == ".part":
             out.add(file.path.as_posix())
     return tuple(sorted(out))
@@ -318,15 +339,9 @@ def _parsed(line: bytes) -> Any:
         return None
 
 
-def _text_of(path: Path, skip: str = "") -> str:
-    """Return the content of a text file without the marks about ``skip``; "" for other kinds of files."""
-    if path.suffix.lower() not in (".toml", ".json", ".jsonl", ".csv", ".md", ".txt", ".html"):
-        return ""
-    try:
-        lines = path.read_bytes().splitlines(keepends=True)
-    except OSError:
-        return ""
-    return b"".join(line for line in lines if not (skip and _is_about(line, skip))).decode("utf-8", "replace")
+def _other_marks(folder: Path, subject: str) -> str:
+    """Return the marks that are not about ``subject``."""
+    return b"".join(line for line in _mark_lines(folder) if not _is_about(line, subject)).decode("utf-8", "replace")
 
 
 def _uses_person(place: Path, subject: str) -> bool:

@@ -211,6 +211,7 @@ class _Pseudonymisation:
                     name=name,
                 )
             files = len(list_files(work))
+            self.source.generation.check()
             write_key(self.key, self.codes)
         if self.notes.prose:
             message = f"{self.notes.prose} notes in free text were kept: names are replaced, but read them"

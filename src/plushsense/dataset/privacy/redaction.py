@@ -5,21 +5,27 @@ Names and codes are replaced, dates shifted, logins become roles, and addresses 
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import json
+import lzma
 import re
 import unicodedata
+import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
+import numpy as np
 import tomli_w
 
-from plushsense.core.errors import DatasetError
+from plushsense.core.errors import DatasetError, MissingExtraError, need
 from plushsense.core.sentences import Sentence
-from plushsense.core.toml import read_toml
+from plushsense.core.toml import loads_json, read_toml
 from plushsense.dataset.files import normalize_code
 from plushsense.dataset.privacy.pseudonyms import FIRST_MS, shifted_number, shifted_text
 from plushsense.dataset.store import HEAD, PersonInfo
@@ -231,9 +237,100 @@ def read_lines(path: Path) -> Iterator[tuple[int, Any]]:
         if not piece.strip():
             continue
         try:
-            yield number, json.loads(piece.decode("utf-8-sig"))
+            yield number, loads_json(piece.decode("utf-8-sig"))
         except (ValueError, RecursionError):
             yield number, None
+
+
+_CHUNK = 1 << 20
+_LONGEST_NAME = 256
+_RUNS = re.compile(rb"[\x20-\x7e]{3,}|(?:[\x20-\x7e]\0){3,}")
+_MAX_UNPACKED = 1 << 33
+# First bytes of files whose text is compressed in a way that is not read here: zstd, 7z, rar, PDF.
+_UNREAD = (b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf\x27\x1c", b"Rar!", b"%PDF")
+_UNPACK: dict[bytes, Callable[[IO[bytes]], IO[bytes]]] = {
+    b"\x1f\x8b": lambda file: cast("IO[bytes]", gzip.open(file)),
+    b"BZh": lambda file: cast("IO[bytes]", bz2.open(file)),
+    b"\xfd7zXZ": lambda file: cast("IO[bytes]", lzma.open(file)),
+}
+
+
+def texts_in(path: Path) -> Iterator[str]:
+    """Yield the text in a file of any kind, piece by piece.
+
+    Of binary files that is what is printable in them, of compressed files and zips what is packed in them, of Parquet
+    and NumPy files the cells that are texts.
+
+    Raises:
+        OSError, ValueError: if the file cannot be read, or its text is packed in another way.
+    """
+    with path.open("rb") as file:
+        yield from _texts(file)
+
+
+def _texts(file: IO[bytes], depth: int = 0) -> Iterator[str]:
+    begin = file.read(8)
+    file.seek(0)
+    if depth > 3 or begin.startswith(_UNREAD):
+        raise ValueError("its text is packed")
+    unpack = next((call for magic, call in _UNPACK.items() if begin.startswith(magic)), None)
+    try:
+        if unpack is not None:
+            yield from _texts(unpack(file), depth + 1)
+        elif begin.startswith(b"PK\x03\x04"):
+            yield from _packed_texts(file, depth)
+        elif begin.startswith((b"PAR1", b"\x93NUMPY")):
+            yield from _cells(file, begin.startswith(b"PAR1"))
+        else:
+            yield from _pieces(file)
+    except (EOFError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error, lzma.LZMAError) as cause:
+        raise ValueError(f"it is damaged or encrypted ({cause})") from None
+
+
+def _packed_texts(file: IO[bytes], depth: int) -> Iterator[str]:
+    with zipfile.ZipFile(file) as archive:
+        if sum(member.file_size for member in archive.infolist()) > _MAX_UNPACKED:
+            raise ValueError("it unpacks to more than 8 GB")
+        for member in archive.infolist():
+            yield member.filename
+            with archive.open(member) as packed:
+                yield from _texts(packed, depth + 1)
+
+
+def _cells(file: IO[bytes], parquet: bool) -> Iterator[str]:
+    """Yield the distinct texts of each column of a Parquet file, or of a NumPy array, one a line."""
+    if not parquet:
+        array = np.lib.format.read_array(file, allow_pickle=False)
+        if array.dtype.kind in "SU":
+            yield "\n".join(np.unique(array).astype(np.str_).tolist())
+        return
+    try:
+        polars = need("polars", extra="tables")
+        table = polars.read_parquet(file)
+    except MissingExtraError:
+        raise ValueError("Parquet is not read without polars") from None
+    except polars.exceptions.PolarsError as cause:
+        raise ValueError(str(cause)) from None
+    for column in table.iter_columns():
+        yield column.name
+        if not column.dtype.is_numeric():
+            yield "\n".join(sorted({str(cell) for cell in column.to_list()}))
+
+
+def _pieces(file: IO[bytes]) -> Iterator[str]:
+    rest = b""
+    while data := file.read(_CHUNK):
+        yield _printable(rest + data)
+        # A name across the edge is found in the next piece, but never the end of a longer word.
+        rest = re.sub(rb"\A[^\s,;:\"'<>(){}\[\]]+", b"", (rest + data)[-_LONGEST_NAME:])
+
+
+def _printable(data: bytes) -> str:
+    text = data.decode("utf-8", "replace")
+    # Characters may be cut at both ends.
+    if "\0" not in text and text.count("\ufffd") <= 6:
+        return text
+    return "\n".join(run.replace(b"\0", b"").decode("ascii") for run in _RUNS.findall(data))
 
 
 def redact_json(path: Path, new: str, words: Redactor) -> str | None:

@@ -231,6 +231,7 @@ def publish(
         if bids:
             write_bids(work, d)
         _write_metadata(work, d)
+        dataset.generation.check()
     checked = check_folder(out, thorough=thorough, progress=progress)
     if checked.valid:
         write_zip(out, target, f"{d.name}-{d.version}")

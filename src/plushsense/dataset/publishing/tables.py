@@ -12,10 +12,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.files import replacing_file
+from plushsense.core.files import replacing_file, temporary_folder, work_folder
 from plushsense.core.gestures import NOBODY
 from plushsense.core.toml import load_table
 from plushsense.dataset.files import sha256_of, walk_files
@@ -191,7 +190,11 @@ def write_zip(root: Path, target: Path, folder: str) -> None:
             reason="name_exists",
             name=target.name,
         )
-    with replacing_file(target) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
+    with (
+        work_folder(target) as work,
+        replacing_file(target, within=work) as part,
+        zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive,
+    ):
         for path in list_package_files(root):
             entry = zip_entry(f"{folder}/{path.relative_to(root).as_posix()}")
             archive.writestr(entry, path.read_bytes())
@@ -213,8 +216,9 @@ def open_package(package: Path) -> Iterator[Path]:
             reason="not_a_package",
             name=package.name,
         )
-    with TemporaryDirectory(prefix="plushsense-package-") as scratch:
-        target = Path(scratch).resolve()
+    with temporary_folder() as scratch:
+        target = scratch.resolve() / "package"
+        target.mkdir()
         try:
             refused = unpack(package, target, _LIMITS)
         except OSError as cause:

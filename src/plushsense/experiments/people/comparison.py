@@ -13,6 +13,7 @@ import numpy as np
 from plushsense.core.errors import BadInput
 from plushsense.core.files import write_file
 from plushsense.core.version import __version__
+from plushsense.dataset.store import writing_around
 from plushsense.evaluation.scores import read_predictions
 from plushsense.experiments.people.lens import calibration_of
 from plushsense.jobs.journal import job_id
@@ -49,6 +50,7 @@ def compare(
     folders = [Path(folder) for folder in evaluations]
     if len(folders) < 2:
         raise BadInput("A comparison needs at least two evaluations: give two folders written by  plushsense evaluate")
+    writing = writing_around(folders[0])
     tables = [load_evaluation(folder) for folder in folders]
     _require_same(folders, tables)
     names = [f"M{i}" for i in range(1, len(tables) + 1)]
@@ -98,9 +100,10 @@ def compare(
     if out is not None:
         from plushsense.experiments.people.report import comparison_page
 
-        Path(out).mkdir(parents=True, exist_ok=True)
-        write_file(Path(out) / PAGE, comparison_page(result))
-        write_file(Path(out) / TABLE, json.dumps(result, ensure_ascii=False, indent=1))
+        with writing():
+            Path(out).mkdir(parents=True, exist_ok=True)
+            write_file(Path(out) / PAGE, comparison_page(result))
+            write_file(Path(out) / TABLE, json.dumps(result, ensure_ascii=False, indent=1))
     return result
 
 

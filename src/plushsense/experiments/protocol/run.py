@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import ConfigError
-from plushsense.core.files import write_file
+from plushsense.core.files import temporary_folder, write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.dataset.importing.importers import import_recordings
@@ -113,8 +113,8 @@ def protocol(
         dataset = as_dataset(dataset)
         made = _recorded(dataset, bundle, asked, subjects, rules, progress)
     elif session is not None:
-        with tempfile.TemporaryDirectory() as work:
-            folder = Path(work) / "session"
+        with temporary_folder() as work:
+            folder = work / "session"
             import_recordings(
                 Path(session), folder, layout=bundle.layout, gestures=bundle.gestures, name=Path(session).resolve().name
             )

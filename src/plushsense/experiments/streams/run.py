@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -23,7 +22,7 @@ from plushsense.core.errors import (
     nearest,
     need,
 )
-from plushsense.core.files import write_file
+from plushsense.core.files import temporary_folder, write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.version import __version__
 from plushsense.dataset.files import CACHE
@@ -75,7 +74,7 @@ from plushsense.workflow.preparation import (
     silent,
     windows_for,
 )
-from plushsense.workflow.reporting import check_results, journal_of
+from plushsense.workflow.reporting import check_results, journal_of, keep_bundle
 
 
 @dataclass(frozen=True)
@@ -147,9 +146,7 @@ class TrainStreams:
             origin,
             calibrated,
         )
-        with dataset.generation.writing():
-            self.folder.mkdir(parents=True, exist_ok=True)
-            bundle.save(path)
+        keep_bundle(bundle, path, dataset)
         return bundle
 
     def key(self) -> dict[str, Any]:
@@ -236,9 +233,9 @@ def streams_at(path: str | os.PathLike[str], bundle: Bundle | None = None) -> It
     if (place / HEAD).is_file() or not place.is_dir():
         yield as_dataset(place)
         return
-    with tempfile.TemporaryDirectory(prefix="plushsense-") as folder:
+    with temporary_folder() as folder:
         layout, gestures = (None, None) if bundle is None else (bundle.layout, bundle.gestures)
-        yield import_recordings(place, Path(folder) / "DS", layout=layout, gestures=gestures).dataset
+        yield import_recordings(place, folder / "DS", layout=layout, gestures=gestures).dataset
 
 
 def _people_of(dataset: Dataset, path: str | os.PathLike[str], subjects: Sequence[str] | None) -> list[str]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plushsense.dataset.store import writing_around
 from plushsense.experiments.sweep import figures as draw
 from plushsense.experiments.sweep import tables
 from plushsense.experiments.sweep.results import SweepResults, file_name_of, name_of, read_sweep
@@ -286,6 +287,7 @@ def write_sweep_report(
         BadInput: where there is no sweep; ConfigError: where the page or its files would replace something else.
         MissingExtraError: when polars, jinja2, matplotlib or MLflow is not installed.
     """
+    writing = writing_around(Path(folder))
     sweep = read_sweep(folder)
     target = check_page_path(Path(page) if page is not None else sweep.folder / PAGE)
     beside = target.parent / (FILES if target.name == PAGE else f"{target.stem}-files")
@@ -299,8 +301,9 @@ def write_sweep_report(
     pictures = {d.name: svg(d.figure) for d in drawings}
     files = dict(_contents(sweep, sections, pictures))
     page_text = render(sweep, sections, pictures, title=title, files=beside.name)
-    write_files(beside, files, before)
-    write_page(target, page_text)
+    with writing():
+        write_files(beside, files, before)
+        write_page(target, page_text)
     summary = [f"{len(files)} tables and figures in {beside}"]
     logged = None
     if mlflow is not None:

@@ -251,18 +251,18 @@ class Toys:
         self._workspace = workspace
         self._lock = threading.Lock()
 
-    def search(self, scan_s: float = SCAN_S) -> None:
-        """Start a search in the background, unless one is running."""
+    def search(self, scan_s: float = SCAN_S, *, network: bool = True) -> None:
+        """Start a search in the background, unless one is running; see `list_devices`."""
         with self._lock:
             if self.searching:
                 return
             self.searching = True
         self.changed.notify()
-        threading.Thread(target=self._search, args=(scan_s,), daemon=True).start()
+        threading.Thread(target=self._search, args=(scan_s, network), daemon=True).start()
 
-    def _search(self, scan_s: float) -> None:
+    def _search(self, scan_s: float, network: bool) -> None:
         try:
-            self.listing, self.searched = list_devices(scan_s), True
+            self.listing, self.searched = list_devices(scan_s, network=network), True
         finally:
             self.searching = False
             self.changed.notify()

@@ -420,12 +420,12 @@ class _Exporting:
             (words("export.size"), size(bytes_, words)),
         ]
         scores = origin.get("scores")
-        if not isinstance(scores, dict) or "accuracy" not in scores:
+        if not isinstance(scores, dict) or scores.get("accuracy") is None:
             return [*rows, (words("export.scores"), words("export.no_scores"))]
         value = words(
             "export.scores_value",
             accuracy=words.number(scores["accuracy"], 2),
-            f1=words.number(scores.get("macro_f1", float("nan")), 2),
+            f1=words.number(scores.get("macro_f1") or float("nan"), 2),
             windows=scores.get("windows", "?"),
             split=scores.get("split", "?"),
         )

@@ -35,7 +35,8 @@ class ToySection:
         self._update()
         on_change(toys.changed, self._update)
         if not toys.searched:
-            toys.search()
+            # Nobody has asked for it: the network must not notice.
+            toys.search(network=False)
 
     def _use(self) -> None:
         """Choose the toy at the address that was typed; an error is shown beside the field."""
@@ -131,3 +132,4 @@ class ToySection:
             for note in toys.listing.notes:
                 ui.label(words.sentence(note)).classes("ps-dim ps-note ps-break")
             button("look", words("home.look_again" if toys.searched else "home.look"), toys.search, SMALL)
+            ui.label(words("home.look_about")).classes("ps-dim ps-note")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -129,6 +130,7 @@ class _Running:
     device: TappedDevice
     writer: BackgroundWriter | None = None
     longest_s: float = LONGEST_S
+    begun_s: float = field(default_factory=time.monotonic)
     failed: PlushSenseError | None = None
     ended: bool = False
     lock: Any = field(default_factory=threading.Lock)
@@ -136,6 +138,11 @@ class _Running:
     @property
     def key(self) -> str:
         return _key(self.session.folder)
+
+    @property
+    def passed_s(self) -> float:
+        """Length by the clock of the toy, see `FrameReceiver.passed_s`."""
+        return self.receiver.passed_s(0.0, self.begun_s)
 
 
 class Clips:
@@ -160,7 +167,7 @@ class Clips:
     def recorded_s(self) -> float:
         """Length of the clip that is being recorded, by the clock of the toy."""
         running = self._running
-        return running.receiver.toy_ms / 1000.0 if running is not None else 0.0
+        return running.passed_s if running is not None else 0.0
 
     def keep(self, reader: LiveReader, seconds: float, subject: str) -> str:
         """Write the last ``seconds`` of the signals as a clip, and return its key.
@@ -252,11 +259,12 @@ class Clips:
             if running.ended:
                 return
             received = [running.receiver.receive(frame) for frame in frames]
+            running.receiver.end_reading()
             running.writer.add_frames([r.frame for r in received], running.receiver.toy_ms)
             for gap in (r.gap for r in received):
                 if gap is not None:
                     running.writer.submit(new_event("gap", **gap))
-            running.ended = running.receiver.toy_ms >= 1000.0 * running.longest_s
+            running.ended = running.passed_s >= running.longest_s
         if running.ended:
             threading.Thread(target=self.end, args=(running,), daemon=True).start()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from nicegui import run, ui
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.gestures import plain_label
 from plushsense.core.recorder_csv import parse_name, read_recording
+from plushsense.core.toml import loads_json
 from plushsense.dataset.quality.comparisons import usual_seconds
 from plushsense.dataset.quality.findings import CheckLimits
 from plushsense.recording.session_files import SIDECAR, discarded_recordings
@@ -58,7 +58,7 @@ def measure_result(session: ActiveSession, file: str, recordings: Path) -> Recor
         PlushSenseError, OSError: if its files cannot be read.
     """
     files = session.recorder.session
-    table = json.loads((files.folder / file).with_suffix(SIDECAR).read_text(encoding="utf-8"))
+    table = loads_json((files.folder / file).with_suffix(SIDECAR).read_text(encoding="utf-8"))
     frames = read_recording(files.folder / file, files.layout).frames
     seconds = _seconds(table)
     # A channel counts by how much it moved in the last minute.
@@ -88,7 +88,7 @@ def _earlier_seconds(recordings: Path, path: Path, table: dict[str, Any]) -> Ite
         if csv.name in discarded.setdefault(csv.parent, discarded_recordings(csv.parent)):
             continue
         try:
-            its = json.loads(other.read_text(encoding="utf-8"))
+            its = loads_json(other.read_text(encoding="utf-8"))
             if bool(its["simulated"]) == bool(table["simulated"]):
                 yield _seconds(its)
         except (OSError, ValueError, KeyError, TypeError):

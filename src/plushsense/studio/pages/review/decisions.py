@@ -102,10 +102,13 @@ class Decisions:
         """Return the decisions of a browser tab that can be undone, oldest first."""
         return tuple(self._histories.get(visit, ()))
 
-    def undo(self, visit: str, who: str, why: str = "") -> ReviewDecision | None:
+    def undo(
+        self, visit: str, who: str, why: str = "", check: Callable[[], None] | None = None
+    ) -> ReviewDecision | None:
         """Undo the last decision of a browser tab by writing the inverse marks; return None if there is none.
 
-        What was changed elsewhere since stays; the returned decision is about the other recordings only.
+        What was changed elsewhere since stays; the returned decision is about the other recordings only. ``check`` is
+        that of `append_marks`.
 
         Raises:
             DatasetError: if everything was changed elsewhere since. The next call undoes an older decision.
@@ -124,7 +127,7 @@ class Decisions:
                 recording=last.recording,
             )
         undone = replace(last, before=standing)
-        append_marks(self._path, undone.inverse(who, why))
+        append_marks(self._path, undone.inverse(who, why), check)
         history.pop()
         self.look()
         return undone

@@ -27,7 +27,7 @@ from plushsense.dataset import trimming as trim
 from plushsense.dataset.files import current_stamp
 from plushsense.dataset.index import apply_marks, open_dataset
 from plushsense.dataset.marks import SUGGESTED as BY_SUGGESTION
-from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, append_marks, apply_mark
+from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, apply_mark
 from plushsense.dataset.onset import Suggestion
 from plushsense.dataset.quality.findings import SEVERITIES, Finding
 from plushsense.dataset.store import Dataset, RecordingInfo
@@ -465,7 +465,7 @@ class Review:
         new = [m for m in marks if apply_mark(self.standing(m.recording), m) != self.standing(m.recording)]
         if not new:
             return 0
-        make = partial(append_marks, self.path, new)
+        make = partial(self.dataset.append_marks, new)
         return self._decide(visit, [m.recording for m in new], new[0].action, make, new[0].check)
 
     def history(self, visit: str) -> Sequence[ReviewDecision]:
@@ -475,7 +475,7 @@ class Review:
     def undo(self, visit: str, who: str, why: str = "") -> ReviewDecision | None:
         """Undo the last decision of a browser tab, see `Decisions.undo`."""
         with self._lock:
-            undone = self._decisions.undo(visit, who, why)
+            undone = self._decisions.undo(visit, who, why, self.dataset.generation.check)
         if undone is not None:
             self._changed()
         return undone

@@ -13,12 +13,11 @@ import numpy as np
 from markupsafe import Markup
 
 from plushsense.core.errors import BadInput, PlushSenseError
-from plushsense.core.gestures import NOBODY
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS
-from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT
+from plushsense.dataset.store import HEAD
 from plushsense.evaluation.scores import Predictions, read_predictions
-from plushsense.models.bundle import Bundle
+from plushsense.models.bundle import Bundle, known_people
 from plushsense.scoring import metrics
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace, file_stamps
@@ -238,7 +237,7 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
     if context == ANYWHERE:
         # As in evaluations, networks trained on any context are scored in the context "stream".
         context = f"{ANYWHERE} → stream"
-    held_back = sorted(set(origin.get("validation_subjects", ())) - {NOBODY, UNKNOWN_SUBJECT})
+    held_back = sorted(known_people(origin, ["validation_subjects"]))
     return [
         ResultRow(
             str(path),
@@ -271,7 +270,7 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
 
 
 def _rest(nobody: Mapping[str, Any] | None, apart: bool) -> float | None:
-    return nobody["accuracy"] if nobody and apart else None
+    return nobody.get("accuracy") if nobody and apart else None
 
 
 def over_trainings(trial: Mapping[str, Any]) -> tuple[str, int]:
