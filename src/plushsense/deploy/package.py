@@ -14,7 +14,7 @@ from typing import Any
 from plushsense.core.errors import LayoutError
 from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Channel, Layout
 from plushsense.core.templates import c_comment, fill_text
-from plushsense.deploy.emit import BUNDLE, FACTS, IMAGE, LIBRARY, MODEL, TOY_BYTES, c_names, read_facts
+from plushsense.deploy.emit import BUNDLE, FACTS, IMAGE, LIBRARY, MODEL, TOY_BYTES, c_names, prefixed, read_facts
 from plushsense.deploy.golden import measured
 from plushsense.models.bundle import Bundle
 from plushsense.windows.features import Scaler
@@ -54,7 +54,8 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
     facts = read_facts(out) if facts is None else facts
     bundle = Bundle.load(out / BUNDLE)
     rendered = firmware(bundle.layout, bundle.scaler, facts)
-    header = (out / LIBRARY[0]).read_text(encoding="utf-8")
+    name = str(facts.get("name", ""))
+    header = (out / prefixed(LIBRARY[0], name)).read_text(encoding="utf-8")
     licence = (files("plushsense.deploy") / "c" / LICENCE).read_text(encoding="utf-8")
     simulated = " SIMULATION: trained on a virtual toy." if facts["simulated"] else ""
     paragraph = (
@@ -63,6 +64,7 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
     )
     values = {
         "version": facts["code_version"],
+        **_folders(name),
         "author": "The PlushSense developers",
         "sentence": "What a soft toy feels: a small streaming network in whole numbers.",
         "paragraph": paragraph.replace("\n", " "),
@@ -75,43 +77,65 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
         f"{SKETCH}/PlushToy.ino": rendered["PlushToy.ino"],
         f"{IDF_EXAMPLE}/main/main.c": rendered["main.c"],
     }
-    for name in _WIRE:
-        texts |= {f"{ARDUINO}/src/{name}": rendered[name], f"{IDF}/{_component_path(name)}": rendered[name]}
-    for name in _EXAMPLE:
-        texts |= {f"{SKETCH}/{name}": rendered[name], f"{IDF_EXAMPLE}/main/{name}": rendered[name]}
-    contents = {name: text.encode() for name, text in texts.items()}
-    contents |= {copy: (out / original).read_bytes() for copy, original in copies().items()}
+    for file in _WIRE:
+        texts |= {f"{ARDUINO}/src/{file}": rendered[file], f"{IDF}/{_component_path(file)}": rendered[file]}
+    for file in _EXAMPLE:
+        texts |= {f"{SKETCH}/{file}": rendered[file], f"{IDF_EXAMPLE}/main/{file}": rendered[file]}
+    contents = {_named_path(file, name): prefixed(text, name).encode() for file, text in texts.items()}
+    contents |= {copy: (out / original).read_bytes() for copy, original in copies(name).items()}
     written = []
-    for name, content in contents.items():
-        path = out / name
+    for file, content in contents.items():
+        path = out / file
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
         written.append(path)
     return written
 
 
-def copies() -> dict[str, str]:
-    """Return the files of the packages that are copies, mapped to their originals, relative to the export folder."""
-    names = (*LIBRARY, *MODEL)
-    return {f"{ARDUINO}/src/{n}": n for n in names} | {f"{IDF}/{_component_path(n)}": n for n in names}
+def copies(name: str = "") -> dict[str, str]:
+    """Return the files of the packages that are copies, mapped to their originals, relative to the export folder.
+
+    ``name`` is that of the export.
+    """
+    files = (*LIBRARY, *MODEL)
+    found = {f"{ARDUINO}/src/{f}": f for f in files} | {f"{IDF}/{_component_path(f)}": f for f in files}
+    return {_named_path(copy, name): prefixed(original, name) for copy, original in found.items()}
+
+
+def _named_path(path: str, name: str) -> str:
+    """Return the path of a file of the packages in an export with a name: also the packages are called by it."""
+    folders = _folders(name)
+    for plain, named in ((ARDUINO, f"arduino/{folders['library']}"), (IDF, f"esp-idf/{folders['component']}")):
+        if path.startswith(f"{plain}/"):
+            path = path.replace(plain, named, 1)
+    return prefixed(path, name)
+
+
+def _folders(name: str) -> dict[str, str]:
+    """Return what the Arduino library and the ESP-IDF component of an export with this name are called."""
+    return {
+        "library": f"{name}_plush" if name else ARDUINO.split("/")[1],
+        "component": f"{name}_plushsense" if name else IDF.split("/")[1],
+    }
 
 
 def changed_copies(out: Path) -> list[str]:
     """Return the copies in an export folder that differ from their originals, since only these are verified."""
     return [
         copy
-        for copy, original in copies().items()
+        for copy, original in copies(str(read_facts(out).get("name", ""))).items()
         if (out / copy).is_file() and (out / copy).read_bytes() != (out / original).read_bytes()
     ]
 
 
 def handbook(bundle: Bundle, facts: Mapping[str, Any]) -> str:
-    """Render the README in Markdown from the ``facts`` (of ``export.json``) and the bundle."""
+    """Render the README in Markdown from the ``facts`` (of ``export.json``) and the bundle, not yet `prefixed`."""
     layout = bundle.layout
     ranges = layout.valid_min_int.tolist(), layout.valid_max_int.tolist()
     return _fill(
         "templates/README.md",
         facts=facts,
+        **_folders(str(facts.get("name", ""))),
         channels=list(zip(layout.channels, c_names(layout.names), *ranges, strict=True)),
         provenance=bundle.provenance,
         personal=bundle.personal,
