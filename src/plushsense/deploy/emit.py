@@ -17,7 +17,7 @@ from plushsense.core.templates import fill_text
 from plushsense.deploy.golden import write_golden
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
-from plushsense.runtime.image import HEAD_BYTES, IntegerModel, image_head, layout_check, memory_bytes
+from plushsense.runtime.image import HEAD_BYTES, IntegerModel, image_check, image_head, layout_check, memory_bytes
 
 FACTS = "export.json"
 IMAGE = "plush_model.bin"
@@ -31,6 +31,12 @@ Extra = Callable[[Path, dict[str, Any]], object]
 
 _MOST_NAME = 10  # so that an Arduino library called NAME_plush has at most the 16 characters that arduino-lint accepts
 _NAME = re.compile(r"(?!.*(?:arduino|library))[a-z][a-z0-9]*(?:_[a-z0-9]+)*")
+# https://semver.org: what the manifests of Arduino, PlatformIO and ESP-IDF all accept.
+_VERSION = re.compile(
+    r"(0|[1-9][0-9]*)(\.(0|[1-9][0-9]*)){2}"
+    r"(-(0|[1-9][0-9]*|[0-9]*[a-zA-Z-][0-9a-zA-Z-]*)(\.(0|[1-9][0-9]*|[0-9]*[a-zA-Z-][0-9a-zA-Z-]*))*)?"
+)
+_HASH = re.compile(r"[0-9a-f]{16,64}")
 # Identifiers and C files of the library and the model, but not the command `plushsense` or the file of the image.
 _OWN = r"(?:(?:PLUSH|plush)_(?!model\.bin\b)\w|plushsense\.[ch]\b|PLUSHSENSE_H\b)"
 
@@ -128,6 +134,15 @@ def check_name(name: str) -> None:
         )
 
 
+def check_model_version(version: str) -> None:
+    """Check a version of a model; raise ConfigError for one that is not accepted."""
+    if not _VERSION.fullmatch(version):
+        raise ConfigError(
+            f"'{version}' is no version of a model: accepted are three numbers, as 1.2.0, and after a hyphen a "
+            "pre-release, as 1.2.0-beta.1 (semver.org)."
+        )
+
+
 def _accepted(name: object) -> bool:
     return isinstance(name, str) and len(name) <= _MOST_NAME and _NAME.fullmatch(name) is not None
 
@@ -135,7 +150,8 @@ def _accepted(name: object) -> bool:
 def prefixed(text: str, name: str) -> str:
     """Put the name of an export before all of its C names and C files in a text.
 
-    ``left`` gives ``left_plush_push``, ``LEFT_PLUSH_OK`` and ``left_plushsense.h``. Macros and include guards are included. An empty name changes nothing.
+    ``left`` gives ``left_plush_push``, ``LEFT_PLUSH_OK`` and ``left_plushsense.h``. Macros and include guards are
+    included. An empty name changes nothing.
     """
     if not name:
         return text
@@ -155,7 +171,7 @@ def _write(model: IntegerModel, bundle: Bundle, folder: Path, name: str) -> dict
     for file, content in code.items():
         plain = content if file == IMAGE else prefixed(content.decode(), name).encode()
         (folder / prefixed(file, name)).write_bytes(plain)
-    facts = _facts(model, bundle, len(code[IMAGE])) | ({"name": name} if name else {})
+    facts = _facts(model, bundle, code[IMAGE]) | ({"name": name} if name else {})
     bundle.save(folder / BUNDLE)
     write_golden(model, bundle.scaler, folder / GOLDEN)
     return facts
@@ -168,7 +184,7 @@ def code_files(model: IntegerModel, bundle: Bundle) -> dict[str, bytes]:
     can be compared with the files of an export of unknown origin.
     """
     image = model.to_bytes()
-    facts = _facts(model, bundle, len(image))
+    facts = _facts(model, bundle, image)
     return {
         **{name: library_text(name, window=model.is_window).encode() for name in LIBRARY},
         MODEL[0]: _header(facts).encode(),
@@ -192,8 +208,11 @@ def times_streaming(arch: Arch) -> float:
     return round(arch.macs_per_step / replace(arch, padding="stream", pool=None).macs_per_step, 1)
 
 
-def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, Any]:
+def _facts(model: IntegerModel, bundle: Bundle, image: bytes) -> dict[str, Any]:
     arch, layout = model.network.arch, model.layout
+    code_version = version("plushsense")
+    # Provenance may come from elsewhere, and goes into C.
+    model_version, training = (str(bundle.provenance.get(key, "")) for key in ("model_version", "dataset_hash"))
     names = c_names(model.gestures.labels)
     return {
         "title": arch.title,
@@ -222,12 +241,15 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
         "macs_per_window": arch.macs_per_window,
         "padding": arch.padding,
         **({"times_streaming": times_streaming(arch)} if model.is_window else {}),
-        "model_bytes": model_bytes,
+        "model_bytes": len(image),
+        "model_id": image_check(image),
+        "model_version": model_version if _VERSION.fullmatch(model_version) else code_version,
+        "training": training if _HASH.fullmatch(training) else "",
         "memory_bytes": memory_bytes(model),
         "simulated": bool(bundle.provenance.get("simulated", False)),
         "provenance": bundle.provenance,
         **({"personal": bundle.personal} if bundle.personal else {}),
-        "code_version": version("plushsense"),
+        "code_version": code_version,
     }
 
 

@@ -21,9 +21,11 @@ from plushsense.windows.features import Scaler
 
 ARDUINO = "arduino/PlushSense"
 IDF = "esp-idf/plushsense"
-IDF_EXAMPLE = "esp-idf/example"
+IDF_EXAMPLE = f"{IDF}/examples/PlushToy"
 SKETCH = f"{ARDUINO}/examples/PlushToy"
 LICENCE = "LICENSE"
+# Manifests must have an address; PlushSense has no page of its own. RFC 6761: nobody can own this one.
+NO_PAGE = "https://plushsense.invalid/"
 _WIRE = ("plush_wire.h", "plush_wire.c")
 _EXAMPLE = ("plush_reaction.h", "plush_reaction.c", "plush_fake.h", "plush_fake.c")
 FIRMWARE = (*_WIRE, *_EXAMPLE, "PlushToy.ino", "main.c")
@@ -63,7 +65,8 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
         f"(layout {facts['layout']}), an answer every {facts['step_ms']:g} ms.{simulated}"
     )
     values = {
-        "version": facts["code_version"],
+        "version": facts["model_version"],
+        "url": facts.get("url", NO_PAGE),
         **_folders(name),
         "author": "The PlushSense developers",
         "sentence": "What a soft toy feels: a small streaming network in whole numbers.",
@@ -71,6 +74,7 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
     }
     texts = {
         "README.md": handbook(bundle, facts),
+        **{f"{folder}/README.md": _fill("templates/package_README.md", **values) for folder in (ARDUINO, IDF)},
         **{f"{folder}{LICENCE}": licence for folder in ("", f"{ARDUINO}/", f"{IDF}/")},
         **{path: _fill(f"templates/{name}", **values) for path, name in _TEMPLATES.items()},
         f"{ARDUINO}/keywords.txt": _keywords(header + rendered["plush_wire.h"]),
