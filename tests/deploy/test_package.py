@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -94,6 +95,69 @@ def test_the_arduino_library_keeps_the_rules_of_arduino_lint(packages: Packages,
         assert text.count(old) == 1
         (library / "library.properties").write_text(text.replace(old, new), encoding="utf-8")
         assert rule in broken_rules(library), "the test itself can fail"
+
+
+_USER = """cmake_minimum_required(VERSION 3.13)
+project(user LANGUAGES C)
+{find}
+add_executable(user user.c)
+target_link_libraries(user PRIVATE {target})
+"""
+_ZEPHYR = """macro(zephyr_library_named name)
+    add_library(${name} STATIC)
+    set(ZEPHYR_CURRENT_LIBRARY ${name})
+endmacro()
+macro(zephyr_library_sources)
+    target_sources(${ZEPHYR_CURRENT_LIBRARY} PRIVATE ${ARGN})
+endmacro()
+macro(zephyr_library_compile_options)
+    target_compile_options(${ZEPHYR_CURRENT_LIBRARY} PRIVATE ${ARGN})
+endmacro()
+macro(zephyr_include_directories)
+    target_include_directories(${ZEPHYR_CURRENT_LIBRARY} PUBLIC ${ARGN})
+endmacro()
+set(CONFIG_OWL_PLUSHSENSE y)
+"""
+_USE = """#include "owl_plush_model.h"
+#include "owl_plushsense.h"
+
+static uint32_t memory[OWL_PLUSH_MODEL_MEMORY_WORDS];
+static owl_plush_toy toy;
+
+int main(void)
+{
+    return (int)owl_plush_begin(&toy, owl_plush_model, OWL_PLUSH_MODEL_BYTES, memory, sizeof memory);
+}
+"""
+
+
+def test_cmake_builds_it_as_a_folder_as_a_package_and_as_a_zephyr_module(
+    needs: Callable[..., None], tmp_path: Path
+) -> None:
+    needs("cmake", "gcc")
+    out = export(bundle_of(window=60), tmp_path / "out", name="owl", model_version="1.2.3-beta.1").folder
+    module = dict(
+        row.strip().split(": ") for row in (out / "zephyr/module.yml").read_text().splitlines() if ": " in row
+    )
+    assert module == {"name": "owl_plushsense", "cmake": "zephyr", "kconfig": "zephyr/Kconfig"}
+    assert (out / module["kconfig"]).read_text().startswith("config OWL_PLUSHSENSE\n\tbool ")
+    known = "-DCMAKE_C_COMPILER_WORKS=1"  # saves time
+    run("cmake", known, "-S", out, "-B", tmp_path / "own")
+    run("cmake", "--build", tmp_path / "own")
+    run("cmake", "--install", tmp_path / "own", "--prefix", tmp_path / "installed")
+    imported = "owl_plushsense::owl_plushsense"
+    for kind, find, target in (
+        ("folder", f'add_subdirectory("{out}" owl)', imported),
+        ("package", "find_package(owl_plushsense 1.2 REQUIRED)", imported),
+        ("zephyr", f'{_ZEPHYR}add_subdirectory("{out / module["cmake"]}" owl)', "owl_plushsense"),
+    ):
+        user = tmp_path / kind
+        user.mkdir()
+        (user / "CMakeLists.txt").write_text(_USER.format(find=find, target=target))
+        (user / "user.c").write_text(_USE)
+        run("cmake", known, "-S", user, "-B", user / "build", f"-DCMAKE_PREFIX_PATH={tmp_path / 'installed'}")
+        run("cmake", "--build", user / "build")
+        run(user / "build" / "user")
 
 
 def test_the_model_s_own_version_and_page_stand_in_every_manifest_and_in_c(tmp_path: Path, c_compiler: str) -> None:

@@ -1,4 +1,4 @@
-"""Create README, Arduino library, ESP-IDF component and example firmware of an export folder from Jinja templates."""
+"""Create README, packages for build systems and example firmware of an export folder from Jinja templates."""
 
 from __future__ import annotations
 
@@ -31,6 +31,10 @@ _EXAMPLE = ("plush_reaction.h", "plush_reaction.c", "plush_fake.h", "plush_fake.
 FIRMWARE = (*_WIRE, *_EXAMPLE, "PlushToy.ino", "main.c")
 """Files of the example firmware, with templates in ``c/toy``."""
 _TEMPLATES = {
+    "CMakeLists.txt": "CMakeLists.txt",
+    "zephyr/module.yml": "zephyr_module.yml",
+    "zephyr/CMakeLists.txt": "zephyr_CMakeLists.txt",
+    "zephyr/Kconfig": "zephyr_Kconfig",
     f"{ARDUINO}/library.properties": "library.properties",
     f"{ARDUINO}/library.json": "library.json",
     f"{IDF}/CMakeLists.txt": "component_CMakeLists.txt",
@@ -42,7 +46,9 @@ _TEMPLATES = {
 
 
 def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
-    """Add README, Arduino library and ESP-IDF component to an export folder; ``facts`` default to its ``export.json``.
+    """Add README, Arduino library, ESP-IDF component, CMake project and Zephyr module to an export folder.
+
+    ``facts`` default to its ``export.json``.
 
     The library and the model are copied from the folder. Existing files are overwritten.
 
