@@ -24,6 +24,8 @@ IDF = "esp-idf/plushsense"
 IDF_EXAMPLE = f"{IDF}/examples/PlushToy"
 SKETCH = f"{ARDUINO}/examples/PlushToy"
 LICENCE = "LICENSE"
+TWO_SLOTS = "examples/two_slots"
+_UPDATE = ("plush_update.h", "plush_update.c")
 # Manifests must have an address; PlushSense has no page of its own. RFC 6761: nobody can own this one.
 NO_PAGE = "https://plushsense.invalid/"
 _WIRE = ("plush_wire.h", "plush_wire.c")
@@ -64,7 +66,8 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
     rendered = firmware(bundle.layout, bundle.scaler, facts)
     name = str(facts.get("name", ""))
     header = (out / prefixed(LIBRARY[0], name)).read_text(encoding="utf-8")
-    licence = (files("plushsense.deploy") / "c" / LICENCE).read_text(encoding="utf-8")
+    c_folder = files("plushsense.deploy") / "c"
+    licence = (c_folder / LICENCE).read_text(encoding="utf-8")
     simulated = " SIMULATION: trained on a virtual toy." if facts["simulated"] else ""
     paragraph = (
         f"Model {facts['title']}: {facts['classes']} gestures from {len(facts['channels'])} channels "
@@ -87,6 +90,7 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
         f"{SKETCH}/PlushToy.ino": rendered["PlushToy.ino"],
         f"{IDF_EXAMPLE}/main/main.c": rendered["main.c"],
     }
+    texts |= {f"{TWO_SLOTS}/{f}": (c_folder / "two_slots" / f).read_text(encoding="utf-8") for f in _UPDATE}
     for file in _WIRE:
         texts |= {f"{ARDUINO}/src/{file}": rendered[file], f"{IDF}/{_component_path(file)}": rendered[file]}
     for file in _EXAMPLE:
