@@ -45,6 +45,21 @@ def test_the_verb(tmp_path: Path, bundle: Bundle, capsys: pytest.CaptureFixture[
     assert "plushsense verify" in capsys.readouterr().out
 
 
+def test_a_name_and_a_version_from_the_command_line(
+    tmp_path: Path, bundle: Bundle, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bundle.save(tmp_path / "m.plush")
+    words = ["export", str(tmp_path / "m.plush"), str(tmp_path / "out")]
+    own = ["--name", "ears", "--model-version", "1.2.0", "--url", "https://example.org/toy"]
+    assert main([*words, *own, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["name"], told["model_version"], told["url"]) == ("ears", "1.2.0", "https://example.org/toy")
+    assert {"ears_plushsense.c", "arduino/ears_plush/library.properties"} <= set(told["files"])
+    for option, value in zip(own[::2], own[1::2], strict=True):
+        assert main([*words, "--patch-for", str(tmp_path / "out"), option, value]) == 2
+        assert f"{option} is for a whole export" in capsys.readouterr().err
+
+
 def test_it_tells_how_many_people_also_when_it_is_exported_again(tmp_path: Path, bundle: Bundle) -> None:
     who = {"subjects": ["Anna", "P02"], "validation_subjects": ["Bo"], "split": "validation-subjects"}
     ps.export(replace(bundle, provenance=who), tmp_path / "one")

@@ -53,7 +53,8 @@ def run(args: argparse.Namespace) -> int:
     if args.patch_for is not None:
         return _patch(args)
     also = listed(args.also)
-    done = export(args.bundle, args.out, dataset=args.dataset, step_s=args.step_s, also=also, warn=warn)
+    package = {"name": args.name, "model_version": args.model_version, "url": args.url}
+    done = export(args.bundle, args.out, dataset=args.dataset, step_s=args.step_s, also=also, **package, warn=warn)
     facts = done.facts
     simulated = ["  SIMULATION: trained on a virtual toy, not on real touch"] if facts["simulated"] else []
     emit(
@@ -78,6 +79,10 @@ def _patch(args: argparse.Namespace) -> int:
 
     if args.also:
         raise ConfigError("--also writes formats of a whole export: leave it out, or leave out --patch-for.")
+    for option in ("name", "model_version", "url"):
+        if getattr(args, option):
+            words = f"--{option.replace('_', '-')}"
+            raise ConfigError(f"{words} is for a whole export: a patch holds no names or versions, so leave it out.")
     if args.step_s is not None:
         raise ConfigError("--step-s is for a whole export: a patch has the step of the export that it is for.")
     done = export_patch(args.bundle, args.out, export=args.patch_for, dataset=args.dataset, warn=warn)

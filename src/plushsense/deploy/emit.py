@@ -11,13 +11,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import BadInput
+from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.files import new_folder
 from plushsense.core.templates import fill_text
 from plushsense.deploy.golden import write_golden
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
-from plushsense.runtime.image import HEAD_BYTES, IntegerModel, image_head, layout_check, memory_bytes
+from plushsense.runtime.image import HEAD_BYTES, IntegerModel, image_check, image_head, layout_check, memory_bytes
 
 FACTS = "export.json"
 IMAGE = "plush_model.bin"
@@ -28,6 +28,17 @@ GOLDEN = "golden"
 TOY_BYTES = 484  # size of a plush_toy with 32-bit pointers (a test compiles it)
 
 Extra = Callable[[Path, dict[str, Any]], object]
+
+_MOST_NAME = 10  # so that an Arduino library called NAME_plush has at most the 16 characters that arduino-lint accepts
+_NAME = re.compile(r"(?!.*(?:arduino|library))[a-z][a-z0-9]*(?:_[a-z0-9]+)*")
+# https://semver.org: what the manifests of Arduino, PlatformIO and ESP-IDF all accept.
+_VERSION = re.compile(
+    r"(0|[1-9][0-9]*)(\.(0|[1-9][0-9]*)){2}"
+    r"(-(0|[1-9][0-9]*|[0-9]*[a-zA-Z-][0-9a-zA-Z-]*)(\.(0|[1-9][0-9]*|[0-9]*[a-zA-Z-][0-9a-zA-Z-]*))*)?"
+)
+_HASH = re.compile(r"[0-9a-f]{16,64}")
+# Identifiers and C files of the library and the model, but not the command `plushsense` or the file of the image.
+_OWN = r"(?:(?:PLUSH|plush)_(?!model\.bin\b)\w|plushsense\.[ch]\b|PLUSHSENSE_H\b)"
 
 
 @dataclass(frozen=True)
@@ -55,7 +66,9 @@ class ExportResult:
         }
 
 
-def emit(model: IntegerModel, bundle: Bundle, out: str | Path, extras: Sequence[Extra] = ()) -> ExportResult:
+def emit(
+    model: IntegerModel, bundle: Bundle, out: str | Path, extras: Sequence[Extra] = (), name: str = ""
+) -> ExportResult:
     """Write an export folder atomically.
 
     Args:
@@ -63,13 +76,16 @@ def emit(model: IntegerModel, bundle: Bundle, out: str | Path, extras: Sequence[
         bundle: also written to the folder (names, scores, float network), without the codes of the training people.
         out: a folder that does not exist yet, or is empty.
         extras: functions that add files to the finished folder (packages for build systems, other formats).
+        name: prefix of all C names and C files (`prefixed`), so that several exports link into one program.
 
     Raises:
         BadInput: if the folder is not empty, or cannot be written.
+        ConfigError: for a name that is not accepted.
     """
+    check_name(name)
     out = Path(out)
     with new_folder(out, BadInput) as part:
-        facts = _write(model, bundle, part)
+        facts = _write(model, bundle, part, name)
         for extra in extras:
             extra(part, facts)
         files = sorted(p.relative_to(part).as_posix() for p in part.rglob("*") if p.is_file())
@@ -95,31 +111,80 @@ def read_facts(folder: str | Path) -> dict[str, Any]:
     except (OSError, ValueError, TypeError) as cause:
         message = f"'{path}' cannot be read ({cause}): export the model again."
         raise BadInput(message, reason="export_damaged", name=Path(folder).name) from None
+    name = facts.get("name", "")
+    if name and not _accepted(name):
+        message = f"'{path}' has the name {name!r}, which no export has: export the model again."
+        raise BadInput(message, reason="export_damaged", name=Path(folder).name)
     if needed:
         message = f"'{path}' lacks {', '.join(sorted(needed))}: export the model again."
         raise BadInput(message, reason="export_damaged", name=Path(folder).name)
     return dict(facts)
 
 
-def _write(model: IntegerModel, bundle: Bundle, folder: Path) -> dict[str, Any]:
+def check_name(name: str) -> None:
+    """Check the name of an export; the empty one stands for none.
+
+    Raises:
+        ConfigError: for a name that is not accepted.
+    """
+    if name and not _accepted(name):
+        raise ConfigError(
+            f"'{name}' cannot be the name of an export: accepted are up to {_MOST_NAME} lower-case letters, digits and "
+            "single underscores between them, a letter first, without the words arduino and library."
+        )
+
+
+def check_model_version(version: str) -> None:
+    """Check a version of a model; raise ConfigError for one that is not accepted."""
+    if not _VERSION.fullmatch(version):
+        raise ConfigError(
+            f"'{version}' is no version of a model: accepted are three numbers, as 1.2.0, and after a hyphen a "
+            "pre-release, as 1.2.0-beta.1 (semver.org)."
+        )
+
+
+def _accepted(name: object) -> bool:
+    return isinstance(name, str) and len(name) <= _MOST_NAME and _NAME.fullmatch(name) is not None
+
+
+def prefixed(text: str, name: str) -> str:
+    """Put the name of an export before all of its C names and C files in a text.
+
+    ``left`` gives ``left_plush_push``, ``LEFT_PLUSH_OK`` and ``left_plushsense.h``. Macros and include guards are
+    included. An empty name changes nothing.
+    """
+    if not name:
+        return text
+    return re.sub(rf"(?<!\w){_OWN}", lambda m: f"{name.upper() if m[0][0] == 'P' else name}_{m[0]}", text)
+
+
+def without_prefix(text: bytes, name: str) -> bytes:
+    """Undo `prefixed` for the bytes of a file."""
+    if not name:
+        return text
+    return re.sub(rf"(?<!\w)(?:{name}|{name.upper()})_(?={_OWN})".encode(), b"", text)
+
+
+def _write(model: IntegerModel, bundle: Bundle, folder: Path, name: str) -> dict[str, Any]:
     bundle = bundle.without_people()
     code = code_files(model, bundle)
-    for name, content in code.items():
-        (folder / name).write_bytes(content)
-    facts = _facts(model, bundle, len(code[IMAGE]))
+    for file, content in code.items():
+        plain = content if file == IMAGE else prefixed(content.decode(), name).encode()
+        (folder / prefixed(file, name)).write_bytes(plain)
+    facts = _facts(model, bundle, code[IMAGE]) | ({"name": name} if name else {})
     bundle.save(folder / BUNDLE)
     write_golden(model, bundle.scaler, folder / GOLDEN)
     return facts
 
 
 def code_files(model: IntegerModel, bundle: Bundle) -> dict[str, bytes]:
-    """Return the contents of the C and model files of an export, by name.
+    """Return the contents of the C and model files of an export without a name, by file name.
 
     A program is compiled from these files only. They depend only on the model and on names in the bundle, so that they
     can be compared with the files of an export of unknown origin.
     """
     image = model.to_bytes()
-    facts = _facts(model, bundle, len(image))
+    facts = _facts(model, bundle, image)
     return {
         **{name: library_text(name, window=model.is_window).encode() for name in LIBRARY},
         MODEL[0]: _header(facts).encode(),
@@ -143,8 +208,11 @@ def times_streaming(arch: Arch) -> float:
     return round(arch.macs_per_step / replace(arch, padding="stream", pool=None).macs_per_step, 1)
 
 
-def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, Any]:
+def _facts(model: IntegerModel, bundle: Bundle, image: bytes) -> dict[str, Any]:
     arch, layout = model.network.arch, model.layout
+    code_version = version("plushsense")
+    # Provenance may come from elsewhere, and goes into C.
+    model_version, training = (str(bundle.provenance.get(key, "")) for key in ("model_version", "dataset_hash"))
     names = c_names(model.gestures.labels)
     return {
         "title": arch.title,
@@ -173,12 +241,15 @@ def _facts(model: IntegerModel, bundle: Bundle, model_bytes: int) -> dict[str, A
         "macs_per_window": arch.macs_per_window,
         "padding": arch.padding,
         **({"times_streaming": times_streaming(arch)} if model.is_window else {}),
-        "model_bytes": model_bytes,
+        "model_bytes": len(image),
+        "model_id": image_check(image),
+        "model_version": model_version if _VERSION.fullmatch(model_version) else code_version,
+        "training": training if _HASH.fullmatch(training) else "",
         "memory_bytes": memory_bytes(model),
         "simulated": bool(bundle.provenance.get("simulated", False)),
         "provenance": bundle.provenance,
         **({"personal": bundle.personal} if bundle.personal else {}),
-        "code_version": version("plushsense"),
+        "code_version": code_version,
     }
 
 

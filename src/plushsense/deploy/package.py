@@ -1,4 +1,4 @@
-"""Create README, Arduino library, ESP-IDF component and example firmware of an export folder from Jinja templates."""
+"""Create README, packages for build systems and example firmware of an export folder from Jinja templates."""
 
 from __future__ import annotations
 
@@ -14,21 +14,29 @@ from typing import Any
 from plushsense.core.errors import LayoutError
 from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Channel, Layout
 from plushsense.core.templates import c_comment, fill_text
-from plushsense.deploy.emit import BUNDLE, FACTS, IMAGE, LIBRARY, MODEL, TOY_BYTES, c_names, read_facts
+from plushsense.deploy.emit import BUNDLE, FACTS, IMAGE, LIBRARY, MODEL, TOY_BYTES, c_names, prefixed, read_facts
 from plushsense.deploy.golden import measured
 from plushsense.models.bundle import Bundle
 from plushsense.windows.features import Scaler
 
 ARDUINO = "arduino/PlushSense"
 IDF = "esp-idf/plushsense"
-IDF_EXAMPLE = "esp-idf/example"
+IDF_EXAMPLE = f"{IDF}/examples/PlushToy"
 SKETCH = f"{ARDUINO}/examples/PlushToy"
 LICENCE = "LICENSE"
+TWO_SLOTS = "examples/two_slots"
+_UPDATE = ("plush_update.h", "plush_update.c")
+# Manifests must have an address; PlushSense has no page of its own. RFC 6761: nobody can own this one.
+NO_PAGE = "https://plushsense.invalid/"
 _WIRE = ("plush_wire.h", "plush_wire.c")
 _EXAMPLE = ("plush_reaction.h", "plush_reaction.c", "plush_fake.h", "plush_fake.c")
 FIRMWARE = (*_WIRE, *_EXAMPLE, "PlushToy.ino", "main.c")
 """Files of the example firmware, with templates in ``c/toy``."""
 _TEMPLATES = {
+    "CMakeLists.txt": "CMakeLists.txt",
+    "zephyr/module.yml": "zephyr_module.yml",
+    "zephyr/CMakeLists.txt": "zephyr_CMakeLists.txt",
+    "zephyr/Kconfig": "zephyr_Kconfig",
     f"{ARDUINO}/library.properties": "library.properties",
     f"{ARDUINO}/library.json": "library.json",
     f"{IDF}/CMakeLists.txt": "component_CMakeLists.txt",
@@ -40,7 +48,9 @@ _TEMPLATES = {
 
 
 def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
-    """Add README, Arduino library and ESP-IDF component to an export folder; ``facts`` default to its ``export.json``.
+    """Add README, Arduino library, ESP-IDF component, CMake project and Zephyr module to an export folder.
+
+    ``facts`` default to its ``export.json``.
 
     The library and the model are copied from the folder. Existing files are overwritten.
 
@@ -54,64 +64,92 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
     facts = read_facts(out) if facts is None else facts
     bundle = Bundle.load(out / BUNDLE)
     rendered = firmware(bundle.layout, bundle.scaler, facts)
-    header = (out / LIBRARY[0]).read_text(encoding="utf-8")
-    licence = (files("plushsense.deploy") / "c" / LICENCE).read_text(encoding="utf-8")
+    name = str(facts.get("name", ""))
+    header = (out / prefixed(LIBRARY[0], name)).read_text(encoding="utf-8")
+    c_folder = files("plushsense.deploy") / "c"
+    licence = (c_folder / LICENCE).read_text(encoding="utf-8")
     simulated = " SIMULATION: trained on a virtual toy." if facts["simulated"] else ""
     paragraph = (
         f"Model {facts['title']}: {facts['classes']} gestures from {len(facts['channels'])} channels "
         f"(layout {facts['layout']}), an answer every {facts['step_ms']:g} ms.{simulated}"
     )
     values = {
-        "version": facts["code_version"],
+        "version": facts["model_version"],
+        "url": facts.get("url", NO_PAGE),
+        **_folders(name),
         "author": "The PlushSense developers",
         "sentence": "What a soft toy feels: a small streaming network in whole numbers.",
         "paragraph": paragraph.replace("\n", " "),
     }
     texts = {
         "README.md": handbook(bundle, facts),
+        **{f"{folder}/README.md": _fill("templates/package_README.md", **values) for folder in (ARDUINO, IDF)},
         **{f"{folder}{LICENCE}": licence for folder in ("", f"{ARDUINO}/", f"{IDF}/")},
         **{path: _fill(f"templates/{name}", **values) for path, name in _TEMPLATES.items()},
         f"{ARDUINO}/keywords.txt": _keywords(header + rendered["plush_wire.h"]),
         f"{SKETCH}/PlushToy.ino": rendered["PlushToy.ino"],
         f"{IDF_EXAMPLE}/main/main.c": rendered["main.c"],
     }
-    for name in _WIRE:
-        texts |= {f"{ARDUINO}/src/{name}": rendered[name], f"{IDF}/{_component_path(name)}": rendered[name]}
-    for name in _EXAMPLE:
-        texts |= {f"{SKETCH}/{name}": rendered[name], f"{IDF_EXAMPLE}/main/{name}": rendered[name]}
-    contents = {name: text.encode() for name, text in texts.items()}
-    contents |= {copy: (out / original).read_bytes() for copy, original in copies().items()}
+    texts |= {f"{TWO_SLOTS}/{f}": (c_folder / "two_slots" / f).read_text(encoding="utf-8") for f in _UPDATE}
+    for file in _WIRE:
+        texts |= {f"{ARDUINO}/src/{file}": rendered[file], f"{IDF}/{_component_path(file)}": rendered[file]}
+    for file in _EXAMPLE:
+        texts |= {f"{SKETCH}/{file}": rendered[file], f"{IDF_EXAMPLE}/main/{file}": rendered[file]}
+    contents = {_named_path(file, name): prefixed(text, name).encode() for file, text in texts.items()}
+    contents |= {copy: (out / original).read_bytes() for copy, original in copies(name).items()}
     written = []
-    for name, content in contents.items():
-        path = out / name
+    for file, content in contents.items():
+        path = out / file
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
         written.append(path)
     return written
 
 
-def copies() -> dict[str, str]:
-    """Return the files of the packages that are copies, mapped to their originals, relative to the export folder."""
-    names = (*LIBRARY, *MODEL)
-    return {f"{ARDUINO}/src/{n}": n for n in names} | {f"{IDF}/{_component_path(n)}": n for n in names}
+def copies(name: str = "") -> dict[str, str]:
+    """Return the files of the packages that are copies, mapped to their originals, relative to the export folder.
+
+    ``name`` is that of the export.
+    """
+    files = (*LIBRARY, *MODEL)
+    found = {f"{ARDUINO}/src/{f}": f for f in files} | {f"{IDF}/{_component_path(f)}": f for f in files}
+    return {_named_path(copy, name): prefixed(original, name) for copy, original in found.items()}
+
+
+def _named_path(path: str, name: str) -> str:
+    """Return the path of a file of the packages in an export with a name: also the packages are called by it."""
+    folders = _folders(name)
+    for plain, named in ((ARDUINO, f"arduino/{folders['library']}"), (IDF, f"esp-idf/{folders['component']}")):
+        if path.startswith(f"{plain}/"):
+            path = path.replace(plain, named, 1)
+    return prefixed(path, name)
+
+
+def _folders(name: str) -> dict[str, str]:
+    """Return what the Arduino library and the ESP-IDF component of an export with this name are called."""
+    return {
+        "library": f"{name}_plush" if name else ARDUINO.split("/")[1],
+        "component": f"{name}_plushsense" if name else IDF.split("/")[1],
+    }
 
 
 def changed_copies(out: Path) -> list[str]:
     """Return the copies in an export folder that differ from their originals, since only these are verified."""
     return [
         copy
-        for copy, original in copies().items()
+        for copy, original in copies(str(read_facts(out).get("name", ""))).items()
         if (out / copy).is_file() and (out / copy).read_bytes() != (out / original).read_bytes()
     ]
 
 
 def handbook(bundle: Bundle, facts: Mapping[str, Any]) -> str:
-    """Render the README in Markdown from the ``facts`` (of ``export.json``) and the bundle."""
+    """Render the README in Markdown from the ``facts`` (of ``export.json``) and the bundle, not yet `prefixed`."""
     layout = bundle.layout
     ranges = layout.valid_min_int.tolist(), layout.valid_max_int.tolist()
     return _fill(
         "templates/README.md",
         facts=facts,
+        **_folders(str(facts.get("name", ""))),
         channels=list(zip(layout.channels, c_names(layout.names), *ranges, strict=True)),
         provenance=bundle.provenance,
         personal=bundle.personal,

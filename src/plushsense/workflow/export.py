@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -11,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ArchError, BadInput, BundleError
+from plushsense.core.errors import ArchError, BadInput, BundleError, ConfigError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.convert import CONVERTERS, check_format, convert
-from plushsense.deploy.emit import IMAGE, ExportResult, emit, read_facts
+from plushsense.deploy.emit import IMAGE, ExportResult, check_model_version, check_name, emit, read_facts
 from plushsense.deploy.package import package
 from plushsense.deploy.quantize import calibrated, integer_model, refuse_undeployable
 from plushsense.models.bundle import Bundle
@@ -108,6 +109,9 @@ def export(
     dataset: Dataset | str | os.PathLike[str] | None = None,
     step_s: float | None = None,
     also: Sequence[str] = (),
+    name: str = "",
+    model_version: str = "",
+    url: str = "",
     warn: Warn = silent,
 ) -> ExportResult:
     """Write the files that a toy needs to run a bundle's network: C99, the model as data, golden vectors, packages.
@@ -119,15 +123,23 @@ def export(
         dataset: the data set of the training, to calibrate on; required if the bundle has no calibration.
         step_s: seconds from one decision of a window network to the next; by default those of the bundle.
         also: formats for other runtimes (`plushsense.deploy.convert.CONVERTERS`), such as ``onnx``.
+        name: prefix of all names in the C code, its files and packages, so that several exports link into one program.
+        model_version: version of the model, for the manifests and the C code; by default that in the bundle, or that
+            of PlushSense.
+        url: web page of the model, for the manifests; by default an address that leads nowhere.
         warn: called with a sentence for everything unusual.
 
     Raises:
         ArchError: for a network that cannot be deployed; the message suggests the nearest one that can. Also for a
             ``step_s`` longer than the window, or for a streaming network, whose pooling is made for its own step.
         BundleError: for a bundle without calibration, or a conversion whose output differs from the network's.
-        ConfigError, MissingExtraError: for an unknown format, or one whose package is not installed.
+        ConfigError, MissingExtraError: for an unknown format, or one whose package is not installed; for a name,
+            version or address that is not accepted.
         BadInput: for a folder that is not empty.
     """
+    check_name(name)
+    if url and not re.fullmatch(r"https?://[^\s\"'\\]+", url):
+        raise ConfigError(f"'{url}' is no address of a web page: accepted is one that begins with http:// or https://.")
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
     if step_s is not None:
         given = _with_step(given, step_s)
@@ -138,22 +150,26 @@ def export(
             windows = training_windows(given, dataset, warn)
             windows = windows[:: -(-len(windows) // _TRIED)]
         given = calibrated_on(given, dataset, warn if windows is None else silent)
+    if model_version:
+        check_model_version(model_version)
+        given = replace(given, provenance=given.provenance | {"model_version": model_version})
     model = integer_model(given)
     given = given.without_people()
 
     def converted(folder: Path, facts: dict[str, Any]) -> None:
-        for name in dict.fromkeys(also):
-            done = convert(given, folder / CONVERTERS[name].file_name, name, windows=windows)
-            facts.setdefault("conversions", {})[name] = {
+        facts |= {"url": url} if url else {}
+        for other in dict.fromkeys(also):
+            done = convert(given, folder / CONVERTERS[other].file_name, other, windows=windows)
+            facts.setdefault("conversions", {})[other] = {
                 "file": done.path.name,
                 "bytes": done.bytes,
                 "largest_difference": done.largest_difference,
                 "notes": list(done.notes),
             }
 
-    for name in also:
-        check_format(name)
-    return emit(model, given, Path(out), extras=[converted, package])
+    for other in also:
+        check_format(other)
+    return emit(model, given, Path(out), extras=[converted, package], name=name)
 
 
 def _with_step(bundle: Bundle, step_s: float) -> Bundle:

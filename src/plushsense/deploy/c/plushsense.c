@@ -1952,6 +1952,11 @@ PLUSH_SMALL plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32
     return PLUSH_OK;
 }
 
+PLUSH_SMALL uint32_t plush_model_id(const plush_toy *toy)
+{
+    return toy->memory != NULL ? word_at(toy->ranges - SHAPE_BYTES - 4) : 0;
+}
+
 PLUSH_SMALL plush_status plush_patch(plush_toy *toy, const uint8_t *patch, uint32_t patch_bytes)
 {
     uint32_t scales = SCALE_BYTES * toy->classes, weights = (uint32_t)toy->classes * toy->features;
@@ -1970,7 +1975,7 @@ PLUSH_SMALL plush_status plush_patch(plush_toy *toy, const uint8_t *patch, uint3
         from.at = layer;
         from.left = weights + scales;
         if (word_at(patch + 8) != HEAD_BYTES + 4 + from.left ||
-            word_at(patch + HEAD_BYTES) != word_at(toy->ranges - SHAPE_BYTES - 4))
+            word_at(patch + HEAD_BYTES) != plush_model_id(toy))
             return PLUSH_OTHER_MODEL;
         if (next_scales(&from, toy->classes) == NULL)
             return PLUSH_DAMAGED;

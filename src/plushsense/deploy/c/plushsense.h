@@ -248,6 +248,10 @@ void plush_restart(plush_toy *toy);
 const char *plush_gesture_name(const plush_toy *toy, uint8_t gesture);
 const char *plush_model_title(const plush_toy *toy);
 
+/* Which model is running: the CRC-32 in the head of its image, as PLUSH_MODEL_ID says it of the model in plush_model.c; 0
+ * for none. A patch does not change it. */
+uint32_t plush_model_id(const plush_toy *toy);
+
 #ifdef __cplusplus
 }
 #endif

@@ -15,7 +15,17 @@ from plushsense.core.errors import BadInput, ConfigError, nearest
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.store import Dataset
-from plushsense.deploy.emit import BUNDLE, FACTS, GOLDEN, IMAGE, LIBRARY, code_files, read_facts
+from plushsense.deploy.emit import (
+    BUNDLE,
+    FACTS,
+    GOLDEN,
+    IMAGE,
+    LIBRARY,
+    code_files,
+    prefixed,
+    read_facts,
+    without_prefix,
+)
 from plushsense.deploy.golden import COLUMNS, HEAD, TRACKING, answers_of, column, golden_frames, read_golden
 from plushsense.deploy.proof.scenarios import scenarios_of
 from plushsense.deploy.quantize import integer_model
@@ -129,7 +139,7 @@ def counted(streams: Sequence[Vectors]) -> tuple[Counts, ...]:
 
 
 class Export:
-    """Export folder, opened for verification.
+    """Export folder, opened for verification. The C of an export with a name is compiled without its prefix.
 
     ``changed`` names the library and model files that differ from what this version writes for the bundle.
 
@@ -149,9 +159,12 @@ class Export:
             raise BadInput(f"'{self.folder / FACTS}' has the smoothing {smoothing!r}: export the model again.")
         self.model: IntegerModel = replace(model, smoothing=smoothing)
         self._code = code_files(self.model, self.bundle)
-        files = {name: self._require_file(name).read_bytes() for name in self._code}
-        self.changed = tuple(name for name, content in self._code.items() if files[name] != content)
-        self.image, self.source = files[IMAGE], files[LIBRARY[1]]
+        name = str(facts.get("name", ""))
+        files = {file: self._require_file(prefixed(file, name)).read_bytes() for file in self._code}
+        expected = {f: c if f == IMAGE else prefixed(c.decode(), name).encode() for f, c in self._code.items()}
+        self.changed = tuple(prefixed(file, name) for file in files if files[file] != expected[file])
+        self._files = {f: c if f == IMAGE else without_prefix(c, name) for f, c in files.items()} if name else None
+        self.image, self.source = files[IMAGE], without_prefix(files[LIBRARY[1]], name)
         self._scenarios: dict[int, list[Vectors]] = {}
         arch = self.model.network.arch
         frames, answers = read_golden(self.folder / GOLDEN, len(self.model.layout.channels), arch.classes)
@@ -188,15 +201,16 @@ class Export:
             )
 
     def code(self, room: Path) -> Path:
-        """Return the folder to compile from: the new folder ``room``, or the export itself if files in it were changed.
+        """Return the folder to compile from: the new folder ``room``, or the export itself if files in it were changed
+        and it has no name.
 
         Unchanged files are written to ``room``, so that the compiler finds no other file of the export, such as a
         ``string.h`` or a precompiled header.
         """
-        if self.changed:
+        if self.changed and self._files is None:
             return self.folder
         room.mkdir(parents=True)
-        for name, content in self._code.items():
+        for name, content in (self._files or self._code).items():
             (room / name).write_bytes(content)
         return room
 
