@@ -24,7 +24,7 @@ from support.fakes import AFFECTS, LABELS, Memory, Oracle, misshapen, refuses, s
 
 KEYS = {
     "split", "context", "train_context", "leaky", "seeds", "accuracy", "macro_f1", "macro_recall",
-    "macro_f1_all_classes", "over", "by_recording", "pooled", "per_class", "confusion", "confusion_affect",
+    "macro_f1_all_classes", "with_rest", "over", "by_recording", "pooled", "per_class", "confusion", "confusion_affect",
     "by_context", "nobody", "folds", "subjects", "histories", "predictions", "leakage",
 }  # fmt: skip
 
@@ -47,6 +47,10 @@ def test_every_figure_of_a_subject_wise_evaluation(tmp_path: Path) -> None:
     assert table["macro_f1"]["mean"] == pytest.approx(5 / 6)
     # Over all classes nobody's rest counts in its fold: P01's has F1 0.5 there (two windows, six read as rest).
     assert table["macro_f1_all_classes"]["mean"] == pytest.approx((5 + (0.5 + 0 + 0) / 3) / 6)
+    # As the paper: over the folds, with the two windows of rest in each, and over all classes.
+    assert table["with_rest"]["accuracy"]["mean"] == pytest.approx((5 + 2 / 10) / 6)
+    assert table["with_rest"]["macro_recall"]["mean"] == pytest.approx((5 + (1 + 0 + 0) / 3) / 6)
+    assert table["with_rest"]["macro_f1"] == table["macro_f1_all_classes"]
     assert table["pooled"]["accuracy"] == pytest.approx((20 * 2 + 12) / (24 * 2 + 12))
     assert table["confusion"] == {"labels": list(LABELS), "counts": [[12, 0, 0], [0, 20, 4], [4, 0, 20]]}
     assert table["confusion_affect"]["labels"] == list(AFFECTS)

@@ -63,6 +63,9 @@ def lines(e: dict[str, Any]) -> list[str]:
     rest = e["nobody"] if units == "subjects" else None
     if rest:
         out.append(f"without recordings at rest: {rest['recordings']} recordings, accuracy {figure(rest['accuracy'])}")
+    if rest and (whole := e.get("with_rest")):
+        scores = ", ".join(f"{name} {spread(whole[key])}" for key, name in names.items() if key in whole)
+        out.append(f"with them, over all classes and {len(e['folds'])} folds, as the paper: {scores}")
     for title, of in (("vote by recording", e["by_recording"]), ("pooled", e["pooled"])):
         scores = ", ".join(f"{name} {figure(of[k])}" for k, name in names.items())
         out.append(f"{title}{', with recordings at rest' if rest and title == 'pooled' else ''}: {scores}")

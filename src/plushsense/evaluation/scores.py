@@ -168,13 +168,21 @@ def compute_scores(
     of_fold = [predictions.fold == fold.name for fold in folds]
     of_person = [predictions.subject == person for person in people_codes]
     parts = [scorer.figures(m) for m in (of_person if apart else [m & counted for m in of_fold])]
-    # The paper averages over all 18 classes, including recordings of nobody (the toy at rest).
-    all_classes = [metrics.macro_f1(scorer.counts(m), all_classes=True) for m in of_fold]
+    # The paper averages over its folds and all 18 classes, including recordings of nobody (the toy at rest).
+    whole = [scorer.counts(m) for m in of_fold]
+    all_classes = metrics.summary([metrics.macro_f1(c, all_classes=True) for c in whole])
     everything = scorer.counts(np.ones(len(people), dtype=np.bool_))
     affect_names, by_affect = metrics.grouped(everything, affects)
     return {
         **{name: metrics.summary([f[name] for f in parts]) for name in metrics.METRICS},
-        "macro_f1_all_classes": metrics.summary(all_classes),
+        "macro_f1_all_classes": all_classes,
+        "with_rest": None
+        if people.all()
+        else {
+            "accuracy": metrics.summary([metrics.METRICS["accuracy"].function(c) for c in whole]),
+            "macro_recall": metrics.summary([metrics.macro_recall(c, all_classes=True) for c in whole]),
+            "macro_f1": all_classes,
+        },
         "over": "subjects" if apart else "folds",
         "by_recording": scorer.by_recording(counted),
         "pooled": _plain(metrics.scores_of(everything)),

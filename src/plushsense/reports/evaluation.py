@@ -152,10 +152,15 @@ def comparison_rows(evaluations: Sequence[Mapping[str, Any]]) -> list[dict[str, 
 
 
 def metric_table(evaluation: Mapping[str, Any]) -> Table:
-    """Return one row for each metric. The paper's macro-F1 over all classes is averaged over folds in any split."""
+    """Return one row for each metric. The paper's, with recordings at rest, are averaged over folds in any split."""
     names = {key: f"{m.title} ({m.note})" if m.note else m.title for key, m in METRICS.items()}
     folds = wording.count_of(evaluation, "folds")
     names["macro_f1_all_classes"] = f"Macro-F1, all classes (as the paper), over {folds}"
+    whole = evaluation.get("with_rest") or {}
+    for key, what in (("accuracy", "Accuracy"), ("macro_recall", "Macro recall, all classes")):
+        if key in whole:
+            names[f"{key}_with_rest"] = f"{what}, with recordings at rest (as the paper), over {folds}"
+            evaluation = {**evaluation, f"{key}_with_rest": whole[key]}
     pooled, recordings = evaluation.get("pooled") or {}, evaluation.get("by_recording") or {}
     columns = (
         Column("name", "Metric"),

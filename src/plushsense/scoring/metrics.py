@@ -215,9 +215,16 @@ def class_rows(counts: Counts, labels: Sequence[str]) -> list[dict[str, Any]]:
     ]
 
 
-def macro_recall(counts: Counts) -> float:
-    """Return the mean recall of the classes that occur in the truth; NaN if there are none."""
-    return _mean(class_scores(counts).recall[counts.sum(axis=1) > 0])
+def macro_recall(counts: Counts, all_classes: bool = False) -> float:
+    """Return the mean recall of the classes that occur in the truth; NaN if there are none.
+
+    Args:
+        all_classes: as for `macro_f1`.
+    """
+    recall = class_scores(counts).recall
+    if not all_classes:
+        return _mean(recall[counts.sum(axis=1) > 0])
+    return _mean(recall) if counts.sum() else float("nan")
 
 
 def macro_f1(counts: Counts, all_classes: bool = False) -> float:
