@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
 def lines(e: dict[str, Any]) -> list[str]:
     """Format the scores of an evaluation as text: a row for each person, then the means."""
     from plushsense.reports.wording import describe_leakage
-    from plushsense.scoring.metrics import column_metrics
+    from plushsense.scoring.metrics import METRICS, column_metrics
 
     names = {key: metric.name for key, metric in column_metrics().items()}
     out = marks(e)
@@ -64,7 +64,7 @@ def lines(e: dict[str, Any]) -> list[str]:
     if rest:
         out.append(f"without recordings at rest: {rest['recordings']} recordings, accuracy {figure(rest['accuracy'])}")
     if rest and (whole := e.get("with_rest")):
-        scores = ", ".join(f"{name} {spread(whole[key])}" for key, name in names.items() if key in whole)
+        scores = ", ".join(f"{METRICS[key].name} {spread(of)}" for key, of in whole.items())
         out.append(f"with them, over all classes and {len(e['folds'])} folds, as the paper: {scores}")
     for title, of in (("vote by recording", e["by_recording"]), ("pooled", e["pooled"])):
         scores = ", ".join(f"{name} {figure(of[k])}" for k, name in names.items())
