@@ -168,9 +168,11 @@ def _release_memory() -> Callable[[], None]:
 
     def release() -> None:
         nonlocal scheduled
-        if not scheduled:
-            scheduled = True
-            asyncio.get_running_loop().call_later(_COLLECT_S, collect)
+        # Pages may also be deleted while the server ends, without a running loop.
+        with contextlib.suppress(RuntimeError):
+            if not scheduled:
+                asyncio.get_running_loop().call_later(_COLLECT_S, collect)
+                scheduled = True
 
     return release
 
