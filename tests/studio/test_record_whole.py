@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -15,11 +15,8 @@ from plushsense.devices.virtual.session import GESTURES
 from plushsense.recording.session_files import SESSION_LOG, SessionHead, read_events
 from support.browsing import connected, marked
 from support.pty_toys import check_whole, pty_toy, recordings
-from support.recording_pages import showing
+from support.recording_pages import showing, start_recording
 from support.waiting import until
-
-if TYPE_CHECKING:
-    from playwright.sync_api import Page
 
 Fixture = Callable[..., Any]
 pytestmark = pytest.mark.usefixtures("pty_possible")
@@ -27,16 +24,9 @@ SPEED = 20.0
 RELOADED, KILLED = 17, 34
 
 
-def begin(page: Page, number: int) -> None:
-    """Start a recording by the space bar."""
-    showing(page, f"idle.{number}.")
-    page.keyboard.press("Space")
-    showing(page, f"recording.{number}.")
-
-
-def recording_begun(folder: Path) -> bool:
-    """Whether the last line of the log says that a recording began."""
-    return [e.kind for e in read_events(folder)][-1] == "start"
+def logged(folder: Path) -> list[str]:
+    """What the log says so far."""
+    return [e.kind for e in read_events(folder)]
 
 
 def test_51_recordings_by_the_space_bar(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:
@@ -51,17 +41,22 @@ def test_51_recordings_by_the_space_bar(studio: Fixture, look: Fixture, shots: F
         marked(page, "begin").click()
         page.wait_for_url("**/record?session=S01/1")
         connected(page)
+        killed = False
         for number in range(51):
-            begin(page, number)
+            runs = start_recording(page, number)
             if number == RELOADED:
                 page.reload()
                 connected(page)
                 # It went on all the while; only a slow machine lets it end by itself.
                 if showing(page, "recording.", "idle.").startswith("idle."):
                     continue
-            elif number == KILLED:
+            elif number >= KILLED and not killed and runs:
                 # The page shows the recording before the background thread has written its start to the log.
-                until(lambda: recording_begun(folder))
+                until(lambda: logged(folder).count("start") > number)  # noqa: B023
+                if logged(folder)[-1] != "start":
+                    # A slow machine let it end by itself: another one is interrupted.
+                    continue
+                killed = True
                 server.kill()
                 server.start()
                 # The page comes back by itself and offers to go on.
@@ -69,8 +64,9 @@ def test_51_recordings_by_the_space_bar(studio: Fixture, look: Fixture, shots: F
                 page.wait_for_selector('[data-test="state-box"]')
                 connected(page)
                 assert "interrupted" in marked(page, "notice").first.inner_text()
-                begin(page, number)
-            page.keyboard.press("Space")
+                runs = start_recording(page, number)
+            if runs:
+                page.keyboard.press("Space")
             showing(page, f"idle.{number + 1}.", "finished.")
         showing(page, "finished.50.51.0.0")
         assert marked(page, "progress").inner_text() == "51 of 51 recorded"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ from support.pty_toys import QUIET
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
+_PRESSES, _PRESSED_MS = 20, 5_000.0
 CALM = "virtual://?person=7&lost=0&garbled=0&glitch=0"
 """A virtual toy that loses nothing."""
 
@@ -43,14 +45,33 @@ def tcp_toy(port: int = 0, speed: float = 1.0, layout: str = "plush-15", spec: T
         thread.join(15)
 
 
-def showing(page: Page, *starts: str) -> str:
-    """Wait until the page shows one of these states, such as ``idle.3.``; what it shows."""
+def showing(page: Page, *starts: str, limit_ms: float | None = None) -> str:
+    """Wait until the page shows one of these states, such as ``idle.3.``; what it shows. None: the page's own limit."""
     found = page.wait_for_function(
         "starts => { const at = document.querySelector('[data-seen]'); const seen = at ? at.dataset.seen : '';"
         " return starts.some(s => seen.startsWith(s)) ? seen : null }",
         arg=list(starts),
+        timeout=limit_ms,
     )
     return str(found.json_value())
+
+
+def start_recording(page: Page, number: int) -> bool:
+    """Press the space bar until this step is recorded, and return whether it still is.
+
+    On a slow machine the toy may not be heard at the moment of a press, which is then answered with a sentence only,
+    and the recording may end by itself before it is seen.
+    """
+    from playwright.sync_api import TimeoutError as TooSlow
+
+    showing(page, f"idle.{number}.")
+    for _ in range(_PRESSES):
+        page.keyboard.press("Space")
+        # A second press, for an outdated display, is refused by the page.
+        with contextlib.suppress(TooSlow):
+            begun = f"recording.{number}.", f"idle.{number + 1}.", "finished."
+            return showing(page, *begun, limit_ms=_PRESSED_MS).startswith("recording.")
+    raise AssertionError(f"step {number} does not begin")
 
 
 def heard(page: Page) -> None:

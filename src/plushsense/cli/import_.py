@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from plushsense.cli.options import options
-from plushsense.cli.output import emit, say
+from plushsense.cli.output import emit, plural, say
 from plushsense.core.errors import ConfigError
 from plushsense.jobs.progress import ProgressReporter
 
@@ -55,8 +55,9 @@ def run(args: argparse.Namespace) -> int:
     emit(
         args,
         result,
-        f"{args.dest}: {done.recordings} recordings of {done.subjects} people{new}, {len(done.gestures)} gestures, "
-        f"{done.streams} streams; {len(result['warnings'])} warnings, {len(done.rejected)} files rejected; "
+        f"{args.dest}: {plural(done.recordings, 'recording')} of {done.subjects} people{new}, "
+        f"{plural(len(done.gestures), 'gesture')}, {plural(done.streams, 'stream')}; "
+        f"{plural(len(result['warnings']), 'warning')}, {plural(len(done.rejected), 'file')} rejected; "
         f"{done.seconds:.1f} s",
     )
     return 0

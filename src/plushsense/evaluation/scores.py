@@ -177,7 +177,7 @@ def compute_scores(
         **{name: metrics.summary([f[name] for f in parts]) for name in metrics.METRICS},
         "macro_f1_all_classes": all_classes,
         "with_rest": None
-        if people.all()
+        if people.all() or not apart
         else {
             "accuracy": metrics.summary([metrics.METRICS["accuracy"].function(c) for c in whole]),
             "macro_recall": metrics.summary([metrics.macro_recall(c, all_classes=True) for c in whole]),

@@ -156,11 +156,9 @@ def metric_table(evaluation: Mapping[str, Any]) -> Table:
     names = {key: f"{m.title} ({m.note})" if m.note else m.title for key, m in METRICS.items()}
     folds = wording.count_of(evaluation, "folds")
     names["macro_f1_all_classes"] = f"Macro-F1, all classes (as the paper), over {folds}"
-    whole = evaluation.get("with_rest") or {}
-    for key, what in (("accuracy", "Accuracy"), ("macro_recall", "Macro recall, all classes")):
-        if key in whole:
-            names[f"{key}_with_rest"] = f"{what}, with recordings at rest (as the paper), over {folds}"
-            evaluation = {**evaluation, f"{key}_with_rest": whole[key]}
+    names["accuracy_with_rest"] = f"Accuracy, with recordings at rest (as the paper), over {folds}"
+    names["macro_recall_with_rest"] = f"Macro recall, all classes, with recordings at rest (as the paper), over {folds}"
+    evaluation = {**evaluation, **{f"{key}_with_rest": of for key, of in (evaluation.get("with_rest") or {}).items()}}
     pooled, recordings = evaluation.get("pooled") or {}, evaluation.get("by_recording") or {}
     columns = (
         Column("name", "Metric"),
