@@ -1,4 +1,4 @@
-"""Read TOML files, and JSON, strictly: refuse unknown keys, and values whose type is not that of the dataclass field.
+"""Read TOML files strictly: refuse unknown keys, and values whose type is not that of the dataclass field; read JSON.
 
 `cattrs` creates the dataclasses; this module sets the rules (the only conversion is from whole number to float) and
 formats the error messages.

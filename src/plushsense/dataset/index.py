@@ -159,7 +159,10 @@ def _is_stream_of(info: StreamInfo, files: Mapping[str, int]) -> bool:
 
 
 def _is_recording_of(info: RecordingInfo, files: Mapping[str, int], streams: Mapping[str, StreamInfo]) -> bool:
-    """Do the same as `_is_stream_of` for a recording, in a file of its own or in one of ``streams``, by id."""
+    """Return whether a row describes a recording with values in range, like `_is_stream_of`.
+
+    Its file is one of its own, or that of one of the ``streams`` (by id).
+    """
     part_of = info.file.startswith(f"{STREAMS}/")
     stream = streams.get(info.stream)
     home = info.stream if part_of else _stem(info.file, RECORDINGS)
