@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import urllib.error
 import urllib.request
 from pathlib import Path
 
@@ -14,10 +15,19 @@ import pytest
 pytest.importorskip("nicegui")
 
 PAGE = """
-from nicegui import ui
+import asyncio
+import sys
+from nicegui import context, ui
+from plushsense.studio.app.shell import query
 
-def show(page):
+async def show(page):
     ui.label(page.words("hello.greeting"))
+    if "leave" in query():
+        context.client.delete()
+        try:
+            await asyncio.sleep(0)
+        finally:
+            print("left", isinstance(sys.exc_info()[1], asyncio.CancelledError), flush=True)
 """
 TEXTS = """
 [pages]
@@ -55,7 +65,11 @@ def test_a_page_is_one_folder_and_one_line(tmp_path: Path) -> None:
                 hello = answer.read().decode()
             with urllib.request.urlopen(url, timeout=120) as answer:
                 home = answer.read().decode()
+            with pytest.raises(urllib.error.HTTPError, match="500"):
+                urllib.request.urlopen(f"{url}hello?leave=1", timeout=120)
+            left = studio.stdout.readline()
         finally:
             studio.terminate()
     assert "A page of its own" in hello and "Greetings from a new page" in hello
     assert "/hello" in home
+    assert left == "left True\n", "a page that was left is still being built"

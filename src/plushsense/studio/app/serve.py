@@ -201,9 +201,15 @@ def _page(workspace: Workspace, name: str) -> Callable[[], Any]:
     """Return a function that builds the page ``name``; it imports the module of the page on the first visit."""
 
     async def build() -> None:
+        from nicegui import context
+
         from plushsense.studio.app.shell import frame
 
         module = importlib.import_module(f"plushsense.studio.pages.{name}.page")
+        task = asyncio.current_task()
+        assert task is not None
+        # Stop building a page that was left meanwhile: the elements to which it would add others are deleted.
+        context.client.on_delete(lambda: task.cancel())
         with frame(workspace, name) as page:
             built = module.show(page)
             if inspect.isawaitable(built):
