@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BadInput, BundleError
 from plushsense.models.arch import Arch, ConvLayer
 from plushsense.runtime.image import IntegerModel
-from plushsense.runtime.integer import IntegerLayer, IntegerNetwork
+from plushsense.runtime.integer import IntegerLayer, IntegerNetwork, rounded_weights
 from support.integers import INT32, any_network, models, plain_model, window_model
 
 
@@ -55,6 +55,20 @@ def test_a_window_and_a_stream_agree(model: IntegerModel, seed: int) -> None:
     stepper.reset()
     again = stepper.push(x)
     assert np.array_equal(again, got)
+
+
+def test_the_rounding_errors_of_a_kernel_never_add_up() -> None:
+    w = np.random.default_rng(1).uniform(-126, 126, size=(30, 20, 9))
+    assert (np.abs(np.cumsum(rounded_weights(w) - w, axis=2)) < 0.5 + 1e-9).all()
+    assert np.array_equal(rounded_weights(w[:, :, 0]), np.rint(w[:, :, 0])), "the dense layer carries none"
+
+
+def test_weights_at_the_edge_stay_within_it() -> None:
+    w = np.array([[[126.6, 127.0, 127.0, 126.0], [-126.6, -127.0, -127.0, 0.0]]])
+    assert rounded_weights(w).tolist() == [[[127, 127, 127, 126], [-127, -127, -127, 0]]]
+    assert rounded_weights(-w).tolist() == [[[-127, -127, -127, -126], [127, 127, 127, 0]]]
+    w = np.array([[[126.4, 127.0, 127.0, 125.2]]])
+    assert rounded_weights(w).tolist() == [[[126, 127, 127, 126]]], "what does not fit is carried further"
 
 
 def first_of(network: IntegerNetwork, x: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -36,8 +36,8 @@ def spoilt(network: Arch) -> Weights:
     """Two channels that are nearly the same get large weights of opposite sign, which cancel but fill the 8 bits."""
     weights = random_weights(network, 3)
     first = weights["conv0.weight"]
-    first[:, 0, 0] += 6.0
-    first[:, 1, 0] -= 6.0
+    first[:, 0, 0] += 60.0
+    first[:, 1, 0] -= 60.0
     return weights
 
 

@@ -4,9 +4,10 @@ Folding is exact, also where a layer reads reflected samples: each normalisation
 layer, the last one into those of the dense layer. `calibrate` measures the 8-bit ranges of inputs and activations, on
 windows of the training people only.
 
-The bias of each layer compensates the mean error caused by the rounding of its weights, which is computed from the mean
-input. Input codes lie around 128, by which a weight's error is multiplied; so on makeability this lowers the share of
-windows on which int8 and float disagree from 4 % to 1.5 %.
+Two measures reduce the error of the rounded weights, the largest one, at no cost in the toy: the rounding error of each
+tap is carried to the next (`plushsense.runtime.integer.rounded_weights`), and the bias of each layer compensates the
+mean error that remains, which is computed from the mean input. On makeability's held-out people the error of the logits
+falls from 2.0–4.3 % of their spread (bias alone, no headroom of the ranges) to 0.8–1.6 %.
 """
 
 from __future__ import annotations
@@ -34,14 +35,14 @@ from plushsense.runtime.fixed import (
     split_ratio,
 )
 from plushsense.runtime.image import IntegerModel
-from plushsense.runtime.integer import IntegerDense, IntegerLayer, IntegerNetwork, deployable
+from plushsense.runtime.integer import IntegerDense, IntegerLayer, IntegerNetwork, deployable, rounded_weights
 from plushsense.runtime.vectors import AXIS_LIMIT, MOST_AXIS_SHIFT, IntegerVectors, down_for
 from plushsense.windows.features import Scaler
 
 Floats = NDArray[np.float64]
 
 # Part of the key of stored results: increase it when the same windows and weights give other integers.
-QUANTIZE_VERSION = 1
+QUANTIZE_VERSION = 2
 
 _BATCH = 16  # windows
 
@@ -49,6 +50,9 @@ _BATCH = 16  # windows
 # steps. Chosen on 5 of makeability's 27 folds, by the smallest change of the outputs (Kullback-Leibler, 5e-4).
 _INPUTS_OUTSIDE = 1e-4
 _OUTSIDE = 1e-5
+# What the ranges of activations leave for new people. Chosen on makeability's training people, with the ranges of one
+# half and the windows of the other.
+_HEADROOM = 1.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +118,7 @@ def calibrate(network: Network, x: NDArray[np.floating[Any]]) -> Ranges:
         for values, z in zip(activations, network.rectified(x[at : at + _BATCH]), strict=True):
             values.append(z.reshape(-1, z.shape[2]))
     rows = [np.concatenate(values) for values in activations]
-    tops = tuple(np.quantile(row, 1 - _OUTSIDE, axis=0) for row in rows)
+    tops = tuple(_HEADROOM * np.quantile(row, 1 - _OUTSIDE, axis=0) for row in rows)
     inputs = np.asarray(first.mean(axis=(0, 2), dtype=np.float64))
     return Ranges(low, high, tops, (inputs, *(row.mean(axis=0) for row in rows)), axes)
 
@@ -213,14 +217,14 @@ def _codes(mean: Floats, start: Floats, unit: Floats) -> Floats:
 
 
 def _eight_bits(w: Floats, b: Floats, mean_input: Floats) -> tuple[NDArray[np.int8], NDArray[np.int64], Floats]:
-    """Quantize weights (F, C, …) and biases (F,) per filter: the largest weight becomes ±127.
+    """Quantize weights (F, C, K) or (F, C) and biases (F,) per filter: the largest weight becomes ±127.
 
     ``mean_input`` (C,) is the mean input; the bias compensates the mean error of the rounded weights.
     """
     rows = np.abs(w).reshape(len(w), -1).max(axis=1)
     scale = np.maximum(np.maximum(rows / 127, np.abs(b) / (1 << 29)), 1e-30)
     scales = scale.reshape(-1, *[1] * (w.ndim - 1))
-    whole = np.rint(w / scales).astype(np.int8)
+    whole = rounded_weights(w / scales)
     mean_error = (w - whole * scales).reshape(*w.shape[:2], -1).sum(axis=2) @ mean_input
     return whole, np.rint((b + mean_error) / scale).astype(np.int64), scale
 

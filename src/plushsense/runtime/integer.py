@@ -39,6 +39,21 @@ def deployable(arch: Arch) -> bool:
     return arch.padding != "causal" and arch.norm != "layer"
 
 
+def rounded_weights(w: Floats) -> NDArray[np.int8]:
+    """Round weights (F, C, K) or (F, C), in steps of the 8 bits, to whole numbers within ±127.
+
+    The rounding error of each tap is carried to the next (error diffusion). The errors of a kernel then nearly cancel
+    for inputs that change slowly, as touch and its features do, for which errors of the same sign would add up.
+    """
+    taps = w[..., None] if w.ndim == 2 else w
+    whole, carried = np.empty(taps.shape, dtype=np.int8), np.zeros(taps.shape[:2])
+    for k in range(taps.shape[2]):
+        exact = taps[:, :, k] + carried
+        kept = np.clip(np.rint(exact), -127, 127)
+        whole[:, :, k], carried = kept, exact - kept
+    return whole.reshape(w.shape)
+
+
 @dataclass(frozen=True, eq=False)
 class IntegerLayer:
     """Integer layer: ``weights`` (F, C, K) int8, ``bias`` (F,) int32, ``scale`` from sums to 8-bit activations."""

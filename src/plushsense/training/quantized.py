@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import TrainingError
 from plushsense.models.arch import NORM_EPSILON, Arch, reflected
 from plushsense.models.net import Net, VectorNet
-from plushsense.runtime.integer import deployable
+from plushsense.runtime.integer import deployable, rounded_weights
 from plushsense.training.engine import slices, torch_threads
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
@@ -177,7 +177,8 @@ def _rounded(w: Tensor, b: Tensor, unit: Tensor, start: Tensor, mean: Tensor) ->
     per_channel = (1, -1, *[1] * (w.ndim - 2))
     scaled = w * unit.reshape(per_channel)
     step = (scaled.detach().abs().flatten(1).amax(dim=1) / 127).clamp_min(1e-30).reshape(-1, *[1] * (w.ndim - 1))
-    rounded = _straight(scaled, torch.round(scaled / step) * step)
+    whole = torch.from_numpy(rounded_weights((scaled.detach() / step).double().numpy()))
+    rounded = _straight(scaled, whole * step)
     mean_codes = torch.where(unit == 0, torch.zeros_like(unit), (mean - start) / torch.where(unit == 0, 1.0, unit))
     mean_error = (
         (scaled - rounded).flatten(2).sum(dim=2) @ mean_codes.detach()
