@@ -157,8 +157,8 @@ def repeated(weights: NDArray[np.float64], offset: float = 0.5) -> NDArray[np.in
 
     With a random ``offset`` between 0 and 1, the weight of a window is the mean of its count.
     """
-    counts = np.diff(np.floor(np.cumsum(weights) + offset).astype(np.int64), prepend=0)
-    return np.repeat(np.arange(len(weights)), counts)
+    counts = np.diff(np.floor(np.cumsum(weights) + offset), prepend=0.0)
+    return np.repeat(np.arange(len(weights)), counts.astype(np.int64))
 
 
 def _state(

@@ -404,7 +404,8 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         refuse_holes(x)
         check_classification_targets(labels)
         people, weights = people_of(groups, len(x)), weights_of(sample_weight, len(x))
-        x, labels, people, weights = (values[weights > 0.0] for values in (x, labels, people, weights))
+        some = weights > 0.0
+        x, labels, people, weights = x[some], labels[some], people[some], weights[some]
         weights = balanced_by_class(weights, labels, self.class_weight)
         classes, index = np.unique(labels, return_inverse=True)
         if len(classes) < 2:
