@@ -133,11 +133,11 @@ def test_whole_numbers_are_read_as_they_are_and_floats_finely_at_any_scale() -> 
 
 def test_short_windows_get_a_shorter_default_network_and_are_told_so() -> None:
     x, y, _ = waves()
-    with pytest.warns(UserWarning, match=r"windows of 60 samples, fewer than .* shortened to 7d1_18d1_18d2") as noted:
+    with pytest.warns(UserWarning, match=r"windows of 60 samples, fewer than .* shortened to 4_10_18") as noted:
         model = small(arch=None, filters=(4, 4, 4), epochs=1).fit(x, y)
     assert [w.filename for w in noted] == [__file__]
-    assert model.bundle_.arch.symbol == "7d1_18d1_18d2"
-    assert model.bundle_.arch.span <= 60
+    assert model.bundle_.arch.symbol == "4_10_18"
+    assert (model.bundle_.arch.receptive_field, model.bundle_.arch.span) == (30, 59)
     assert model.predict(x).shape == (60,)
     long = np.tile(x, 3)[:, :, :122]
     with warnings.catch_warnings():

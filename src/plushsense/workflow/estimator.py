@@ -41,6 +41,10 @@ _CONSTANT = 1e-12
 _BATCH = 256
 # Weights are scaled if an epoch would have fewer windows than X, or more than this many times as many.
 _MOST_REPEATS = 10.0
+# A default network that is shortened reads half of the window at a position, as the default does of 2.5 s, but at least
+# this many samples. Accuracy on makeability, 5 folds by person, 30 epochs, one seed, of half and of the whole window:
+# 0.477 and 0.457 with 100 samples, 0.388 and 0.383 with 60.
+_SHORTEST_FIELD = 16
 # The settings that are used only in training.
 _TRAINING = ("preset", "epochs", "batch", "learning_rate", "random_state")
 
@@ -311,9 +315,9 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
 
     Args:
         arch, filters, padding, norm: the network (see `Arch`). With arch None it is the default network, at the rate of
-            ``layout``; if T is less than its receptive field, its layers are shortened, with a warning. With padding
-            None the preset's is used, which for most presets is ``stream`` and requires T to be at least the receptive
-            field; ``mirror`` works with any T from 2.
+            ``layout``; if T is less than its receptive field, its layers are shortened, so that they reach over half
+            of the window, with a warning. With padding None the preset's is used, which for most presets is ``stream``
+            and requires T to be at least the receptive field; ``mirror`` works with any T from 2.
         preset, epochs, batch, learning_rate: settings of the training; None: the value of the preset.
         channels: number of channels C in rows (N, C·T); default: that of ``layout``, else 1.
         layout: a `Layout`, its name or its path, if ``X`` has the integers of `cut_windows`. Vectors are then rotated
@@ -521,16 +525,11 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
     def _network(self, channels: int, classes: int, samples: int, rate_hz: float) -> Arch:
         """Return the network for windows of (C, T); raise ArrayError if they are too short for it."""
         padding = PADDING[self.preset] if self.padding is None else self.padding
-        symbol = self.arch
-        if symbol is None:
-            default = symbol_at_rate(DEFAULT_SYMBOL, rate_hz)
-            symbol = symbol_within(default, samples)
-            if symbol != default:
-                warnings.warn(
-                    f"X has windows of {samples} samples, fewer than the default network {default} reads: it is "
-                    f"shortened to {symbol}. With arch='{symbol}' there is no warning.",
-                    stacklevel=3,
-                )
+        default = symbol_at_rate(DEFAULT_SYMBOL, rate_hz)
+        symbol = default if self.arch is None else self.arch
+        shortened = self.arch is None and symbol_within(default, samples) != default
+        if shortened:
+            symbol = symbol_within(default, max(samples // 2, min(samples, _SHORTEST_FIELD)))
         made = Arch.parse(
             symbol,
             self.filters,
@@ -541,11 +540,17 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             window=samples,
             step=1,
         )
+        if shortened:
+            warnings.warn(
+                f"X has windows of {samples} samples, fewer than the default network {default} reads: it is shortened "
+                f"to {made.symbol}. With arch='{made.symbol}' there is no warning.",
+                stacklevel=3,
+            )
         if padding != "stream":
             return replace(made, step=min(5, samples))
         if made.receptive_field > samples:
             raise ArrayError(
-                f"X has windows of {samples} samples, but {symbol} with padding 'stream' needs at least "
+                f"X has windows of {samples} samples, but {made.symbol} with padding 'stream' needs at least "
                 f"{made.receptive_field}: give longer windows, a shorter network (arch=None makes one that fits), or "
                 "padding='mirror'."
             )
