@@ -168,8 +168,9 @@ def test_balanced_classes_count_alike() -> None:
     y, weights = np.array(["a", "a", "a", "b"]), np.array([1.0, 1.0, 2.0, 1.0])
     assert balanced_by_class(weights, y, "balanced").tolist() == [0.625, 0.625, 1.25, 2.5]
     assert balanced_by_class(weights, y, {"b": 3.0}).tolist() == [1.0, 1.0, 2.0, 3.0]
-    with pytest.raises(ValueError, match="class_weight"):
-        balanced_by_class(weights, y, "equal")
+    for wrong in ("equal", {"a": -1.0}, {"a": 0.0, "b": 0.0}):
+        with pytest.raises(ValueError, match="class_weight"):
+            balanced_by_class(weights, y, wrong)
 
 
 def test_groups_choose_folds_and_who_decides_when_to_stop() -> None:

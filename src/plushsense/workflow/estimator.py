@@ -121,7 +121,10 @@ def balanced_by_class(
     if class_weight == "balanced":
         sums = np.bincount(index, weights)
         return np.asarray(weights * (sums.mean() / sums)[index])
-    return np.asarray(weights * compute_class_weight(class_weight, classes=classes, y=y)[index])
+    of_class = compute_class_weight(class_weight, classes=classes, y=y)
+    if not (np.isfinite(of_class).all() and (of_class >= 0.0).all() and of_class.any()):
+        raise ArrayError(f"class_weight is {class_weight}: give weights from 0 up, and one above 0.")
+    return np.asarray(weights * of_class[index])
 
 
 def in_own_order(x: NDArray[Any], *others: NDArray[Any]) -> NDArray[np.int64]:
@@ -448,6 +451,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
                 "dataset": "arrays given to PlushClassifier",
                 "estimator": {"settings": self._settings(), **labels_table(classes)},
                 "windows": len(x),
+                "weighted": bool((trained != 1.0).any()),
                 "subjects": sorted(set(people[~watching].tolist())) if named else [],
                 "validation_subjects": sorted(set(people[watching].tolist())) if named else [],
                 "split": "none",
