@@ -27,6 +27,7 @@ from plushsense.models.arch import (
     parse_symbol,
     reflected,
     symbol_at_rate,
+    symbol_within,
 )
 
 CELLS = [
@@ -223,3 +224,12 @@ def test_default_kernels_last_as_long_at_other_rates() -> None:
         arch = Arch.parse(symbol_at_rate(DEFAULT_SYMBOL, rate), (8, 12, 16), window=round(2.5 * rate))
         assert 1.0 <= arch.receptive_field / rate <= 1.35 and arch.span <= 2.5 * rate
         assert arch.parameters <= Arch.parse(DEFAULT_SYMBOL, (8, 12, 16)).parameters
+
+
+def test_a_network_is_shortened_to_what_a_window_holds() -> None:
+    assert symbol_within(DEFAULT_SYMBOL, 122) == DEFAULT_SYMBOL
+    assert symbol_within(VECTOR_SYMBOL, 30) == "v4_9d1_19d1"
+    assert [symbol_within(DEFAULT_SYMBOL, n) for n in (1, 2, 4)] == ["1d1", "2d1", "2d1_3d1"]
+    for samples in range(2, 122):
+        arch = Arch.parse(symbol_within(DEFAULT_SYMBOL, samples), (8, 12, 16), window=samples, step=1)
+        assert 0.78 * samples <= arch.receptive_field <= arch.span <= samples

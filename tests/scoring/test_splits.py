@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from plushsense.core.errors import BadInput, ConfigError
-from plushsense.scoring.splits import EXAMPLES, Fold, make_folds, parse_split, purge
+from plushsense.core.errors import ArrayError, BadInput, ConfigError
+from plushsense.scoring.splits import EXAMPLES, Fold, Splitter, make_folds, parse_split, purge
 
 CLASSES = 4
 
@@ -191,3 +191,27 @@ def test_purge_keeps_exactly_what_touches_no_tested_row(seed: int) -> None:
             stream[i] == tested[j] and mine & set(range(*tested_rows[j])) for j in range(5) if tested[j] != ""
         )
         assert keep[i] == (not touches)
+
+
+def test_a_splitter_keeps_people_and_recordings_apart_and_says_what_it_lacks() -> None:
+    people = np.repeat(["none", "P1", "P2", "P3"], 8)
+    recordings, x, y = np.arange(32) // 2, np.zeros((32, 1, 9)), np.array(["a", "b"])[np.arange(32) // 2 % 2]
+    splitter = Splitter("leave-one-subject-out", people, recordings)
+    folds = list(splitter.split(x, y))
+    assert len(folds) == splitter.get_n_splits() == 3
+    for train, test in folds:
+        assert sorted([*train, *test]) == list(range(32))
+        assert not set(recordings[train]) & set(recordings[test])
+        assert set(people[test]) - {"none"} and not set(people[train]) & set(people[test]) - {"none"}
+    assert Splitter("by-recording:4", recordings=recordings).get_n_splits() == 4
+    given = list(Splitter("by-subject:3").split(x[8:], groups=people[8:]))
+    assert all(len(set(people[8:][test])) == 1 for _, test in given), "people that only the call names"
+    for match, splitter, groups in (
+        (r"groups has the shape \(31,\): expected \(32,\)", Splitter(groups=people[1:]), None),
+        (r"recordings has the shape", Splitter(groups=people, recordings=recordings[1:]), None),
+        (r"by-recording:4 must know which windows", Splitter("by-recording:4"), people),
+        (r"leave-one-subject-out must know which windows", Splitter(), people),
+        (r"needs to know who made each recording", Splitter(), None),
+    ):
+        with pytest.raises((ArrayError, BadInput), match=match):
+            list(splitter.split(x, y, groups))

@@ -135,7 +135,11 @@ def test_a_recording_nobody_stopped_is_left_out_and_named(dataset: Dataset, tmp_
 
 
 def test_vectors_are_found_among_the_inputs(dataset: Dataset) -> None:
-    assert cut_windows(dataset).vectors == ((0, 1, 2),)
+    everything = cut_windows(dataset)
+    assert everything.vectors == ((0, 1, 2),)
+    assert "Custom" in dataset.gestures.labels
+    assert everything.labels == ("Shake", "Wave"), "free choice is left out, as by train and evaluate"
+    assert everything.left_out[0].startswith("Custom: free choice")
 
 
 def test_a_recording_with_a_gap_keeps_the_full_windows_before_it(dataset: Dataset, tmp_path: Path) -> None:

@@ -20,8 +20,11 @@ from plushsense.core.errors import ArchError, ArrayError, BundleError, ConfigErr
 from plushsense.core.gestures import Gesture, GestureSet, load_gestures
 from plushsense.core.layouts import load_layout
 from plushsense.dataset.store import Dataset
+from plushsense.evaluation.crossval import fold_windows
 from plushsense.models.reference import softmax
-from plushsense.workflow.estimator import labels_from
+from plushsense.scoring.splits import Splitter, parse_split
+from plushsense.windows.cut import WindowSpec
+from plushsense.workflow.estimator import balanced_by_class, labels_from
 
 sklearn = pytest.importorskip("sklearn", minversion="1.6")
 
@@ -34,13 +37,11 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 
 SRC = Path(__file__).resolve().parents[2] / "src"
 
-# The checks' windows have 2 to 20 samples: any padding but ``stream``, and no ``mirror``, whose mean over two mirrored
-# samples cannot tell which came first.
 TINY: dict[str, Any] = {"arch": "3", "filters": (4,), "padding": "causal", "epochs": 20, "learning_rate": 0.03}
 
 
-# None of the checks is expected to fail.
-@parametrize_with_checks([ps.PlushClassifier(**TINY)])
+# None of the checks is expected to fail, those of weights included: windows of 2 to 20 samples, in rows of one channel.
+@parametrize_with_checks([ps.PlushClassifier()])
 def test_scikit_learns_own_checks(estimator: Any, check: Callable[[Any], None]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -130,6 +131,48 @@ def test_whole_numbers_are_read_as_they_are_and_floats_finely_at_any_scale() -> 
     assert small().fit(1000.0 + x, y).bundle_.layout.channels[0].step <= x[:, 0].std() / 2**16
 
 
+def test_short_windows_get_a_shorter_default_network_and_are_told_so() -> None:
+    x, y, _ = waves()
+    with pytest.warns(UserWarning, match=r"windows of 60 samples, fewer than .* shortened to 4_10_18") as noted:
+        model = small(arch=None, filters=(4, 4, 4), epochs=1).fit(x, y)
+    assert [w.filename for w in noted] == [__file__]
+    assert model.bundle_.arch.symbol == "4_10_18"
+    assert (model.bundle_.arch.receptive_field, model.bundle_.arch.span) == (30, 59)
+    assert model.predict(x).shape == (60,)
+    long = np.tile(x, 3)[:, :, :122]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = small(arch=None, filters=(4, 4, 4), epochs=1).fit(long, y)
+    assert (model.bundle_.arch.symbol, model.bundle_.arch.span) == ("14d1_19d2_19d4", 122), "just long enough"
+    for samples in (60, 79):
+        with pytest.raises(ArrayError, match=f"{samples} samples, but 80 with padding 'stream' needs at least 80:"):
+            small(arch="80", epochs=1).fit(long[:, :, :samples], y)
+    assert small(arch="80", epochs=1).fit(long[:, :, :80], y).bundle_.arch.span == 80
+
+
+def test_weights_count_windows_and_their_order_does_not_matter() -> None:
+    x, y, people = waves()
+    rng = np.random.default_rng(2)
+    weights = rng.integers(0, 4, 60)
+    repeats, shuffled = np.repeat(np.arange(60), weights), rng.permutation(60)
+    plain = small(epochs=5).fit(x[repeats], y[repeats]).predict_proba(x)
+    weighted = small(epochs=5).fit(x[shuffled], y[shuffled], sample_weight=weights[shuffled])
+    assert np.array_equal(weighted.predict_proba(x), plain)
+    rare = small(epochs=5, class_weight={0: 0.01}).fit(x, y, sample_weight=np.full(60, 1e-3))
+    assert rare.predict(x).mean() > 0.9, "class 0 hardly counts, and the scale of all weights not at all"
+    held = small(epochs=2, preset="loso").fit(x, y, groups=people, sample_weight=weights + 0.5).history_
+    assert held[-1]["validation_loss"] is not None
+
+
+def test_balanced_classes_count_alike() -> None:
+    y, weights = np.array(["a", "a", "a", "b"]), np.array([1.0, 1.0, 2.0, 1.0])
+    assert balanced_by_class(weights, y, "balanced").tolist() == [0.625, 0.625, 1.25, 2.5]
+    assert balanced_by_class(weights, y, {"b": 3.0}).tolist() == [1.0, 1.0, 2.0, 3.0]
+    for wrong in ("equal", {"a": -1.0}, {"a": 0.0, "b": 0.0}):
+        with pytest.raises(ValueError, match="class_weight"):
+            balanced_by_class(weights, y, wrong)
+
+
 def test_groups_choose_folds_and_who_decides_when_to_stop() -> None:
     x, y, people = waves()
     scores = cross_val_score(small(), x, y, groups=people, cv=LeaveOneGroupOut(), error_score="raise")
@@ -201,6 +244,17 @@ def test_a_classifier_of_cut_windows_is_a_bundle_that_reads_the_toy(
     ran = cli("live", "--device", f"replay://{stream}?speed=0&layout=accel-3", "--model", path, "--json")
     assert ran.status == 0, ran.err
     assert '"tracking"' in ran.out
+
+
+def test_a_splitter_gives_the_folds_of_an_evaluation(dataset: Dataset) -> None:
+    windows = ps.cut_windows(dataset, WindowSpec(context="loop"))
+    for split in ("leave-one-subject-out", "by-subject:2", "by-recording:3", "windows:4"):
+        cv = Splitter(split, windows.subject, windows.recording, seed=3)
+        ours = [test.tolist() for _, test in cv.split(windows.x, windows.y)]
+        assert ours == [fold.test.tolist() for fold in fold_windows(windows, windows, parse_split(split), 3)]
+    model = ps.PlushClassifier(filters=(2, 2, 2), epochs=1, layout=dataset.layout)
+    cv = Splitter("by-subject:2", windows.subject, windows.recording)
+    assert len(cross_val_score(model, windows.x, windows.y, cv=cv, error_score="raise")) == 2
 
 
 def test_any_bundle_becomes_a_classifier(bundle: Path, dataset: Dataset) -> None:
@@ -288,7 +342,8 @@ def test_what_does_not_fit_is_refused_in_a_sentence() -> None:
         (r"at least 2 samples", small(channels=120), rows, y, None),
         (r"one class \(0\)", small(), x, np.zeros(60, dtype=int), None),
         (r"groups has the shape \(59,\)", small(), x, y, people[:-1]),
-        (r"60 samples, but 80 with padding 'stream' needs", small(arch="80"), x, y, None),
+        (r"60 channels of 2 samples.*swapaxes\(X, 1, 2\), or channels=60", small(), x.swapaxes(1, 2), y, None),
+        (r"60 channels of 2 samples.*swapaxes\(X, 1, 2\)\.", small(channels=2), x.swapaxes(1, 2), y, None),
         (r"Unknown label type", small(), x, y + 0.5 * np.pi * np.arange(60), None),
     ):
         with pytest.raises(ValueError, match=match) as refused:
@@ -313,8 +368,11 @@ def test_what_does_not_fit_is_refused_in_a_sentence() -> None:
         model.predict(rows[:, :60])
     with pytest.raises(ArrayError, match="window 4"):
         model.predict(holes)
-    with pytest.raises(TypeError, match="sample_weight"):
-        model.fit(x, y, sample_weight=np.ones(60))
+    with pytest.raises(ArrayError, match=r"\(60, 60, 2\): expected .* give np.swapaxes"):
+        model.predict(x.swapaxes(1, 2))
+    for weights, match in ((np.ones(59), "shape"), (-np.ones(60), "negative"), (np.zeros(60), "only zeros")):
+        with pytest.raises(ArrayError, match=f"sample_weight has .*{match}"):
+            model.fit(x, y, sample_weight=weights)
 
 
 def test_forget_finds_a_classifier_that_was_told_whose_windows_they_are(dataset: Dataset, tmp_path: Path) -> None:

@@ -72,14 +72,35 @@ def symbol_at_rate(spec: str, rate_hz: float) -> str:
     """
     if 2 / 3 <= (factor := rate_hz / DEFAULT_RATE_HZ) <= 1.5:
         return spec
+    return _scaled(spec, factor, 2)
+
+
+def symbol_within(spec: str, samples: int) -> str:
+    """Return a symbol with a receptive field of at most ``samples``, from 1: itself, or one with shorter layers.
+
+    All layers are shortened by the same factor, the largest that fits. Those of one tap are then left out, but not all.
+    """
+    for factor in np.linspace(1.0, 0.0, 501).tolist():
+        shorter = spec if factor == 1.0 else _scaled(spec, factor, 1)
+        vector, layers = parse_symbol(shorter)
+        if (vector or 1) + sum((kernel - 1) * dilation for kernel, dilation in layers) <= samples:
+            break
+    return shorter
+
+
+def _scaled(spec: str, factor: float, shortest: int) -> str:
+    """Return a symbol whose layers reach ``factor`` times as far, with kernels of at least ``shortest``."""
     symbol = parse_symbol(spec)
 
     def scaled(kernel: int, dilation: int) -> tuple[int, int]:
         spacing = max(1, round(dilation * factor))
-        return max(2, min(kernel, 1 + round((kernel - 1) * dilation * factor / spacing))), spacing
+        return max(shortest, min(kernel, 1 + round((kernel - 1) * dilation * factor / spacing))), spacing
 
+    layers = [scaled(*layer) for layer in symbol.layers]
+    if shortest == 1:
+        layers = [layer for layer in layers if layer[0] > 1] or layers[-1:]
     vector = [] if symbol.vector is None else [f"{VECTOR}{scaled(symbol.vector, 1)[0]}"]
-    return "_".join([*vector, *("{}d{}".format(*scaled(*layer)) for layer in symbol.layers)])
+    return "_".join([*vector, *(f"{kernel}d{dilation}" for kernel, dilation in layers)])
 
 
 def parse_filters(text: str) -> tuple[int, ...]:

@@ -7,13 +7,14 @@ training apart. Units of nobody (subject "none": the toy at rest) are spread ove
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from plushsense.core.errors import BadInput, ConfigError, nearest
+from plushsense.core.errors import ArrayError, BadInput, ConfigError, nearest
 from plushsense.core.gestures import NOBODY
 
 Index = NDArray[np.int64]
@@ -136,6 +137,71 @@ def make_folds(
     if split.k is None:
         return holdout(subject, label, seed)
     return windows(subject, label, split.k, seed)
+
+
+class Splitter:
+    """A split as a splitter of scikit-learn, with the folds of `evaluate`; scikit-learn is not needed.
+
+        cv = Splitter("leave-one-subject-out", windows.subject, windows.recording)
+        cross_val_score(model, windows.x, windows.y, cv=cv)
+
+    The people whom `evaluate` holds out for validation are among those to train on. Windows that overlap a test
+    recording in its stream, which `evaluate` leaves out, are not known here: with splits by recording, use windows of
+    the context ``loop``. ``recordings:holdout`` takes the recordings in the order of ``recordings``.
+
+    Args:
+        split: the name of a split (see `parse_split`).
+        groups: the person of each window (N,), "none" for nobody; without it, that given to `split`.
+        recordings: the recording of each window (N,), to keep its windows together. It can be left out if the split is
+            by person and every window has one, or if it is of windows.
+    """
+
+    def __init__(
+        self,
+        split: str = "leave-one-subject-out",
+        groups: ArrayLike | None = None,
+        recordings: ArrayLike | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.kind, self.seed = parse_split(split), seed
+        self.groups, self.recordings = groups, recordings
+
+    def split(
+        self, X: Any, y: ArrayLike | None = None, groups: ArrayLike | None = None
+    ) -> Iterator[tuple[Index, Index]]:
+        """Return pairs of indices of windows, to train on and to test on.
+
+        Raises:
+            ArrayError: if people or recordings are missing, or there are more or fewer than windows.
+            BadInput: like `make_folds`.
+        """
+        people = self.groups if self.groups is not None else groups
+        n = len(X if X is not None else people if people is not None else [])
+        subject = np.asarray(np.full(n, UNKNOWN) if people is None else people).astype(str)
+        units = np.arange(n) if self.recordings is None else np.unique(self.recordings, return_inverse=True)[1]
+        for name, values in (("groups", subject), ("recordings", units)):
+            if values.shape != (n,):
+                raise ArrayError(f"{name} has the shape {values.shape}: expected ({n},), one a window.")
+        together = not self.kind.apart or NOBODY in subject
+        if self.recordings is None and together and not self.kind.leaky:
+            raise ArrayError(
+                f"The split {self.kind.text} must know which windows are of one recording: give recordings, such as "
+                "windows.recording."
+            )
+        if self.kind.leaky:
+            units = np.arange(n)
+        first = np.unique(units, return_index=True)[1]
+        label = np.zeros(n, dtype=np.int64) if y is None else np.unique(y, return_inverse=True)[1]
+        for fold in make_folds(self.kind, subject[first], label[first], self.seed):
+            tested = np.isin(units, fold.test)
+            yield np.flatnonzero(~tested), np.flatnonzero(tested)
+
+    def get_n_splits(self, X: Any = None, y: ArrayLike | None = None, groups: ArrayLike | None = None) -> int:
+        """Return the number of folds; for leave-one-subject-out that of the people, who must be known."""
+        if self.kind.kind != "leave-one-subject-out":
+            return self.kind.k or 1
+        people = self.groups if self.groups is not None else groups
+        return len(_people(np.asarray([] if people is None else people).astype(str), self.kind.text, 3))
 
 
 def by_subject(subject: NDArray[np.str_], k: int, seed: int = 0) -> list[Fold]:

@@ -65,6 +65,7 @@ def fit(
     start: FitState | None = None,
     save: Callable[[FitState], None] | None = None,
     save_every_s: float = 60.0,
+    weights: NDArray[np.float64] | None = None,
 ) -> FittedNetwork:
     """Train a network; the same seed gives the same weights.
 
@@ -76,6 +77,8 @@ def fit(
         start: state to continue from, with the same windows and settings but more epochs; the result is bit for bit
             that of an uninterrupted training.
         save: called with such a state every ``save_every_s`` seconds, also with early stopping.
+        weights: how often each window of ``train`` counts in an epoch, (N,). Whole numbers give the same network as
+            windows that are repeated; of fractions, each epoch draws whether the window counts once more.
 
     Raises:
         TrainingError: when the windows do not fit the network, or the loss is no longer a number.
@@ -87,7 +90,11 @@ def fit(
         _check(validation, arch, "validate on")
     device = _device(spec.device)
     vectors = train.vectors if arch.vector is not None else ()
-    scaler = Scaler.none(train.x.shape[1]) if spec.scaling == "none" else Scaler.fit(train.x, vectors)
+    scaler = (
+        Scaler.none(train.x.shape[1])
+        if spec.scaling == "none"
+        else Scaler.fit(train.x if weights is None else train.x[repeated(weights)], vectors)
+    )
     x, y = _tensors(train, scaler, arch, device)
     val_data = None if validation is None or not len(validation) else _tensors(validation, scaler, arch, device)
     stops = val_data is not None and spec.patience is not None
@@ -103,7 +110,8 @@ def fit(
         initial = Net(arch)
         if start is not None:
             initial.import_weights(start.weights)
-        net = engine(arch, initial, device, min(spec.batch, len(train)), spec.threads)
+        most = len(train) if weights is None else int(np.ceil(weights.sum()))
+        net = engine(arch, initial, device, min(spec.batch, most), spec.threads)
         order = torch.Generator().manual_seed(spec.seed)
         augment = augmentations(spec.augment, Channels(train.vectors, scaler, device, arch.vector is not None))
         adam = torch.optim.Adam(net.parameters, lr=spec.learning_rate, fused=True)
@@ -121,7 +129,7 @@ def fit(
                 row: dict[str, Any] = {"epoch": epoch}
                 for group in adam.param_groups:
                     group["lr"] = spec.learning_rate_at(epoch)
-                row["train_loss"], row["train_accuracy"] = _train(net, adam, x, y, spec, order, augment)
+                row["train_loss"], row["train_accuracy"] = _train(net, adam, x, y, spec, order, augment, weights)
                 row |= _measure(net, val_data, validation)
                 row["learning_rate"] = spec.learning_rate_at(epoch)
                 _refuse_not_finite(row, spec)
@@ -142,6 +150,15 @@ def fit(
                 best_epoch, best = len(history), net.export_weights()
             state = None if spec.patience is not None else _state(adam, net, order, history, kept)
     return FittedNetwork(best, scaler, history, best_epoch, time.perf_counter() - began, kept, state)
+
+
+def repeated(weights: NDArray[np.float64], offset: float = 0.5) -> NDArray[np.int64]:
+    """Return the index of each window as often as its weight (N,) says: the counts add up to rounded sums of weights.
+
+    With a random ``offset`` between 0 and 1, the weight of a window is the mean of its count.
+    """
+    counts = np.diff(np.floor(np.cumsum(weights) + offset), prepend=0.0)
+    return np.repeat(np.arange(len(weights)), counts.astype(np.int64))
 
 
 def _state(
@@ -243,12 +260,20 @@ def _train(
     spec: TrainSpec,
     order: torch.Generator,
     augment: Transform | None,
+    weights: NDArray[np.float64] | None,
 ) -> tuple[float, float]:
     """Train one epoch; return mean loss and accuracy over its batches."""
     # Sum on the device: reading a number from a GPU in every batch would make the CPU wait.
     sums, n_windows = torch.zeros(2, device=y.device), 0
-    shuffled = torch.randperm(len(x), generator=order).to(y.device)
-    for at in slices(len(x), spec.batch):
+    if weights is None:
+        shuffled = torch.randperm(len(x), generator=order)
+    else:
+        # Whole numbers draw nothing, so that the order is that of windows that are repeated.
+        offset = 0.5 if (weights == np.rint(weights)).all() else float(torch.rand(1, generator=order))
+        counted = torch.from_numpy(repeated(weights, offset))
+        shuffled = counted[torch.randperm(len(counted), generator=order)]
+    shuffled = shuffled.to(y.device)
+    for at in slices(len(shuffled), spec.batch):
         batch = shuffled[at]
         # The batch statistics of a few remaining windows would be noisy; they are used in other epochs.
         if n_windows and len(batch) < min(8, spec.batch):

@@ -79,7 +79,7 @@ class WindowSet:
     recording), "stream" (begins before it in the stream), "loop" or "anywhere"; ``stream`` (N,): id of the stream of
     the recording, or ""; ``window_rows`` and ``recording_rows`` (N, 2): rows of that stream which the window and its
     recording cover, −1 if unknown (always for looped windows). ``vectors``: triples of inputs that are the axes of one
-    vector; ``left_out``: recordings that gave no window, with the reason.
+    vector; ``left_out``: recordings that gave no window, and gestures of free choice, with the reason.
     """
 
     x: NDArray[np.int32]
@@ -193,7 +193,8 @@ def cut_windows(
     """Cut the used recordings of ``dataset`` into windows.
 
     Args:
-        gestures: the classes, in order; by default all of the data set. Recordings of other gestures are left out.
+        gestures: the classes, in order; by default all of the data set but those of free choice, which `train` and
+            `evaluate` leave out as well. Recordings of other gestures are left out.
         progress: called with (recordings done, total number of recordings).
 
     Raises:
@@ -201,7 +202,14 @@ def cut_windows(
         DatasetError: if there is no window.
     """
     spec = spec or WindowSpec()
-    gestures = gestures or dataset.gestures
+    left_out = list[Sentence]()
+    if gestures is None:
+        free = [g.label for g in dataset.gestures.gestures if g.free_choice]
+        gestures = dataset.gestures.subset([label for label in dataset.gestures.labels if label not in free])
+        left_out = [
+            Sentence(f"{label}: free choice, everybody did something else", "gestures_left_out", gestures=[label])
+            for label in free
+        ]
     if spec.context == ANYWHERE:
         raise ConfigError(
             "Windows anywhere in a stream are cut by plushsense.windows.anywhere.cut_anywhere: call that."
@@ -209,7 +217,8 @@ def cut_windows(
     layout = dataset.layout
     window, step = layout.samples(spec.window_s), layout.samples(spec.step_s)
     reach = max(window, layout.samples(spec.span_s) if spec.span_s else 0)
-    recordings, left_out = drop_long_recordings([r for r in dataset.used if r.gesture in gestures.labels], spec)
+    recordings, too_long = drop_long_recordings([r for r in dataset.used if r.gesture in gestures.labels], spec)
+    left_out += too_long
     recordings.sort(key=lambda r: (r.stream, r.id))
     cuts: list[tuple[RecordingInfo, WindowCut]] = []
     stream_id, segments = "", list[_Read]()

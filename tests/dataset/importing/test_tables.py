@@ -194,6 +194,28 @@ def test_parquet_dates_and_gaps(tmp_path: Path, parquet: None) -> None:
         import_recordings(tmp_path / "u.parquet", tmp_path / "DS2", layout="accel-3")
 
 
+def test_a_row_of_lists_is_a_recording(tmp_path: Path, parquet: None) -> None:
+    import polars as pl
+
+    frame = pl.DataFrame(
+        {
+            "subject": ["ana", "ana", "ben"],
+            "label": ["Shake", "Shake", "Wave"],
+            "time_ms": [list(range(0, 10 * n, 10)) for n in (50, 40, 30)],
+            "x": [[i] * n for i, n in enumerate((50, 40, 30))],
+            "y": [[0] * n for n in (50, 40, 30)],
+            "z": 1,
+        }
+    )
+    frame.write_parquet(tmp_path / "t.parquet")
+    done = import_recordings(tmp_path / "t.parquet", tmp_path / "DS", layout="accel-3")
+    assert got(done) == [("ana", "1", "Shake", 40), ("ana", "1", "Shake", 50), ("ben", "1", "Wave", 30)]
+    assert [done.dataset.read(r).values[-1].tolist() for r in done.dataset.recordings] == [[i, 0, 1] for i in (1, 0, 2)]
+    frame.with_columns(y=pl.lit([1, 2])).write_parquet(tmp_path / "u.parquet")
+    with pytest.raises(FileFormatError, match="cannot be read as Parquet"):
+        import_recordings(tmp_path / "u.parquet", tmp_path / "DS2", layout="accel-3")
+
+
 def test_parquet_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def need(module: str, extra: str) -> None:
         raise MissingExtraError(f"{module} {extra}")

@@ -1,5 +1,8 @@
 """Import a table with one row per sample: ``subject, [session], [recording], label, time`` and the channels.
 
+A Parquet table may also have one row per recording or stream, with lists of samples as cells, as in data sets of
+Hugging Face.
+
 Rows are grouped by person and session, in the order of the file. A recording is a run of rows with the same label (and
 the same ``recording``, if there is such a column); without that column it also ends where the time decreases or pauses
 for more than a second. Rows without a label belong to no recording; a session with such rows is also written as stream.
@@ -264,7 +267,7 @@ def _number(text: str) -> float:
 
 
 def read_parquet(path: Path, display_name: str, layout: Layout, given: Mapping[str, str]) -> ImportedColumns:
-    """Read a Parquet table with polars."""
+    """Read a Parquet table with polars; each value of a list becomes a row, and a row of lists a recording."""
     with path.open("rb") as file:
         if file.read(4) != b"PAR1":
             message = f"'{display_name}' is no Parquet file: it does not begin with PAR1"
@@ -276,6 +279,12 @@ def read_parquet(path: Path, display_name: str, layout: Layout, given: Mapping[s
         names = choose_columns(there, layout, given, display_name)
         with path.open("rb") as file:
             table = pl.read_parquet(file, columns=list(dict.fromkeys(names.values())))
+        lists = [n for n in table.columns if table[n].dtype.base_type() in (pl.List, pl.Array)]
+        if lists:
+            row = "row" + "_" * max(map(len, table.columns))
+            table = table.with_row_index(row).explode(lists)
+            if "recording" not in names:
+                names["recording"] = row
         nested = next((n for n in table.columns if table[n].dtype.is_nested()), None)
         if nested is not None:
             message = f"'{display_name}' has more than one value in a cell of column '{nested}'"
