@@ -28,6 +28,7 @@ from plushsense.dataset.importing.build import (
     merge_people,
     read_copied,
     summarize_import,
+    unknown_labels,
 )
 from plushsense.dataset.importing.sources import SourceScan
 from plushsense.dataset.importing.truncation import truncation_marks
@@ -167,6 +168,8 @@ def add_to_dataset(
         rebuilt = rebuild_index(dest, head).dataset if new or marks else open_dataset(dest)
     come = sorted(set(rebuilt.subjects) - set(dataset.subjects))
     notes += remarks + _returning_people_warning(dest, come)
+    if note := unknown_labels(own, (r.gesture for r in built.dataset.recordings)):
+        notes.append(note)
     return summarize_import(rebuilt, account, search.notes + notes, new, len(trims))
 
 

@@ -6,11 +6,13 @@ in `importing.sources`.
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from plushsense.core.errors import ConfigError, DatasetError, FileFormatError
 from plushsense.core.files import work_folder, write_file
@@ -26,6 +28,8 @@ from plushsense.dataset.importing.build import (
     create_dataset,
     folder_name,
 )
+from plushsense.dataset.importing.pattern import STREAM_ROLE, ImportPattern, check_roles, read_pattern
+from plushsense.dataset.importing.preview import ImportPreview, preview
 from plushsense.dataset.importing.proposals import adopt, matching_layouts, propose_settings, readable_layouts
 from plushsense.dataset.importing.saved_windows import read_windows, windows_layout, write_windows
 from plushsense.dataset.importing.sources import (
@@ -44,7 +48,7 @@ from plushsense.dataset.importing.sources import (
     source_files,
     split_regular_files,
 )
-from plushsense.dataset.importing.tables import STREAM_ROLE, check_roles, read_table
+from plushsense.dataset.importing.tables import TableImport
 from plushsense.dataset.importing.truncation import CHOSEN, choices_of, original_of, split_backups
 from plushsense.dataset.importing.xdf import person_and_session, read_xdf
 from plushsense.dataset.index import rebuild_index
@@ -56,6 +60,7 @@ from plushsense.dataset.store import (
 )
 
 FOLDER = "folder"
+PATTERN = "pattern"
 SHOWN = 5
 
 
@@ -78,6 +83,7 @@ class ImportOptions:
     limits: UnpackLimits = field(default_factory=UnpackLimits)
     person: str | None = None
     guess_layout: bool = False
+    pattern: ImportPattern | None = None
 
     def known_layout(self, own: Layout | None, files: Iterable[Path]) -> tuple[Layout, list[str]]:
         """Return the layout ``own`` of the source, else the given one, else the one that the header of a file names.
@@ -160,6 +166,44 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     return search
 
 
+def scan_pattern(source: Path, options: ImportOptions, *, around: Path | None = None) -> SourceScan:
+    """Search a folder or a file for the files that the pattern in ``options`` describes, and convert them.
+
+    ``around`` is as in `scan_folder`.
+    """
+    pattern = options.pattern
+    assert pattern is not None
+    base = source if source.is_dir() else source.parent
+    all_files = source_files(source) if source.is_dir() else [source]
+    files, refused = split_regular_files(f for f in all_files if f.name != SIMULATION_MARK)
+    layout, notes = options.known_layout(None, files)
+    check_roles(pattern.columns, layout, "[columns] of the pattern: ")
+    search = SourceScan(layout, options.known_gestures(layout), PATTERN, [], notes=notes)
+    search.simulated = is_simulation(around or base, all_files)
+    search.found += [replace(f, origin=printable_path(f.source.relative_to(base))) for f in refused]
+    tables = TableImport(options.new_folder("converted"), layout, pattern)
+    for file in files:
+        relative = file.relative_to(base).as_posix()
+        name = printable_path(file.relative_to(base))
+        place = pattern.match(relative)
+        if place is None:
+            excluded = pattern.excluded_by(relative)
+            reason = (
+                f"excluded by '{excluded}'" if excluded else f"fits no path of the pattern: {', '.join(pattern.paths)}"
+            )
+            search.found.append(SourceFile(file, LEFT_OUT, origin=name, reason=reason))
+            continue
+        person = options.person or None
+        if options.mapping is not None:
+            person = options.mapping.get(relative, options.mapping.get(file.name))
+        try:
+            _add(tables.convert(file, name, person, place), search)
+        except FileFormatError as cause:
+            search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
+    search.found += tables.origins()
+    return search
+
+
 def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
     """Unpack a zip beside the new data set and search it."""
     # As if the user had unpacked it: recordings at the top belong to the person with the name of the zip.
@@ -170,7 +214,8 @@ def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
         message = f"'{path}' holds a data set: unpack it and open the folder, it needs no import."
         raise DatasetError(message, reason="import_of_dataset", name=path.name)
     options = replace(options, person=options.person or None)
-    search = scan_folder(folder, options, around=path.resolve().parent)
+    scan = scan_folder if options.pattern is None else scan_pattern
+    search = scan(folder, options, around=path.resolve().parent)
     search.found += [SourceFile(path, "", origin=printable_path(Path(name)), reason=reason) for name, reason in refused]
     return search
 
@@ -212,7 +257,9 @@ def scan_table(path: Path, options: ImportOptions) -> SourceScan:
     search = _scan_of_file(path, "table", options)
     check_roles(options.columns, search.layout)
     person = (options.mapping or {}).get(path.name) or options.person or None
-    _add(read_table(path, path.name, options.new_folder("converted"), person, search.layout, options.columns), search)
+    columns = {role: name for role, name in options.columns.items() if role != STREAM_ROLE}
+    tables = TableImport(options.new_folder("converted"), search.layout, ImportPattern(columns=columns))
+    _add(tables.convert(path, path.name, person), search)
     return search
 
 
@@ -266,9 +313,13 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
         DatasetError: if it is neither, cannot be read, or contains nothing to import.
     """
     try:
-        if source.is_dir():
+        if options.pattern is not None and source.exists() and source.suffix.lower() != ".zip":
+            search = scan_pattern(source, options)
+        elif source.is_dir():
             if unused := sorted(set(options.columns) - {STREAM_ROLE}):
-                raise ConfigError(f"--column {unused[0]}=… is for a table; '{source}' is a folder.")
+                raise ConfigError(
+                    f"--column {unused[0]}=… is for a table; '{source}' is a folder: describe it with --pattern FILE."
+                )
             search = scan_folder(source, options)
         elif source.is_file():
             if source.suffix.lower() not in FORMATS:
@@ -288,10 +339,14 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
     if not any(f.kind in ("recordings", "streams") for f in search.found):
         first = next((f" The first: '{f.origin}': {f.reason.rstrip('.')}." for f in search.found if f.reason), "")
         unknown = any(getattr(f.reason, "reason", "") == "person_unknown" for f in search.found)
+        expected = "<label>_<epoch ms>_<rows>.csv in a folder per person"
+        if options.pattern is not None:
+            expected = f"files that fit {', '.join(options.pattern.paths)}"
+        elif search.shape == "labelled-rows":
+            expected += " (or CSVs with a label column)"
         raise DatasetError(
-            f"'{source}' holds no recording: expected <label>_<epoch ms>_<rows>.csv in a folder per person"
-            f"{' (or CSVs with a label column)' if search.shape == 'labelled-rows' else ''}; "
-            f"found {len(search.found)} other files.{first}",
+            f"'{source}' holds no recording: expected {expected}; found {len(search.found)} other files.{first}"
+            + ("" if options.pattern is not None else " Other files can be described with --pattern FILE.toml."),
             reason="person_unknown" if unknown else "import_nothing",
             n=len(search.found),
         )
@@ -308,6 +363,55 @@ def _propose(done: ImportSummary, adopting: bool) -> None:
         head = replace(head, layout=layout)
         write_file(done.dataset.path / HEAD, head.to_toml())
         done.dataset = rebuild_index(done.dataset.path, head).dataset
+
+
+def _options(
+    new_folder: Callable[[str], Path],
+    layout: Layout | str | Path | None = None,
+    gestures: GestureSet | str | Path | None = None,
+    subjects: str | Path = FOLDER,
+    columns: Mapping[str, str] | None = None,
+    limits: UnpackLimits | None = None,
+    person: str | None = None,
+    guess_layout: bool = False,
+    pattern: ImportPattern | str | Path | None = None,
+) -> ImportOptions:
+    """Load the files that options of an import name; a layout, gestures or columns override those of the pattern."""
+    if pattern is not None and not isinstance(pattern, ImportPattern):
+        pattern = read_pattern(pattern)
+    if pattern is not None:
+        pattern = replace(pattern, columns={**pattern.columns, **(columns or {})})
+        layout = pattern.known_layout() if layout is None else layout
+        gestures = pattern.known_gestures() if gestures is None else gestures
+    return ImportOptions(
+        layout if isinstance(layout, Layout) or layout is None else load_layout(layout),
+        gestures if isinstance(gestures, GestureSet) or gestures is None else load_gestures(gestures),
+        None if str(subjects) == FOLDER else read_mapping(Path(subjects)),
+        new_folder,
+        columns=columns or {},
+        limits=limits or UnpackLimits(),
+        person=person,
+        guess_layout=guess_layout,
+        pattern=pattern,
+    )
+
+
+def _grid(layout: Layout) -> list[tuple[str, float]]:
+    """Return the name and the step of each channel."""
+    return [(channel.name, channel.step) for channel in layout.channels]
+
+
+def preview_import(source: str | Path, **given: Any) -> ImportPreview:
+    """Return what `import_recordings` would understand of ``source``; nothing is written.
+
+    Args:
+        given: layout, gestures, subjects, columns, limits, person, guess_layout and pattern of `import_recordings`.
+
+    Raises:
+        DatasetError: if there is nothing to import.
+    """
+    with tempfile.TemporaryDirectory(prefix="plushsense-") as place, _temporary_folders(Path(place) / "new") as folder:
+        return preview(scan_source(Path(source), _options(folder, **given)))
 
 
 def import_recordings(
@@ -329,6 +433,7 @@ def import_recordings(
     adopt_proposals: bool = False,
     person: str | None = None,
     guess_layout: bool = False,
+    pattern: ImportPattern | str | Path | None = None,
 ) -> ImportSummary:
     """Create a data set at ``dest`` from recordings, or add them to an existing one.
 
@@ -350,6 +455,7 @@ def import_recordings(
         person: the person of files that name none: those directly in ``source``, in folders of gestures, and XDF files
             and tables without a person. "" refuses them; None takes the name of the folder where there is one.
         guess_layout: if no layout is given or stated, take the most probable built-in one that can read the files.
+        pattern: description of files of other projects, or the path of its TOML file.
 
     Returns:
         The summary. Every source file is imported (possibly with warnings), left out, or rejected with a reason.
@@ -359,38 +465,34 @@ def import_recordings(
     """
     began = time.perf_counter()
     source, dest = Path(source), Path(dest)
-    given = layout if isinstance(layout, Layout) or layout is None else load_layout(layout)
-    if gestures is not None and not isinstance(gestures, GestureSet):
-        gestures = load_gestures(gestures)
-    mapping = None if str(subjects) == FOLDER else read_mapping(Path(subjects))
     if people is not None and not Path(people).exists():
         raise DatasetError(f"There is no people's file '{people}': check the path.")
     people_info = {} if people is None else read_people(Path(people))
     if source.is_dir() and dest.resolve() != source.resolve() and dest.resolve().is_relative_to(source.resolve()):
         raise ConfigError(f"'{dest}' lies in '{source}', which is only read: give a folder outside of it.")
-    head = None
-    if add_to:
-        head = DatasetHead.read(dest)
-        if adopt_proposals:
-            raise ConfigError("--add keeps the layout of the data set: leave --adopt out.")
-        if given is not None and given.to_dict() != head.layout.to_dict():
-            raise DatasetError(f"'{dest}' has the layout '{head.layout.name}', not '{given.name}': leave --layout out.")
-        if name or licence or consent:
-            raise ConfigError("--add keeps the name, licence and consent statement of the data set: leave them out.")
-    # An inferred set cannot decide which markers of an XDF file are gestures.
-    known = gestures if head is None or head.gestures.inferred else head.gestures
     with _temporary_folders(dest) as new_folder:
-        options = ImportOptions(
-            given if head is None else head.layout,
-            known,
-            mapping,
-            new_folder,
-            "the given layout" if head is None else "that of the data set",
-            columns or {},
-            limits or UnpackLimits(),
-            person,
-            guess_layout,
-        )
+        options = _options(new_folder, layout, gestures, subjects, columns, limits, person, guess_layout, pattern)
+        given, known, head = options.layout, options.gestures, None
+        if add_to:
+            head = DatasetHead.read(dest)
+            if adopt_proposals:
+                raise ConfigError("--add keeps the layout of the data set: leave --adopt out.")
+            if layout is not None and given is not None and given.to_dict() != head.layout.to_dict():
+                own = head.layout.name
+                raise DatasetError(f"'{dest}' has the layout '{own}', not '{given.name}': leave --layout out.")
+            # The rate, gap and offsets may have been adopted from the recordings.
+            if layout is None and given is not None and _grid(given) != _grid(head.layout):
+                raise DatasetError(
+                    f"'{dest}' has the channels {', '.join(head.layout.names)}, but the pattern has "
+                    f"{', '.join(given.names)}, or other steps: a data set has one layout, so import them apart."
+                )
+            if name or licence or consent:
+                raise ConfigError(
+                    "--add keeps the name, licence and consent statement of the data set: leave them out."
+                )
+            # An inferred set cannot decide which markers of an XDF file are gestures.
+            of_set = known if head.gestures.inferred else head.gestures
+            options = replace(options, layout=head.layout, gestures=of_set, layout_origin="that of the data set")
         search = scan_source(source, options)
         search.simulated = search.simulated or simulated
         if head is None:
@@ -407,7 +509,7 @@ def import_recordings(
             _propose(done, adopt_proposals)
         else:
             try:
-                done = add_to_dataset(dest, search, gestures, people_info, progress)
+                done = add_to_dataset(dest, search, known, people_info, progress)
             except OSError as cause:
                 raise DatasetError(
                     f"'{dest}' cannot be written ({cause.strerror or cause}, {cause.filename}), but is as valid as "

@@ -72,8 +72,9 @@ def garbage(s: Examination) -> Iterator[Issue]:
 
 
 def blank_rows(s: Examination) -> Iterator[Issue]:
+    """Find rows in which every channel reads 0; cells that nothing touches do so without a fault."""
     rows = ~s.frames.values.any(axis=1)
-    if s.layout.n_channels > 1 and rows.any():
+    if sum(not ch.is_discrete for ch in s.layout.channels) > 1 and rows.any():
         n, row = int(rows.sum()), s.row(int(np.argmax(rows)))
         yield Issue(
             Sentence(
@@ -95,6 +96,7 @@ def spikes(s: Examination) -> Iterator[Issue]:
     usual = np.percentile(np.abs(steps), 95, axis=0)
     usual = np.maximum(usual, _OF_SPREAD * np.subtract(*np.percentile(values, (98, 2), axis=0)))
     far = (size > s.limits.spike * np.maximum(usual, 1)) & (size > 3 * np.abs(values[2:] - values[:-2]))
+    far &= ~np.array([ch.is_discrete for ch in s.layout.channels])
     # Another check reports values outside the valid range.
     far &= (values[1:-1] >= s.layout.valid_min_int) & (values[1:-1] <= s.layout.valid_max_int)
     rows = np.flatnonzero(far.any(axis=1)) + 1
@@ -129,7 +131,7 @@ def format_duration(ms: float) -> str:
 
 
 def clock_reset(s: Examination) -> Iterator[Issue]:
-    back = np.flatnonzero(s.steps < 0)
+    back, _ = s.back
     of_stream: Severity | None = None
     if s.stream:
         # The first rows of a stream may be old ones from the buffer of the serial port.
@@ -153,6 +155,15 @@ def clock_reset(s: Examination) -> Iterator[Issue]:
             _ranges(s.jumps, s, 2),
             severity="info" if s.jumps.max() < _LEFT_OVER else of_stream,
         )
+
+
+def out_of_order(s: Examination) -> Iterator[Issue]:
+    """Find rows that came after later ones, as packets of a radio do that overtake each other."""
+    _, late = s.back
+    if len(late):
+        n, row, by = len(late), s.row(int(late[0]) + 1), format_duration(-int(s.steps[late].min()))
+        message = f"{_plural(n, 'row')} out of order by the device clock (first row {row}, by at most {by})"
+        yield Issue(Sentence(message, "out_of_order", n=n, row=row, by=by), _ranges(late, s, 2))
 
 
 def gaps(s: Examination) -> Iterator[Issue]:
