@@ -76,7 +76,7 @@ def test_a_pattern_is_guessed_tried_and_used(cli: Cli, tmp_path: Path) -> None:
     lines = tried.out.splitlines()
     assert lines[0].split()[:6] == ["person", "session", "gesture", "time", "in", "ms"]
     assert len([line for line in lines if line.startswith(("S01", "S02"))]) == 10
-    assert "8 recordings of 2 people, 0 streams, layout touch-cells; nothing was written" in lines[-2]
+    assert "8 recordings of 2 people, 0 streams, layout src; nothing was written" in lines[-2]
     assert "left out: S01/readme.txt: excluded by" in tried.err
     rows = cli("import", tmp_path / "src", "--pattern", pattern, "--dry-run", "--json").json["rows"]
     assert [row["time_ms"] for row in rows[:2]] == [0, 20]

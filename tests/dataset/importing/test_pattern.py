@@ -87,6 +87,38 @@ def test_a_guess_reads_what_was_written_by_hand(name: str, tmp_path: Path) -> No
     assert len(found.rows[0].values) == len(by_hand["channels"])
 
 
+def test_what_a_guess_leaves_out_and_refuses(tmp_path: Path) -> None:
+    src = tmp_path / "src"
+    for person in range(1, 13):
+        (src / f"P{person:02}").mkdir(parents=True)
+        rows = [f"{k},{10 * k},{5000 + 10 * k},{k % 7}.25,{'Tap' if k < 30 else 'Hold'}" for k in range(60)]
+        (src / f"P{person:02}" / "all day.csv").write_text("\n".join(["index,time_ms,time_host,force,gesture", *rows]))
+    (src / "people.csv").write_text("code,age\nP01,30\n")
+    (src / "notes.txt").write_text("12 people\n")
+    guessed = guess_pattern(src)
+    found = tomllib.loads(guessed.toml)
+    assert found["paths"] == ["{subject}/all day.csv"]
+    assert found["exclude"] == ["people.csv"]
+    assert found["layout"]["channels"] == [{"name": "force", "unit": "", "kind": "sensor", "step": 0.01}]
+    assert found["layout"]["rate_hz"] == 100.0
+    assert [doubt.partition(":")[0] for doubt in guessed.doubts] == [
+        "1 files that do not end in '.csv' are left out",
+        "files without such rows are left out",
+        "the column 'index' is taken for a number of the row, not for a channel",
+        "the column 'time_host' is taken for a second clock, not for a channel",
+    ]
+    assert preview_import(src, pattern=ImportPattern(**found)).gestures == {"Hold": 12, "Tap": 12}
+    for path in src.rglob("*.*"):
+        path.rename(path.with_name(f"Tap_{10**12}_60.csv"))
+    with pytest.raises(DatasetError, match="recordings of the GestureRecorder: import it without a pattern"):
+        guess_pattern(src)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DatasetError, match="holds no text file"):
+        guess_pattern(tmp_path / "empty")
+    with pytest.raises(DatasetError, match="is no folder"):
+        guess_pattern(tmp_path / "none")
+
+
 def test_values_of_the_five_folders(tmp_path: Path) -> None:
     def read(name: str) -> ImportSummary:
         FOLDERS[name](tmp_path / name)

@@ -20,6 +20,7 @@ import numpy as np
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import plain_label
+from plushsense.core.recorder_csv import parse_name
 from plushsense.dataset.importing.pattern import ENDINGS, PARTS, ROLES, UNITS
 from plushsense.dataset.importing.sources import source_files, split_regular_files
 from plushsense.dataset.importing.table_files import json_cells, unit_of_time
@@ -133,6 +134,8 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
     mine = [f for f in of_ending if _has_rows(f)]
     if not mine:
         raise DatasetError(f"'{source}' holds no table: its files that end in '{ending}' have no row with a number.")
+    if sum(parse_name(f.name) is not None for f in mine) > 0.8 * len(mine):
+        raise DatasetError(f"'{source}' holds recordings of the GestureRecorder: import it without a pattern.")
     guess = _Guess()
     if others := len(files) - len(of_ending):
         guess.doubts.append(f"{others} files that do not end in '{ending}' are left out")
@@ -280,6 +283,9 @@ def _roles(columns: list[_Column], guess: _Guess) -> None:
         if _NO_CHANNEL.fullmatch(column.name.strip()):
             guess.doubts.append(f"the column '{column.key}' is taken for a number of the row, not for a channel")
             continue
+        if column.rises and re.search("time|stamp", column.name.casefold()):
+            guess.doubts.append(f"the column '{column.key}' is taken for a second clock, not for a channel")
+            continue
         missing += column.words
         guess.channels.append(_measured(column, guess))
     if missing:
@@ -353,15 +359,18 @@ def _vectors(guess: _Guess) -> None:
 
 def _paths(files: list[Path], ending: str, guess: _Guess) -> None:
     """Find out which parts of the paths are person, session, label and take."""
-    depth = min(len(f.parts) for f in files)
+    depth = _usual_least([len(f.parts) for f in files])
     before = "**/" if any(len(f.parts) > depth for f in files) else ""
-    split = [[*f.parts[-depth:-1], f.name[: len(f.name) - len(ending)]] for f in files]
-    names = [re.split(r"([_\-. ]+)", parts[-1]) for parts in split]
-    least = min(map(len, names))
+    split = [[*f.parts[-depth:-1], f.name[: len(f.name) - len(ending)]] for f in files if len(f.parts) >= depth]
+    named = [(parts, re.split(r"([_\-. ]+)", parts[-1])) for parts in split]
+    least = _usual_least([len(name) for _, name in named])
+    if others := len(files) - sum(len(name) >= least for _, name in named):
+        guess.doubts.append(f"files whose paths are not like the others do not fit paths: {others}")
     # Extra separators belong to the first piece, since labels may hold them.
     pieces = [
         [*parts[:-1], "".join(n[: len(n) - least + 1]), *n[len(n) - least + 1 :]]
-        for parts, n in zip(split, names, strict=True)
+        for parts, n in named
+        if len(n) >= least
     ]
     taken = {role for role in PARTS if role in guess.columns}
     known = {"label"} if guess.labels else set[str]()
@@ -391,6 +400,11 @@ def _paths(files: list[Path], ending: str, guess: _Guess) -> None:
         text += f"{{{role}}}" if role in PARTS else role or next(iter(same))
         text += "/" if k < depth - 1 else ""
     guess.keys["paths"] = [text + ending]
+
+
+def _usual_least(numbers: Sequence[int]) -> int:
+    """Return the largest number that nine of ten ``numbers`` reach."""
+    return sorted(numbers)[len(numbers) // 10]
 
 
 def _role(texts: list[str], several: bool, taken: set[str], at: int) -> str:
