@@ -108,6 +108,8 @@ def test_what_a_guess_leaves_out_and_refuses(tmp_path: Path) -> None:
         "the column 'time_host' is taken for a second clock, not for a channel",
     ]
     assert preview_import(src, pattern=ImportPattern(**found)).gestures == {"Hold": 12, "Tap": 12}
+    one = tomllib.loads(guess_pattern(src / "P01" / "all day.csv").toml)
+    assert (one["paths"], one["layout"]["name"]) == (["*.csv"], "all-day")
     for path in src.rglob("*.*"):
         path.rename(path.with_name(f"Tap_{10**12}_60.csv"))
     with pytest.raises(DatasetError, match="recordings of the GestureRecorder: import it without a pattern"):
@@ -115,7 +117,7 @@ def test_what_a_guess_leaves_out_and_refuses(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetError, match="holds no text file"):
         guess_pattern(tmp_path / "empty")
-    with pytest.raises(DatasetError, match="is no folder"):
+    with pytest.raises(DatasetError, match="There is no"):
         guess_pattern(tmp_path / "none")
 
 

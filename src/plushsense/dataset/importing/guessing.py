@@ -115,15 +115,16 @@ class _Guess:
 
 
 def guess_pattern(source: str | Path) -> GuessedPattern:
-    """Look at the files of a folder, and return the pattern that they suggest.
+    """Look at the files of a folder, or at one file, and return the pattern that they suggest.
 
     Raises:
         DatasetError: for a folder without text files.
     """
     source = Path(source)
-    if not source.is_dir():
-        raise DatasetError(f"'{source}' is no folder: a pattern is guessed from the files of a folder.")
-    files = [f for f in split_regular_files(source_files(source))[0] if not f.name.startswith(".") and _is_text(f)]
+    if not source.exists():
+        raise DatasetError(f"There is no '{source}': a pattern is guessed from a folder, or from one file.")
+    base, found = (source, source_files(source)) if source.is_dir() else (source.parent, [source])
+    files = [f for f in split_regular_files(found)[0] if not f.name.startswith(".") and _is_text(f)]
     if not files:
         raise DatasetError(f"'{source}' holds no text file: a pattern is guessed from tables of text and JSON lines.")
     sizes: Counter[str] = Counter()
@@ -146,13 +147,13 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
         guess.keys["format"] = "json"
     if not is_json:
         mine = [f for f in mine if _has_rows(f, guess.width, guess.separator)]
-    if without := sorted({f.relative_to(source).as_posix() for f in set(of_ending) - set(mine)}):
+    if without := sorted({f.relative_to(base).as_posix() for f in set(of_ending) - set(mine)}):
         guess.keys["exclude"] = without
         guess.doubts.append(f"files without such rows are left out: {', '.join(without[:5])}")
     _roles(columns, guess)
-    _paths([f.relative_to(source) for f in mine], ending, guess)
+    _paths([f.relative_to(base) for f in mine], ending, guess)
     _aliases(guess)
-    return GuessedPattern(_toml(guess, source.resolve().name), guess.doubts)
+    return GuessedPattern(_toml(guess, source.resolve().stem), guess.doubts)
 
 
 def _is_text(path: Path) -> bool:
@@ -399,7 +400,7 @@ def _paths(files: list[Path], ending: str, guess: _Guess) -> None:
         same = {row[k] for row in pieces}
         text += f"{{{role}}}" if role in PARTS else role or next(iter(same))
         text += "/" if k < depth - 1 else ""
-    guess.keys["paths"] = [text + ending]
+    guess.keys["paths"] = [(text if len(pieces) > 1 else "*") + ending]
 
 
 def _usual_least(numbers: Sequence[int]) -> int:

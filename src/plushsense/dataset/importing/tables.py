@@ -35,7 +35,7 @@ from plushsense.dataset.files import sha256_of
 from plushsense.dataset.importing.pattern import UNITS, ImportPattern
 from plushsense.dataset.importing.sources import COMPANIONS, SourceFile
 from plushsense.dataset.importing.table_files import ImportedColumns, TableFile, read_rows, unit_of_time
-from plushsense.dataset.quality.measurements import backward_steps
+from plushsense.dataset.quality.measurements import in_order
 from plushsense.dataset.store import RECORDINGS, STREAMS
 
 ORIGIN = "origin.json"
@@ -260,9 +260,9 @@ class TableImport:
         original = ConvertedSource(path, display_name, {"columns": columns.names})
         for first, last in itertools.pairwise(edges):
             mine = order[first:last]
-            if table.place is not None and (moved := in_order(device_ms[mine])) is not None:
-                late = int(np.sum(moved != np.arange(len(moved))))
-                yield about_file(display_name, f"{late} rows put into the order of their times")
+            moved = in_order(device_ms[mine])
+            if table.place is not None and (n := int(np.sum(moved != np.arange(len(moved))))):
+                yield about_file(display_name, f"{n} rows put into the order of their times")
                 mine = mine[moved]
             frames = Frames(values[mine], device_ms[mine], host_ms[mine])
             new = (np.diff(labels[mine]) != 0) | (np.diff(takes[mine]) != 0)
@@ -319,18 +319,6 @@ class TableImport:
             about.write_text(_json({"sources": sources}), encoding="utf-8", newline="\n")
             where = f"{subject}{f', session {session}' if session else ''}, {ORIGIN}"
             yield SourceFile(about, COMPANIONS, subject, session=session, origin=where)
-
-
-def in_order(device_ms: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Return the indices that bring rows that came late into the order of their times; None if none did.
-
-    The rows before and after a reset of the clock stay apart.
-    """
-    resets, late = backward_steps(device_ms)
-    if not len(late):
-        return None
-    parts = np.split(np.arange(len(device_ms)), resets + 1)
-    return np.concatenate([part[np.argsort(device_ms[part], kind="stable")] for part in parts])
 
 
 def _left_out(

@@ -59,6 +59,19 @@ def backward_steps(times: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray
     return back[~late], back[late]
 
 
+def in_order(times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the indices (T,) that bring rows that came late into the order of their times.
+
+    Rows before and after a reset of the clock stay apart.
+    """
+    rows = np.arange(len(times), dtype=np.int64)
+    resets, late = backward_steps(times)
+    if not len(late):
+        return rows
+    parts = np.split(rows, resets + 1)
+    return np.concatenate([part[np.argsort(times[part], kind="stable")] for part in parts])
+
+
 @dataclass(frozen=True)
 class Examination:
     """Input of the checks of one recording or stream.
@@ -88,6 +101,12 @@ class Examination:
     def back(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows after which the device clock was reset, and rows after which a row came late, see `backward_steps`."""
         return backward_steps(self.frames.device_ms)
+
+    @cached_property
+    def ordered_steps(self) -> NDArray[np.int64]:
+        """Like `steps`, after rows that came late are put in order, so that they leave no gaps."""
+        times = self.frames.device_ms
+        return np.diff(times[in_order(times)]) if len(self.back[1]) else self.steps
 
     @cached_property
     def period_ms(self) -> float:
@@ -137,7 +156,7 @@ class Examination:
     @cached_property
     def gaps(self) -> NDArray[np.int64]:
         """Rows after which frames are missing for longer than `gap_ms`."""
-        gaps = np.setdiff1d(np.flatnonzero(self.steps > self.gap_ms), self.jumps)
+        gaps = np.setdiff1d(np.flatnonzero(self.ordered_steps > self.gap_ms), self.jumps)
         if not self.uneven or not len(gaps):
             return gaps
         # With uneven stamps, a delay that later frames catch up is no gap: compare the duration of the rows around it

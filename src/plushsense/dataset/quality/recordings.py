@@ -168,8 +168,8 @@ def out_of_order(s: Examination) -> Iterator[Issue]:
 
 def gaps(s: Examination) -> Iterator[Issue]:
     if len(s.gaps):
-        longest = int(s.steps[s.gaps].max())
-        at = int(s.gaps[int(np.argmax(s.steps[s.gaps]))])
+        longest = int(s.ordered_steps[s.gaps].max())
+        at = int(s.gaps[int(np.argmax(s.ordered_steps[s.gaps]))])
         n, limit, row = len(s.gaps), round(s.gap_ms), s.row(at)
         message = f"{_plural(n, 'gap')} over {limit} ms, the longest {longest} ms (after row {row})"
         yield Issue(
@@ -184,11 +184,11 @@ def lost_frames(s: Examination) -> Iterator[Issue]:
     if s.period_ms <= 0:
         return
     # Other checks report pauses and restarts.
-    good = (s.steps > 0) & (s.steps <= _STANDSTILL_MS)
+    good = (s.ordered_steps > 0) & (s.ordered_steps <= _STANDSTILL_MS)
     good[s.jumps] = False
-    usual = float(np.mean(s.steps[good & (s.steps < 1.5 * s.period_ms)])) if good.any() else s.period_ms
-    missing = np.where(good, np.rint(s.steps / usual) - 1, 0)
-    long = s.gaps if s.uneven else np.flatnonzero((s.steps > 1.6 * s.period_ms) & (missing >= 1))
+    usual = float(np.mean(s.ordered_steps[good & (s.ordered_steps < 1.5 * s.period_ms)])) if good.any() else s.period_ms
+    missing = np.where(good, np.rint(s.ordered_steps / usual) - 1, 0)
+    long = s.gaps if s.uneven else np.flatnonzero((s.ordered_steps > 1.6 * s.period_ms) & (missing >= 1))
     lost = int(missing[long].sum())
     share = lost / (lost + len(s.frames))
     if lost >= _FEW_LOST and share > s.limits.lost:
