@@ -132,8 +132,11 @@ def test_values_of_the_five_folders(tmp_path: Path) -> None:
     text = (tmp_path / "touch-cells/S01/long_hug_1.txt").read_text().splitlines()
     assert ["".join(map(str, row)) for row in frames.values.tolist()] == text
     done = read("multimeter")
-    assert "ana_1.csv: 2 rows of another width than the header left out (the first: line 51: '0,96;11')" in done.notes
-    assert "ana_1.csv: 4 values are missing ('OL'): they count as invalid" in done.notes
+    assert done.notes == [
+        "3 files, for instance ana_1.csv: 2 rows of another width than the header left out (the first: line 51: "
+        "'0,96;11')",
+        "3 files, for instance ana_1.csv: 4 values are missing ('OL'): they count as invalid",
+    ]
     squeeze = next(r for r in done.dataset.recordings if r.gesture == "squeeze")
     values = done.dataset.read(squeeze).values
     # A row before was cut, so that row 60 of the file is the 40th.

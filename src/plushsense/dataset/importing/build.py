@@ -454,17 +454,18 @@ def summarize_import(
 _PARTS = re.compile(r"\([^()]*\)|'[^']*'|(?<= as ).+|[+-]?\d+(?:\.\d+)?( \w+?)?s?\b")
 
 
-def group_flags(flags: Iterable[tuple[str, str]]) -> list[str]:
+def group_flags(flags: Iterable[tuple[str, str]], noun: str = "recordings or streams") -> list[str]:
     """Return one warning for each kind of flag.
 
     Args:
         flags: the id of a recording or stream, and the message of a check. Messages are of one kind if they differ
             only in numbers, names in quotes or at the end behind "as", and remarks in brackets.
+        noun: what the ids are of.
     """
     kinds: dict[str, list[tuple[str, str]]] = {}
     for identity, flag in flags:
         kinds.setdefault(_PARTS.sub(lambda part: f"#{part[1] or ''}", flag), []).append((identity, flag))
     return [
-        (f"{len(found)} recordings or streams, for instance " if len(found) > 1 else "") + ": ".join(found[0])
+        (f"{len(found)} {noun}, for instance " if len(found) > 1 else "") + ": ".join(found[0])
         for found in kinds.values()
     ]

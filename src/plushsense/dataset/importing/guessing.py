@@ -146,13 +146,18 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
     if is_json and ENDINGS.get(ending) != "json":
         guess.keys["format"] = "json"
     if not is_json:
-        mine = [f for f in mine if _has_rows(f, guess.width, guess.separator)]
+        mine = [f for f in mine if _has_rows(f, guess.width, guess.separator)] or mine
     if without := sorted({f.relative_to(base).as_posix() for f in set(of_ending) - set(mine)}):
         guess.keys["exclude"] = without
         guess.doubts.append(f"files without such rows are left out: {', '.join(without[:5])}")
     _roles(columns, guess)
+    if not guess.channels:
+        listed = ", ".join(column.name.strip()[:30] for column in columns[:20])
+        raise DatasetError(f"No column of numbers that could be a channel was found in '{source}'; it has {listed}.")
     _paths([f.relative_to(base) for f in mine], ending, guess)
     _aliases(guess)
+    # Names in the files may hold characters that no line of text can show.
+    guess.doubts = ["".join(c if c.isprintable() else " " for c in doubt) for doubt in guess.doubts]
     return GuessedPattern(_toml(guess, source.resolve().stem), guess.doubts)
 
 
@@ -292,8 +297,6 @@ def _roles(columns: list[_Column], guess: _Guess) -> None:
     if missing:
         guess.keys["missing"] = sorted(missing)
         guess.doubts.append(f"the words {', '.join(sorted(missing))} are taken for missing values")
-    if not guess.channels:
-        guess.doubts.append("no column of numbers was found: give the channels of the layout")
     _vectors(guess)
 
 
@@ -458,10 +461,10 @@ def _key(key: str) -> str:
 def _toml(guess: _Guess, name: str) -> str:
     """Return the TOML of a guess, with what is uncertain as comments at its beginning."""
     lines = [
-        f"# Guessed from the files in '{name}'. Look at it, then see ten rows with",
+        f"# Guessed from the files in {json.dumps(name)}. Look at it, then see ten rows with",
         "#   plushsense import SRC --pattern THIS.toml --dry-run",
         *(["# To check:"] if guess.doubts else []),
-        *(f"# - {' '.join(doubt.split())}" for doubt in guess.doubts),
+        *(f"# - {doubt}" for doubt in guess.doubts),
         "",
     ]
     aliases = guess.keys.pop("aliases", {})

@@ -27,6 +27,7 @@ from plushsense.dataset.importing.build import (
     ImportSummary,
     create_dataset,
     folder_name,
+    group_flags,
 )
 from plushsense.dataset.importing.pattern import STREAM_ROLE, ImportPattern, check_roles, read_pattern
 from plushsense.dataset.importing.preview import ImportPreview, preview
@@ -103,7 +104,8 @@ class ImportOptions:
         fit = f"the header of the files fits {' and '.join(layout.name for layout in found)}. " if found else ""
         raise ConfigError(
             f"--layout is needed: {fit}Accepted are {', '.join(layout_names())}, or a TOML file of your own, which "
-            "names the channels (see docs/importing.md).",
+            "names the channels (see docs/importing.md). For files of another form, let --guess FILE.toml write a "
+            "pattern.",
             reason="layout_unknown",
         )
 
@@ -182,6 +184,7 @@ def scan_pattern(source: Path, options: ImportOptions, *, around: Path | None = 
     search.simulated = is_simulation(around or base, all_files)
     search.found += [replace(f, origin=printable_path(f.source.relative_to(base))) for f in refused]
     tables = TableImport(options.new_folder("converted"), layout, pattern)
+    remarks: list[tuple[str, str]] = []
     for file in files:
         relative = file.relative_to(base).as_posix()
         name = printable_path(file.relative_to(base))
@@ -197,10 +200,15 @@ def scan_pattern(source: Path, options: ImportOptions, *, around: Path | None = 
         if options.mapping is not None:
             person = options.mapping.get(relative, options.mapping.get(file.name))
         try:
-            _add(tables.convert(file, name, person, place), search)
+            for entry in tables.convert(file, name, person, place):
+                if isinstance(entry, Sentence):
+                    remarks.append((entry.values["file"], entry.values["note"]))
+                else:
+                    search.found.append(entry)
         except FileFormatError as cause:
             search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
     search.found += tables.origins()
+    search.notes += group_flags(remarks, "files")
     return search
 
 

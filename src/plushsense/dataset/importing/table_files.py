@@ -324,7 +324,10 @@ def read_json(file: TableFile) -> ImportedColumns:
     first = next((item for _, item in objects if isinstance(item, dict)), None)
     if first is None:
         raise file.error("holds no JSON object: accepted is one object a line, or a list of objects")
-    there = list(dict.fromkeys(_paths(first)))
+    try:
+        there = list(dict.fromkeys(_paths(first)))
+    except RecursionError:
+        raise file.error("holds JSON objects that are nested too deeply") from None
     at = file.choose_columns(there)
     for name in file.pattern.bits:
         _bit_column(file, name, there)
@@ -442,6 +445,10 @@ def read_parquet(file: TableFile) -> ImportedColumns:
     with file.path.open("rb") as opened:
         if opened.read(4) != b"PAR1":
             raise file.error("is no Parquet file: it does not begin with PAR1", reason="table_damaged", file=name)
+    pattern = file.pattern
+    if pattern.bits or pattern.missing:
+        key = "bits" if pattern.bits else "missing"
+        raise file.error(f"is a Parquet table, whose columns have types: {key} is for text, leave it out")
     pl = need("polars", extra="tables")
     try:
         with file.path.open("rb") as opened:
@@ -460,6 +467,8 @@ def read_parquet(file: TableFile) -> ImportedColumns:
         }
         numbers = {r: _parquet_numbers(pl, table[n]) for r, n in names.items() if r not in PARTS}
         in_ms = "time" in names and table[names["time"]].dtype.is_temporal()
+        if pattern.time_unit == "iso" and "time" in names and not in_ms:
+            raise file.error(f"has no dates in column '{names['time']}': leave time_unit out, or give a unit")
     except FileFormatError:
         raise
     except BaseException as cause:
@@ -468,8 +477,8 @@ def read_parquet(file: TableFile) -> ImportedColumns:
             raise
         message = " ".join(str(cause).split())[:120] or type(cause).__name__
         raise file.error(f"cannot be read as Parquet: {message}", reason="table_damaged", file=name) from None
-    if file.pattern.row_rate_hz:
-        numbers["time"] = np.arange(len(table), dtype=np.float64) * (1000.0 / file.pattern.row_rate_hz)
+    if pattern.row_rate_hz:
+        numbers["time"] = np.arange(len(table), dtype=np.float64) * (1000.0 / pattern.row_rate_hz)
         names["time"], in_ms = "row number", True
     return ImportedColumns(names, texts, numbers, in_ms=in_ms)
 

@@ -191,8 +191,8 @@ class TableImport:
 
     def convert(
         self, path: Path, display_name: str, person: str | None, place: Mapping[str, str] | None = None
-    ) -> Iterator[SourceFile | str]:
-        """Write the recordings of a table; yield the files, and warnings as text.
+    ) -> Iterator[SourceFile | Sentence]:
+        """Write the recordings of a table; yield the files, and warnings as `about_file` makes them.
 
         ``place`` are the parts of the path, None without a pattern, when each session gets its ``origin.json`` at once.
 
