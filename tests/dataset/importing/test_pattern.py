@@ -8,6 +8,7 @@ import shutil
 import tomllib
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -284,10 +285,10 @@ def test_paths(pattern: str, path: str, parts: dict[str, str] | None) -> None:
         ("\udcff", {}, "is not UTF-8: save it as UTF-8, or name its encoding"),
     ],
 )
-def test_what_is_wrong_in_a_file_is_named(tmp_path: Path, content: str, keys: dict[str, object], said: str) -> None:
+def test_what_is_wrong_in_a_file_is_named(tmp_path: Path, content: str, keys: dict[str, Any], said: str) -> None:
     (tmp_path / "src").mkdir()
     (tmp_path / "src" / "P1.csv").write_bytes(content.encode("utf-8", "surrogateescape"))
-    pattern = ImportPattern(layout=LAYOUT, paths=("{subject}.csv",), **keys)  # type: ignore[arg-type]
+    pattern = ImportPattern(layout=LAYOUT, paths=("{subject}.csv",), **keys)
     with pytest.raises(DatasetError, match=said):
         import_recordings(tmp_path / "src", tmp_path / "DS", pattern=pattern)
     assert not (tmp_path / "DS").exists()
@@ -322,3 +323,20 @@ def test_dates_white_space_columns_by_number_and_rows_in_json(tmp_path: Path) ->
     assert values[:, 0].tolist() == list(range(30))
     assert (values[:, 1] == 7).sum() == 29
     assert recording.flags == ("1 value outside the valid range (b; first in row 6)",)
+
+
+def test_parquet_has_types_and_may_have_no_clock(tmp_path: Path, parquet: None) -> None:
+    import polars as pl
+
+    (tmp_path / "src").mkdir()
+    pl.DataFrame({"label": ["Tap"] * 30, "a": range(30), "b": [1.0] * 30}).write_parquet(
+        tmp_path / "src" / "P1.parquet"
+    )
+    keys: dict[str, Any] = {"layout": LAYOUT, "paths": ("{subject}.parquet",), "row_rate_hz": 100.0}
+    done = import_recordings(tmp_path / "src", tmp_path / "DS", pattern=ImportPattern(**keys))
+    assert done.dataset.read(done.dataset.recordings[0]).device_ms[:3].tolist() == [0, 10, 20]
+    with pytest.raises(DatasetError, match="missing is for text"):
+        import_recordings(tmp_path / "src", tmp_path / "DS2", pattern=ImportPattern(**keys, missing=("OL",)))
+    dates = {**keys, "row_rate_hz": 0.0, "time_unit": "iso", "columns": {"time": "a"}}
+    with pytest.raises(DatasetError, match="no dates in column 'a'"):
+        import_recordings(tmp_path / "src", tmp_path / "DS3", pattern=ImportPattern(**dates))

@@ -28,7 +28,6 @@ from plushsense.core.recorder_csv import (
     format_header,
     format_rows,
     recording_filename,
-    write_recording,
 )
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.files import sha256_of
@@ -151,7 +150,9 @@ def write_session(
             note = Sentence("its label is too long for a file name", reason="label_too_long")
             yield SourceFile(path, "", origin=name, reason=note)
             continue
-        write_recording(path, frames.slice(cut.start, cut.stop), layout)
+        # Nothing is lost if these temporary files are: they need not be on the disk before the import copies them.
+        rows = format_rows(frames.slice(cut.start, cut.stop), layout)
+        path.write_text(format_header(layout) + rows, encoding="utf-8", newline="\n")
         yield SourceFile(path, RECORDINGS, subject, session=session, origin=name)
     if taken is not None:
         return
