@@ -122,6 +122,28 @@ def test_what_a_guess_leaves_out_and_refuses(tmp_path: Path) -> None:
         guess_pattern(tmp_path / "none")
 
 
+def test_one_of_two_devices_in_folders_and_lines_that_end_in_a_semicolon(tmp_path: Path) -> None:
+    for device in ("phone", "watch"):
+        (tmp_path / "src" / device).mkdir(parents=True)
+        for person in ("1600", "1601"):
+            rows = [f"{person},{'AB'[k // 40]},{252207666810782 + 50_000_000 * k},{k}.5,-1.25;" for k in range(80)]
+            (tmp_path / "src" / device / f"data_{person}_{device}.txt").write_text("\n".join(rows))
+    guessed = guess_pattern(tmp_path / "src")
+    assert any("all of the folders phone, watch are imported" in doubt for doubt in guessed.doubts)
+    pattern = ImportPattern(
+        layout={**LAYOUT, "rate_hz": 20.0},
+        paths=("watch/data_{subject}_watch.txt",),
+        names=("code", "label", "time", "a", "b"),
+        time_unit="ns",
+    )
+    done = import_recordings(tmp_path / "src", tmp_path / "DS", pattern=pattern)
+    assert [(r.subject, r.gesture, r.rows) for r in done.dataset.recordings] == [
+        (person, label, 40) for person in ("1600", "1601") for label in "AB"
+    ]
+    assert len(done.left_out) == 2
+    assert "fits no path of the pattern" in done.left_out[0]["reason"]
+
+
 def test_values_of_the_five_folders(tmp_path: Path) -> None:
     def read(name: str) -> ImportSummary:
         FOLDERS[name](tmp_path / name)

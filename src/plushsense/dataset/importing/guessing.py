@@ -33,6 +33,10 @@ _MOST_LABELS = 60
 _MOST_STEPS = 1e7
 _PERSON = re.compile(r"(s|p|subj|subject|sub|participant|person|user|u|id|child|kid)[-_ ]?\d+", re.IGNORECASE)
 _SESSION = re.compile(r"(session|ses|day|visit|run)[-_ ]?\d*", re.IGNORECASE)
+# Words in paths that are no persons: devices, sensors, sides and parts of a data set.
+_NO_PERSON = frozenset(
+    ("phone", "watch", "accel", "acc", "gyro", "left", "right", "train", "test", "raw", "data", "csv", "wrist", "ankle")
+)
 _LABEL_NAMES = ("label", "gesture", "activity", "class", "event", "action", "touch", "kind", "movement")
 _PERSON_NAMES = ("subject", "participant", "person", "user", "child", "who")
 _NO_CHANNEL = re.compile(r"(index|row|frame|sample|no|nr|id|count_?er|unnamed.*|#)?", re.IGNORECASE)
@@ -54,11 +58,10 @@ class _Column:
     def __post_init__(self) -> None:
         for cell in self.cells:
             text = cell.strip().replace(",", ".") if self.decimal == "," else cell.strip()
-            try:
+            if _is_number(text) and "," not in text:
                 self.numbers.append(float(text))
-            except ValueError:
-                if text:
-                    self.words[text] += 1
+            elif text:
+                self.words[text] += 1
 
     @property
     def is_numeric(self) -> bool:
@@ -104,6 +107,8 @@ class _Guess:
     """What has been found out so far."""
 
     keys: dict[str, Any] = field(default_factory=dict)
+    taken: set[str] = field(default_factory=set)
+    """Parts that have a column."""
     columns: dict[str, str] = field(default_factory=dict)
     channels: list[dict[str, Any]] = field(default_factory=list)
     vectors: list[list[str]] = field(default_factory=list)
@@ -188,7 +193,7 @@ def _lines(path: Path, guess: _Guess) -> list[str]:
 
 
 def _is_number(text: str) -> bool:
-    return bool(re.fullmatch(r"\s*[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?\s*", text))
+    return bool(re.fullmatch(r"\s*[-+]?(\d{1,30}[.,]?\d*|[.,]\d+)([eE][-+]?\d{1,2})?\s*", text))
 
 
 def _text_columns(samples: list[list[str]], guess: _Guess) -> list[_Column]:
@@ -198,7 +203,9 @@ def _text_columns(samples: list[list[str]], guess: _Guess) -> list[_Column]:
     for candidate in _SEPARATORS:
         widths = Counter(len(row) for row in _cells(body, candidate))
         usual, count = widths.most_common(1)[0]
-        if count >= 0.8 * len(body) and usual > 1:
+        # A separator at the end of every line only ends it.
+        ends_line = usual == 2 and all(line.rstrip().endswith(candidate) for line in body)
+        if count >= 0.8 * len(body) and usual > 1 and not ends_line:
             width, separator = usual, candidate
             break
     guess.width, guess.separator = width, separator
@@ -230,6 +237,8 @@ def _text_columns(samples: list[list[str]], guess: _Guess) -> list[_Column]:
 
 
 def _cells(lines: Iterable[str], separator: str) -> Iterable[list[str]]:
+    if separator != ";":
+        lines = (line.rstrip("; ") for line in lines)
     if separator in (" ", ""):
         return (line.split() if separator else [line.strip()] for line in lines if line.strip())
     return csv.reader((line for line in lines if line.strip()), delimiter=separator)
@@ -261,6 +270,7 @@ def _roles(columns: list[_Column], guess: _Guess) -> None:
     def take(role: str, column: _Column | None) -> _Column | None:
         if column is not None:
             left.remove(column)
+            guess.taken.add(role)
             if column.name.casefold() not in ROLES[role] or column.key != column.name:
                 guess.columns[role] = column.key
         return column
@@ -376,28 +386,34 @@ def _paths(files: list[Path], ending: str, guess: _Guess) -> None:
         for parts, n in named
         if len(n) >= least
     ]
-    taken = {role for role in PARTS if role in guess.columns}
-    known = {"label"} if guess.labels else set[str]()
+    taken = guess.taken
     roles: list[str] = []
     for k in range(len(pieces[0])):
         texts = [row[k] for row in pieces]
-        roles.append(_role(texts, len(pieces) > 1, taken | known | set(roles), k))
-    needs_person = "subject" not in taken | set(roles)
-    for k, role in enumerate(roles):
-        letters = any(c.isalpha() for c in pieces[0][k])
-        if role == "*" and needs_person and len({row[k] for row in pieces}) > 1 and (letters or k < depth - 1):
-            roles[k], needs_person = "subject", False
+        roles.append(_role(texts, len(pieces) > 1, taken | set(roles), k))
+    if "recording" in roles and "label" not in roles:
+        # The files hold several recordings each, so that their number is rather that of a session.
+        roles[roles.index("recording")] = "session" if "session" not in roles else "*"
+    if "subject" not in taken | set(roles):
+        values = {k: {row[k] for row in pieces} for k, role in enumerate(roles) if role in ("*", "session")}
+        several = {k: texts for k, texts in values.items() if len(texts) > 1 and not texts & _NO_PERSON}
+        if several:
+            k = max(several, key=lambda k: (len(several[k]), pieces[0][k][0].isalpha()))
+            roles[k] = "subject"
             guess.doubts.append(f"'{pieces[0][k]}' in the path is taken for a person")
-    if needs_person and "subject" not in guess.columns:
-        guess.doubts.append("the person of a recording was not found: put {subject} into paths, or give its column")
+        else:
+            guess.doubts.append("the person of a recording was not found: put {subject} into paths, or give its column")
+    for k, role in enumerate(roles[: depth - 1]):
+        if role == "*":
+            listed = ", ".join(sorted({row[k] for row in pieces})[:5])
+            guess.doubts.append(
+                f"all of the folders {listed} are imported: if they hold other sensors, name one in paths"
+            )
     if "label" in roles:
         at = roles.index("label")
         guess.labels = Counter(row[at] for row in pieces)
     elif not guess.labels:
         guess.doubts.append("the label of a recording was not found: put {label} into paths, or give its column")
-    if "recording" in roles and "label" not in roles:
-        # The files hold several recordings each, so that their number is rather that of a session.
-        roles[roles.index("recording")] = "session" if "session" not in roles else "*"
     text = before
     for k, role in enumerate(roles):
         same = {row[k] for row in pieces}

@@ -273,6 +273,9 @@ def read_csv(file: TableFile) -> ImportedColumns:
                     row.pop()
                 if not row:
                     continue
+                if row[-1].endswith(";"):
+                    # Some loggers end each line so.
+                    row[-1] = row[-1].rstrip("; ")
                 whole = len(row) == len(there)
                 if whole and rows.add(line, [row[k] for k in places], [row[k] for k in bits_at]):
                     numbers.append(row_number)
