@@ -12,6 +12,7 @@ import pytest
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
 from plushsense.recording.session_files import SessionHead
+from support.foreign_folders import FOLDERS
 
 ACCEL = load_layout("accel-3")
 Cli = Callable[..., Any]
@@ -63,6 +64,31 @@ def test_a_table_with_columns_of_its_own(cli: Cli, tmp_path: Path) -> None:
     assert refused.status == 2
     assert "--column subject=NAME" in refused.err
     assert cli(*words, "--column", "subject=who").json["recordings"] == 1
+
+
+def test_a_pattern_is_guessed_tried_and_used(cli: Cli, tmp_path: Path) -> None:
+    FOLDERS["touch-cells"](tmp_path / "src")
+    pattern = tmp_path / "cells.toml"
+    guessed = cli("import", tmp_path / "src", "--guess", pattern)
+    assert "to check: 4" in guessed.out and "--dry-run" in guessed.out
+    assert cli("import", tmp_path / "src", "--guess", pattern).status == 2
+    tried = cli("import", tmp_path / "src", "--pattern", pattern, "--dry-run")
+    lines = tried.out.splitlines()
+    assert lines[0].split()[:6] == ["person", "session", "gesture", "time", "in", "ms"]
+    assert len([line for line in lines if line.startswith(("S01", "S02"))]) == 10
+    assert "8 recordings of 2 people, 0 streams, layout src; nothing was written" in lines[-2]
+    assert "left out: S01/readme.txt: excluded by" in tried.err
+    rows = cli("import", tmp_path / "src", "--pattern", pattern, "--dry-run", "--json").json["rows"]
+    assert [row["time_ms"] for row in rows[:2]] == [0, 20]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cells.toml", "src"]
+    assert "needs DEST" in cli("import", tmp_path / "src", "--pattern", pattern).err
+    assert cli("import", tmp_path / "src", tmp_path / "DS", "--pattern", pattern, "--json").json["recordings"] == 8
+
+
+def test_a_dry_run_of_sessions(cli: Cli, tmp_path: Path) -> None:
+    session(tmp_path / "out" / "P1" / "s1", "P1", 1)
+    found = cli("import", tmp_path / "out", "--dry-run", "--json").json
+    assert (found["recordings"], found["streams"], found["gestures"], len(found["rows"])) == (1, 1, {"Shake": 1}, 10)
 
 
 @pytest.mark.parametrize(

@@ -1,16 +1,18 @@
-"""Implement ``plushsense import SRC DEST [--layout NAME] [--add]``."""
+"""Implement ``plushsense import SRC DEST [--layout NAME] [--pattern FILE] [--add]``."""
 
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from plushsense.cli.options import options
-from plushsense.cli.output import emit, plural, say
+from plushsense.cli.output import emit, plural, say, table
 from plushsense.core.errors import ConfigError
 from plushsense.jobs.progress import ProgressReporter
 
 _MOST_WARNINGS = 20
 _FEW = 5
+_MOST_CHANNELS = 8
 
 
 def _columns(texts: list[str]) -> dict[str, str]:
@@ -21,36 +23,91 @@ def _columns(texts: list[str]) -> dict[str, str]:
     return columns
 
 
+def _report(result: dict[str, Any], names: str) -> None:
+    """Print warnings, and what was left out or rejected, on standard error; ``names`` says where all warnings are."""
+    for line in result["warnings"][:_MOST_WARNINGS]:
+        say(f"warning: {line}")
+    if len(result["warnings"]) > _MOST_WARNINGS:
+        say(f"... and {len(result['warnings']) - _MOST_WARNINGS} more warnings{names}")
+    for proposal in result.get("proposals", ()):
+        say(f"suggestion: {proposal['reason']}: {proposal['advice']}")
+    for status in ("left_out", "rejected"):
+        by_reason: dict[str, list[str]] = {}
+        for entry in result[status]:
+            by_reason.setdefault(entry["reason"], []).append(entry["file"])
+        for reason, files in by_reason.items():
+            several = f"{len(files)} files, for instance " if len(files) > _FEW else ""
+            for file in files[: 1 if several else _FEW]:
+                say(f"{status.replace('_', ' ')}: {several}{file}: {reason}")
+
+
+def _guess(args: argparse.Namespace) -> int:
+    from plushsense.dataset.importing.guessing import guess_pattern
+
+    guessed = guess_pattern(args.source)
+    guessed.write(args.guess)
+    text = [f"wrote {args.guess}; to check: {len(guessed.doubts)}", *(f"  {doubt}" for doubt in guessed.doubts)]
+    text.append(f"next: plushsense import {args.source} --pattern {args.guess} --dry-run")
+    emit(args, {"pattern": args.guess, "doubts": guessed.doubts}, text)
+    return 0
+
+
+def _dry_run(args: argparse.Namespace, given: dict[str, Any]) -> int:
+    from plushsense.dataset.importing.importers import preview_import
+
+    found = preview_import(args.source, **given).to_dict()
+    if not args.json:
+        _report(found, "")
+    channels = list(found["rows"][0]["values"]) if found["rows"] else []
+    shown = channels[:_MOST_CHANNELS]
+    more = [f"and {len(channels) - len(shown)} more channels"] if len(channels) > len(shown) else []
+    rows = [
+        [row["subject"], row["session"], row["gesture"], row["time_ms"]]
+        + ["invalid" if row["values"][c] is None else format(row["values"][c], "g") for c in shown]
+        for row in found["rows"]
+    ]
+    gestures = ", ".join(f"{label} ({n})" for label, n in found["gestures"].items())
+    emit(
+        args,
+        found,
+        [
+            table(["person", "session", "gesture", "time in ms", *shown], rows),
+            *more,
+            f"{plural(found['recordings'], 'recording')} of {len(found['subjects'])} people, "
+            f"{plural(found['streams'], 'stream')}, layout {found['layout']}; nothing was written",
+            *([f"gestures: {gestures}"] if gestures else []),
+        ],
+    )
+    return 0
+
+
 def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.importing.archives import UnpackLimits
     from plushsense.dataset.importing.importers import import_recordings
 
+    if args.guess:
+        return _guess(args)
+    given = {
+        **options(args, "layout", "gestures", "subjects", "pattern"),
+        "columns": _columns(args.column),
+        "limits": UnpackLimits.of_gigabytes(args.max_gb),
+    }
+    if args.dry_run:
+        return _dry_run(args, given)
+    if args.dest is None:
+        raise ConfigError(f"import {args.source} needs DEST, the folder of the new data set, or --dry-run or --guess.")
     done = import_recordings(
         args.source,
         args.dest,
-        **options(args, "layout", "gestures", "subjects", "name", "licence", "consent", "people"),
+        **given,
+        **options(args, "name", "licence", "consent", "people"),
         progress=ProgressReporter("reading"),
         add_to=args.add,
         adopt_proposals=args.adopt,
-        columns=_columns(args.column),
-        limits=UnpackLimits.of_gigabytes(args.max_gb),
     )
     result = done.to_dict()
     if not args.json:
-        for line in result["warnings"][:_MOST_WARNINGS]:
-            say(f"warning: {line}")
-        if len(result["warnings"]) > _MOST_WARNINGS:
-            say(f"... and {len(result['warnings']) - _MOST_WARNINGS} more warnings; all are in {args.dest}/*.csv")
-        for proposal in done.proposals:
-            say(f"suggestion: {proposal['reason']}: {proposal['advice']}")
-        for status, entries in (("left out", done.left_out), ("rejected", done.rejected)):
-            by_reason: dict[str, list[str]] = {}
-            for entry in entries:
-                by_reason.setdefault(entry["reason"], []).append(entry["file"])
-            for reason, files in by_reason.items():
-                several = f"{len(files)} files, for instance " if len(files) > _FEW else ""
-                for file in files[: 1 if several else _FEW]:
-                    say(f"{status}: {several}{file}: {reason}")
+        _report(result, f"; all are in {args.dest}/*.csv")
     new = f", {done.added['recordings']} of them new, {done.already_there} files already there" if args.add else ""
     emit(
         args,

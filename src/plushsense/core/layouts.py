@@ -22,6 +22,7 @@ GRAVITY_FRACTION_BITS = 4
 GRAVITY_STATE_BITS = 10  # fraction bits of the running mean itself
 GRAVITY_S = 0.64  # time constant of the running mean; chosen on 14 people (bench/people.py)
 ACCELERATION = "acceleration"
+BINARY, COUNT = "binary", "count"
 MOST_GAP_MS, MOST_GAP_SAMPLES = 60_000, 60_000
 _INT32 = (-2147483648.0, 2147483647.0)
 
@@ -41,7 +42,8 @@ class Channel:
     """A quantity that the toy measures and sends as a raw value.
 
     The physical value, in ``unit``, is ``(raw - offset) * scale``; all computations use the integer
-    ``round(raw / step)``. Raw values outside ``[valid_min, valid_max]`` are invalid.
+    ``round(raw / step)``. Raw values outside ``[valid_min, valid_max]`` are invalid. The kinds ``binary`` (touched or
+    not) and ``count`` (a number of cells) are for channels that keep one value while nothing touches them.
     """
 
     name: str
@@ -70,6 +72,19 @@ class Channel:
                 f"{self.step:g} must rise and fit 32-bit integers, also after the offset {self.offset:g} is "
                 "subtracted: narrow the range or take a larger step."
             )
+
+    @property
+    def is_discrete(self) -> bool:
+        """Whether one value for long is usual, as for a cell that nothing touches."""
+        return self.kind in (BINARY, COUNT)
+
+    def in_units(self, steps: float) -> tuple[float, str]:
+        """Return a value of ``steps`` integer steps as the files have it, and the unit to write behind it, "" if none.
+
+        Raw values that are not in the unit of the channel have none.
+        """
+        plain = self.scale == 1.0 and self.unit not in ("", "count", "counts")
+        return float(f"{steps * self.step:.6g}"), f" {self.unit}" if plain else ""
 
 
 @dataclass(frozen=True)

@@ -89,13 +89,14 @@ def read_toml(path: Path, kind: str, error: type[BadInput]) -> dict[str, Any]:
         raise error(message, reason="file_broken", name=path.name) from None
 
 
-def load_table(table: object, kind: type[T], where: str, error: type[BadInput], reason: str = "") -> T:
+def load_table(table: object, kind: type[T], where: str, error: type[BadInput], reason: str = "", text: str = "") -> T:
     """Create an instance of the dataclass ``kind`` from a table.
 
     Args:
         table: its keys are the fields of ``kind``; inner tables become dataclasses, and lists become tuples.
         where: name of the table in messages, such as "layout 'plush-15'".
         reason: that of the error.
+        text: the TOML that ``table`` was read from, so that messages name the line.
 
     Raises:
         error: for the first unknown or missing key or unfit value; the message has its path.
@@ -104,8 +105,41 @@ def load_table(table: object, kind: type[T], where: str, error: type[BadInput], 
         made: T = _converter().structure(table, kind)
     except Exception as cause:  # noqa: BLE001
         steps, leaf, expected = next(_leaves(cause, (), kind))
-        raise error(_message(table, steps, leaf, expected, where), reason=reason, where=where) from None
+        line = line_of(text, (*steps, *_wrong_key(leaf, table, steps)))
+        named = f"{where}, line {line}" if line else where
+        raise error(_message(table, steps, leaf, expected, named), reason=reason, where=where) from None
     return made
+
+
+_TOML_KEYS = re.compile(r"""\s*(?:\[\[?\s*(?P<header>[^\]\n]+?)\s*\]|(?P<key>[\w.\s"'-]+?)\s*=)""")
+
+
+def line_of(text: str, steps: Steps) -> int:
+    """Return the line, from 1, of a TOML text that sets the value at ``steps`` or a table around it; 0 if none does."""
+    wanted = [step for step in steps if isinstance(step, str)]
+    table: list[str] = []
+    best, line = 0, 0
+    for number, row in enumerate(text.splitlines(), 1):
+        match = _TOML_KEYS.match(row)
+        if match is None:
+            continue
+        keys = [key.strip(" \t\"'") for key in (match["header"] or match["key"]).split(".")]
+        if match["header"]:
+            table = keys
+        there = table if match["header"] else [*table, *keys]
+        if best < len(there) <= len(wanted) and wanted[: len(there)] == there:
+            best, line = len(there), number
+    return line
+
+
+def _wrong_key(cause: Exception, table: object, steps: Steps) -> Steps:
+    """Return the key, below ``steps``, that an error is about, as far as the error says so."""
+    from cattrs.errors import ForbiddenExtraKeysError
+
+    if isinstance(cause, ForbiddenExtraKeysError):
+        return (next(key for key in _value(table, steps) if key in cause.extra_fields),)
+    key = cause.values.get("key") if isinstance(cause, BadInput) else None
+    return (key,) if isinstance(key, str) else ()
 
 
 def check_table(table: Mapping[str, Any], kind: type[Any], where: str) -> tuple[dict[str, Any], list[str]]:

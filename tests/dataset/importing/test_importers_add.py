@@ -13,7 +13,7 @@ import pytest
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, recording_filename, write_recording
-from plushsense.dataset.importing import importers as adding
+from plushsense.dataset.importing import adding
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks

@@ -11,7 +11,7 @@ import pytest
 
 from plushsense.core.errors import ConfigError, DatasetError, FileFormatError, MissingExtraError
 from plushsense.core.layouts import load_layout
-from plushsense.dataset.importing import tables
+from plushsense.dataset.importing import table_files
 from plushsense.dataset.importing.importers import ImportSummary, import_recordings
 
 ACCEL = load_layout("accel-3")
@@ -120,9 +120,9 @@ def test_rows_that_cannot_be_used_are_counted(tmp_path: Path) -> None:
     assert done.recordings == 1
     assert done.dataset.recordings[0].rows == 46
     assert done.notes == [
-        "a.csv: 1 row of another width than the header left out",
-        "a.csv: 2 rows without a number in every column left out",
-        "a.csv: 1 row without a subject left out",
+        "a.csv: 1 row of another width than the header left out (the first: line 10: 'ana,1,Shake')",
+        "a.csv: 2 rows without a number in every column left out (the first: line 7)",
+        "a.csv: 1 row without a subject left out (the first: line 5)",
     ]
 
 
@@ -220,7 +220,7 @@ def test_parquet_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     def need(module: str, extra: str) -> None:
         raise MissingExtraError(f"{module} {extra}")
 
-    monkeypatch.setattr(tables, "need", need)
+    monkeypatch.setattr(table_files, "need", need)
     (tmp_path / "t.parquet").write_bytes(b"PAR1")
     with pytest.raises(MissingExtraError, match="polars tables"):
         import_recordings(tmp_path / "t.parquet", tmp_path / "DS", layout="accel-3")

@@ -29,7 +29,7 @@ from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.quality.checking import CHECKS, Check, CheckReport, check
 from plushsense.dataset.quality.findings import CheckLimits, Issue
-from plushsense.dataset.quality.measurements import Examination
+from plushsense.dataset.quality.measurements import Examination, backward_steps
 from plushsense.dataset.store import Dataset
 from plushsense.recording.simulate import simulate
 from plushsense.studio.app.words import Words
@@ -328,6 +328,16 @@ def leap(folder: Path) -> str:
     return change(folder / "streams" / "P2" / "fulldatastream.csv", lambda f: later(f, 5000, 900_000, 0))
 
 
+def overtaken(folder: Path) -> str:
+    def how(frames: Frames) -> Frames:
+        order = np.arange(len(frames))
+        order[100:108] = [107, *range(100, 107)]
+        assert frames.host_ms is not None
+        return Frames(frames.values[order], frames.device_ms[order], frames.host_ms)
+
+    return change(recording(folder), how)
+
+
 def gap(folder: Path) -> str:
     return change(recording(folder), lambda f: later(f, 120, 60))
 
@@ -389,6 +399,7 @@ PLANTS: list[tuple[str, Callable[[Path], str]]] = [
     ("resumed", next_day),
     ("clock-reset", reset),
     ("clock-reset", leap),
+    ("out-of-order", overtaken),
     ("gaps", gap),
     ("lost-frames", loss),
     ("rate", slow),
@@ -411,6 +422,35 @@ def test_a_planted_fault_is_found_where_it_is(name: str, plant: Callable[[Path],
         assert f.message.reason and english != f.message and latvian not in (english, f.message)
         # Numbers have a decimal comma; ids of files may have points.
         assert not re.search(r"(?<![\w./])\d+\.\d", latvian), latvian
+
+
+def test_rows_that_came_late_are_no_reset_of_the_clock(copy: Path) -> None:
+    about = overtaken(copy)
+    result = check(open_dataset(copy))
+    assert result.findings_of("clock-reset") == []
+    (found,) = result.findings_of("out-of-order")
+    assert (found.about, found.message) == (
+        about,
+        "1 row out of order by the device clock (first row 102, by at most 70 ms)",
+    )
+    assert result.findings_of("gaps", "lost-frames") == [], "the place of a late row is no gap"
+
+
+@pytest.mark.parametrize(
+    ("times", "resets", "late"),
+    [
+        (np.arange(9) * 10, [], []),
+        (np.array([0, 10, 30, 20, 40, 50]), [], [2]),
+        (np.array([0, 10, 40, 30, 20, 50, 60]), [], [2, 3]),
+        # A clock that is set back by five rows passes the same times twice.
+        (np.concatenate([np.arange(20) * 10, 150 + np.arange(20) * 10]), [19], []),
+        (np.concatenate([np.arange(50) * 10, np.arange(50) * 10]), [49], []),
+        # After a reset, rows are late against the new time only.
+        (np.array([5000, 5010, 5020, 0, 10, 30, 20, 40, 50]), [2], [5]),
+    ],
+)
+def test_late_rows_are_told_from_resets(times: np.ndarray, resets: list[int], late: list[int]) -> None:
+    assert [found.tolist() for found in backward_steps(times)] == [resets, late]
 
 
 def test_every_check_has_a_planted_fault() -> None:

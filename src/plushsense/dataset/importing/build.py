@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -303,6 +304,21 @@ def recording_id(file: str) -> str:
     return file.removeprefix(f"{RECORDINGS}/").rpartition(".")[0]
 
 
+def unknown_labels(given: GestureSet, labels: Iterable[str]) -> str:
+    """Return a warning about labels that a gesture set, which was not inferred, has not; "" if it has all."""
+    counts = Counter(label for label in labels if given.find(label) is None)
+    if given.inferred or not counts:
+        return ""
+    listed = ", ".join(f"'{label}' ({n})" for label, n in counts.most_common(8)) + (", …" if len(counts) > 8 else "")
+    return Sentence(
+        f"the gesture set '{given.name}' has no gesture {listed}: such recordings become gestures without affect; give "
+        "other spellings as aliases of a pattern, or a gesture set that has them",
+        reason="labels_unknown",
+        set=given.name,
+        labels=listed,
+    )
+
+
 def extend_gestures(given: GestureSet | None, dataset: Dataset) -> GestureSet:
     """Return ``given`` with the labels that it lacks, or infer a set from the recordings if it is None."""
     if given is None:
@@ -393,6 +409,8 @@ def create_dataset(
         write_index_files(Dataset(work, head, infos, built.dataset.streams))
         account.check()
     dataset = Dataset(dest, head, infos, built.dataset.streams)
+    if search.gestures is not None and (note := unknown_labels(search.gestures, (r.gesture for r in infos))):
+        notes.append(note)
     return summarize_import(dataset, account, search.notes + notes + remarks, set(account.kept), len(trims))
 
 
@@ -436,17 +454,18 @@ def summarize_import(
 _PARTS = re.compile(r"\([^()]*\)|'[^']*'|(?<= as ).+|[+-]?\d+(?:\.\d+)?( \w+?)?s?\b")
 
 
-def group_flags(flags: Iterable[tuple[str, str]]) -> list[str]:
+def group_flags(flags: Iterable[tuple[str, str]], noun: str = "recordings or streams") -> list[str]:
     """Return one warning for each kind of flag.
 
     Args:
         flags: the id of a recording or stream, and the message of a check. Messages are of one kind if they differ
             only in numbers, names in quotes or at the end behind "as", and remarks in brackets.
+        noun: what the ids are of.
     """
     kinds: dict[str, list[tuple[str, str]]] = {}
     for identity, flag in flags:
         kinds.setdefault(_PARTS.sub(lambda part: f"#{part[1] or ''}", flag), []).append((identity, flag))
     return [
-        (f"{len(found)} recordings or streams, for instance " if len(found) > 1 else "") + ": ".join(found[0])
+        (f"{len(found)} {noun}, for instance " if len(found) > 1 else "") + ": ".join(found[0])
         for found in kinds.values()
     ]

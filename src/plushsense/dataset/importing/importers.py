@@ -6,17 +6,13 @@ in `importing.sources`.
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-
-from filelock import FileLock, Timeout
+from typing import Any
 
 from plushsense.core.errors import ConfigError, DatasetError, FileFormatError
 from plushsense.core.files import work_folder, write_file
@@ -24,22 +20,17 @@ from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
 from plushsense.core.sentences import Sentence
-from plushsense.dataset.files import CACHE, sha256_of, walk_files
+from plushsense.dataset.importing.adding import add_to_dataset
 from plushsense.dataset.importing.archives import UnpackLimits, unpack
 from plushsense.dataset.importing.build import (
-    RECORDER,
     WINDOWS,
-    Copier,
-    ImportedFiles,
     ImportSummary,
     create_dataset,
-    extend_gestures,
     folder_name,
-    key_of,
-    merge_people,
-    read_copied,
-    summarize_import,
+    group_flags,
 )
+from plushsense.dataset.importing.pattern import STREAM_ROLE, ImportPattern, check_roles, read_pattern
+from plushsense.dataset.importing.preview import ImportPreview, preview
 from plushsense.dataset.importing.proposals import adopt, matching_layouts, propose_settings, readable_layouts
 from plushsense.dataset.importing.saved_windows import read_windows, windows_layout, write_windows
 from plushsense.dataset.importing.sources import (
@@ -58,167 +49,19 @@ from plushsense.dataset.importing.sources import (
     source_files,
     split_regular_files,
 )
-from plushsense.dataset.importing.tables import STREAM_ROLE, check_roles, read_table
-from plushsense.dataset.importing.truncation import CHOSEN, choices_of, original_of, split_backups, truncation_marks
+from plushsense.dataset.importing.tables import TableImport
+from plushsense.dataset.importing.truncation import CHOSEN, choices_of, original_of, split_backups
 from plushsense.dataset.importing.xdf import person_and_session, read_xdf
-from plushsense.dataset.index import open_dataset, rebuild_index
-from plushsense.dataset.marks import MARKS, Mark, read_marks, write_marks
-from plushsense.dataset.privacy.forget import read_removals
+from plushsense.dataset.index import rebuild_index
 from plushsense.dataset.store import (
     HEAD,
-    RECORDINGS,
-    STREAMS,
-    Dataset,
     DatasetHead,
-    PersonInfo,
     Progress,
     read_people,
-    write_people,
 )
 
-
-@contextmanager
-def _locked_work_folder(dest: Path) -> Iterator[Path]:
-    """Create a work folder on the disk of the data set for one import at a time; remove those of killed imports."""
-    cache = dest / CACHE
-    cache.mkdir(exist_ok=True)
-    try:
-        with FileLock(cache / "adding.lock", timeout=0):
-            for left in cache.glob("adding-*"):
-                shutil.rmtree(left, ignore_errors=True)
-            work = Path(tempfile.mkdtemp(prefix="adding-", dir=cache))
-            try:
-                yield work
-            finally:
-                shutil.rmtree(work, ignore_errors=True)
-    except Timeout:
-        message = f"Another import is adding to '{dest}' now: wait until it ends."
-        raise DatasetError(message, reason="import_runs") from None
-
-
-def _copier(dataset: Dataset, work: Path) -> Copier:
-    """Create a copier into ``work`` that does not copy files of the data set again."""
-    taken: dict[str, str] = {}
-    contents: dict[tuple[str, str], str] = {}
-    for kind, infos in ((RECORDINGS, dataset.recordings), (STREAMS, dataset.streams)):
-        for info in infos:
-            # Recordings that are parts of a stream have no file of their own.
-            if info.file.startswith(f"{kind}/"):
-                taken[key_of(info.file, companion=False)] = info.sha256
-                contents[(kind, info.sha256)] = info.file
-    for path in (*walk_files(dataset.path / RECORDINGS), *walk_files(dataset.path / STREAMS)):
-        if path.suffix.lower() != ".csv":
-            taken[key_of(path.relative_to(dataset.path).as_posix(), companion=True)] = sha256_of(path)
-    return Copier(work, taken, contents, dataset.path)
-
-
-def _new_marks(folder: Path, set_aside: Mapping[str, str]) -> list[Mark]:
-    """Return marks for recordings that the recorder has discarded or kept since; marks of people take precedence.
-
-    Args:
-        set_aside: by recording id, the reason why the recorder discarded it, "" if it did not.
-    """
-    last: dict[str, tuple[str, str]] = {}
-    for line in (folder / MARKS).read_bytes().split(b"\n") if (folder / MARKS).is_file() else ():
-        try:
-            mark = json.loads(line)
-            if mark["action"] in ("exclude", "include"):
-                last[str(mark["recording"])] = (mark["action"], mark["who"])
-        except (ValueError, TypeError, KeyError, RecursionError):
-            continue
-    marks = []
-    for recording, why in set_aside.items():
-        action, who = last.get(recording, ("include", RECORDER))
-        new_action = "exclude" if why else "include"
-        if who == RECORDER and action != new_action:
-            marks.append(Mark(recording, new_action, RECORDER, why or "kept after all"))
-    return marks
-
-
-def add_to_dataset(
-    dest: Path,
-    search: SourceScan,
-    gestures: GestureSet | None,
-    people: Mapping[str, PersonInfo],
-    progress: Progress | None,
-) -> ImportSummary:
-    """Add the files of a search to the data set ``dest``; ``gestures`` may describe gestures that it lacks.
-
-    Raises:
-        DatasetError: if the data set cannot be opened, nothing can be added, or another import is running.
-    """
-    with _locked_work_folder(dest) as work:
-        dataset = open_dataset(dest)
-        if dataset.head.simulated != search.simulated:
-            kinds = ("real", "virtual") if search.simulated else ("virtual", "real")
-            raise DatasetError(
-                f"'{dest}' holds recordings of a {kinds[0]} toy, the source those of a {kinds[1]} one: keep them "
-                "apart.",
-                reason="real_and_virtual",
-            )
-        copier = _copier(dataset, work)
-        account = ImportedFiles(search, copier)
-        own = dataset.head.gestures
-        if new_gestures := tuple(g for g in (gestures.gestures if gestures else ()) if own.find(g.label) is None):
-            own = GestureSet(own.name, own.gestures + new_gestures)
-        head = replace(dataset.head, gestures=own)
-        built = read_copied(account, head, progress)
-        if account.rejected and not account.kept and not copier.already:
-            file, reason = account.rejected[0].values()
-            raise DatasetError(
-                f"Nothing of the source fits '{dest}', whose layout is '{head.layout.name}': all "
-                f"{len(account.rejected)} files are rejected. The first: '{file}': {reason.rstrip('.')}.",
-                reason="import_unreadable",
-                layout=head.layout.name,
-                first=reason,
-            )
-        head = replace(head, gestures=extend_gestures(head.gestures, built.dataset))
-        subjects = {r.subject for r in (*dataset.recordings, *built.dataset.recordings)}
-        there = read_people(dest)
-        listed, notes = merge_people(there, search.people, people, subjects)
-        account.check()
-        new = set(account.kept)
-        # Without the lock, marks and the people's table could restore a person who is removed meanwhile.
-        with dataset.generation.writing():
-            if head.gestures != dataset.head.gestures:
-                write_file(dest / HEAD, head.to_toml())
-            marks = _new_marks(dest, account.set_aside_reasons())
-            both = (*dataset.recordings, *built.dataset.recordings)
-            trims, remarks = truncation_marks(search.choices, both, account.sources, read_marks(dest))
-            write_marks(dest, marks := marks + trims)
-            if {p.subject: p for p in listed} != there:
-                write_people(dest, listed)
-            # Move companions first, so that a recording in the data set always has its sidecar.
-            for file in sorted(new, key=lambda f: (f.lower().endswith(".csv"), f)):
-                target = dest / file
-                target.parent.mkdir(parents=True, exist_ok=True)
-                if target.exists() and file not in copier.grown:
-                    raise DatasetError(f"'{target}' appeared during the import and is not overwritten: import again.")
-                os.replace(work / file, target)
-        rebuilt = rebuild_index(dest, head).dataset if new or marks else open_dataset(dest)
-    come = sorted(set(rebuilt.subjects) - set(dataset.subjects))
-    notes += remarks + _returning_people_warning(dest, come)
-    return summarize_import(rebuilt, account, search.notes + notes, new, len(trims))
-
-
-def _returning_people_warning(dest: Path, come: list[str]) -> list[str]:
-    """Return a warning if ``come`` were added to a data set from which people were removed: they may be the same."""
-    gone = read_removals(dest)
-    if not come or not gone:
-        return []
-    days = ", ".join(dict.fromkeys(g.day for g in gone))
-    listed = f"{', '.join(come[:5])}{f' and {len(come) - 5} more' if len(come) > 5 else ''}"
-    return [
-        Sentence(
-            f"people were removed from this data set ({len(gone)}; {days}), and {listed} were added now: remove a "
-            f"person again with  plushsense forget {dest} CODE",
-            reason="removed_return",
-            people=", ".join(come),
-        )
-    ]
-
-
 FOLDER = "folder"
+PATTERN = "pattern"
 SHOWN = 5
 
 
@@ -241,6 +84,7 @@ class ImportOptions:
     limits: UnpackLimits = field(default_factory=UnpackLimits)
     person: str | None = None
     guess_layout: bool = False
+    pattern: ImportPattern | None = None
 
     def known_layout(self, own: Layout | None, files: Iterable[Path]) -> tuple[Layout, list[str]]:
         """Return the layout ``own`` of the source, else the given one, else the one that the header of a file names.
@@ -260,7 +104,8 @@ class ImportOptions:
         fit = f"the header of the files fits {' and '.join(layout.name for layout in found)}. " if found else ""
         raise ConfigError(
             f"--layout is needed: {fit}Accepted are {', '.join(layout_names())}, or a TOML file of your own, which "
-            "names the channels (see docs/importing.md).",
+            "names the channels (see docs/importing.md). For files of another form, let --guess FILE.toml write a "
+            "pattern.",
             reason="layout_unknown",
         )
 
@@ -323,6 +168,50 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     return search
 
 
+def scan_pattern(source: Path, options: ImportOptions, *, around: Path | None = None) -> SourceScan:
+    """Search a folder or a file for the files that the pattern in ``options`` describes, and convert them.
+
+    ``around`` is as in `scan_folder`.
+    """
+    pattern = options.pattern
+    assert pattern is not None
+    base = source if source.is_dir() else source.parent
+    all_files = source_files(source) if source.is_dir() else [source]
+    files, refused = split_regular_files(f for f in all_files if f.name != SIMULATION_MARK)
+    layout, notes = options.known_layout(None, files)
+    check_roles(pattern.columns, layout, "[columns] of the pattern: ")
+    search = SourceScan(layout, options.known_gestures(layout), PATTERN, [], notes=notes)
+    search.simulated = is_simulation(around or base, all_files)
+    search.found += [replace(f, origin=printable_path(f.source.relative_to(base))) for f in refused]
+    tables = TableImport(options.new_folder("converted"), layout, pattern)
+    remarks: list[tuple[str, str]] = []
+    for file in files:
+        relative = file.relative_to(base).as_posix()
+        name = printable_path(file.relative_to(base))
+        place = pattern.match(relative)
+        if place is None:
+            excluded = pattern.excluded_by(relative)
+            reason = (
+                f"excluded by '{excluded}'" if excluded else f"fits no path of the pattern: {', '.join(pattern.paths)}"
+            )
+            search.found.append(SourceFile(file, LEFT_OUT, origin=name, reason=reason))
+            continue
+        person = options.person or None
+        if options.mapping is not None:
+            person = options.mapping.get(relative, options.mapping.get(file.name))
+        try:
+            for entry in tables.convert(file, name, person, place):
+                if isinstance(entry, Sentence):
+                    remarks.append((entry.values["file"], entry.values["note"]))
+                else:
+                    search.found.append(entry)
+        except FileFormatError as cause:
+            search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
+    search.found += tables.origins()
+    search.notes += group_flags(remarks, "files")
+    return search
+
+
 def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
     """Unpack a zip beside the new data set and search it."""
     # As if the user had unpacked it: recordings at the top belong to the person with the name of the zip.
@@ -333,7 +222,8 @@ def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
         message = f"'{path}' holds a data set: unpack it and open the folder, it needs no import."
         raise DatasetError(message, reason="import_of_dataset", name=path.name)
     options = replace(options, person=options.person or None)
-    search = scan_folder(folder, options, around=path.resolve().parent)
+    scan = scan_folder if options.pattern is None else scan_pattern
+    search = scan(folder, options, around=path.resolve().parent)
     search.found += [SourceFile(path, "", origin=printable_path(Path(name)), reason=reason) for name, reason in refused]
     return search
 
@@ -375,7 +265,9 @@ def scan_table(path: Path, options: ImportOptions) -> SourceScan:
     search = _scan_of_file(path, "table", options)
     check_roles(options.columns, search.layout)
     person = (options.mapping or {}).get(path.name) or options.person or None
-    _add(read_table(path, path.name, options.new_folder("converted"), person, search.layout, options.columns), search)
+    columns = {role: name for role, name in options.columns.items() if role != STREAM_ROLE}
+    tables = TableImport(options.new_folder("converted"), search.layout, ImportPattern(columns=columns))
+    _add(tables.convert(path, path.name, person), search)
     return search
 
 
@@ -429,9 +321,13 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
         DatasetError: if it is neither, cannot be read, or contains nothing to import.
     """
     try:
-        if source.is_dir():
+        if options.pattern is not None and source.exists() and source.suffix.lower() != ".zip":
+            search = scan_pattern(source, options)
+        elif source.is_dir():
             if unused := sorted(set(options.columns) - {STREAM_ROLE}):
-                raise ConfigError(f"--column {unused[0]}=… is for a table; '{source}' is a folder.")
+                raise ConfigError(
+                    f"--column {unused[0]}=… is for a table; '{source}' is a folder: describe it with --pattern FILE."
+                )
             search = scan_folder(source, options)
         elif source.is_file():
             if source.suffix.lower() not in FORMATS:
@@ -451,10 +347,14 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
     if not any(f.kind in ("recordings", "streams") for f in search.found):
         first = next((f" The first: '{f.origin}': {f.reason.rstrip('.')}." for f in search.found if f.reason), "")
         unknown = any(getattr(f.reason, "reason", "") == "person_unknown" for f in search.found)
+        expected = "<label>_<epoch ms>_<rows>.csv in a folder per person"
+        if options.pattern is not None:
+            expected = f"files that fit {', '.join(options.pattern.paths)}"
+        elif search.shape == "labelled-rows":
+            expected += " (or CSVs with a label column)"
         raise DatasetError(
-            f"'{source}' holds no recording: expected <label>_<epoch ms>_<rows>.csv in a folder per person"
-            f"{' (or CSVs with a label column)' if search.shape == 'labelled-rows' else ''}; "
-            f"found {len(search.found)} other files.{first}",
+            f"'{source}' holds no recording: expected {expected}; found {len(search.found)} other files.{first}"
+            + ("" if options.pattern is not None else " Other files can be described with --pattern FILE.toml."),
             reason="person_unknown" if unknown else "import_nothing",
             n=len(search.found),
         )
@@ -471,6 +371,55 @@ def _propose(done: ImportSummary, adopting: bool) -> None:
         head = replace(head, layout=layout)
         write_file(done.dataset.path / HEAD, head.to_toml())
         done.dataset = rebuild_index(done.dataset.path, head).dataset
+
+
+def _options(
+    new_folder: Callable[[str], Path],
+    layout: Layout | str | Path | None = None,
+    gestures: GestureSet | str | Path | None = None,
+    subjects: str | Path = FOLDER,
+    columns: Mapping[str, str] | None = None,
+    limits: UnpackLimits | None = None,
+    person: str | None = None,
+    guess_layout: bool = False,
+    pattern: ImportPattern | str | Path | None = None,
+) -> ImportOptions:
+    """Load the files that options of an import name; a layout, gestures or columns override those of the pattern."""
+    if pattern is not None and not isinstance(pattern, ImportPattern):
+        pattern = read_pattern(pattern)
+    if pattern is not None:
+        pattern = replace(pattern, columns={**pattern.columns, **(columns or {})})
+        layout = pattern.known_layout() if layout is None else layout
+        gestures = pattern.known_gestures() if gestures is None else gestures
+    return ImportOptions(
+        layout if isinstance(layout, Layout) or layout is None else load_layout(layout),
+        gestures if isinstance(gestures, GestureSet) or gestures is None else load_gestures(gestures),
+        None if str(subjects) == FOLDER else read_mapping(Path(subjects)),
+        new_folder,
+        columns=columns or {},
+        limits=limits or UnpackLimits(),
+        person=person,
+        guess_layout=guess_layout,
+        pattern=pattern,
+    )
+
+
+def _grid(layout: Layout) -> list[tuple[str, float]]:
+    """Return the name and the step of each channel."""
+    return [(channel.name, channel.step) for channel in layout.channels]
+
+
+def preview_import(source: str | Path, **given: Any) -> ImportPreview:
+    """Return what `import_recordings` would understand of ``source``; nothing is written.
+
+    Args:
+        given: layout, gestures, subjects, columns, limits, person, guess_layout and pattern of `import_recordings`.
+
+    Raises:
+        DatasetError: if there is nothing to import.
+    """
+    with tempfile.TemporaryDirectory(prefix="plushsense-") as place, _temporary_folders(Path(place) / "new") as folder:
+        return preview(scan_source(Path(source), _options(folder, **given)))
 
 
 def import_recordings(
@@ -492,6 +441,7 @@ def import_recordings(
     adopt_proposals: bool = False,
     person: str | None = None,
     guess_layout: bool = False,
+    pattern: ImportPattern | str | Path | None = None,
 ) -> ImportSummary:
     """Create a data set at ``dest`` from recordings, or add them to an existing one.
 
@@ -513,6 +463,7 @@ def import_recordings(
         person: the person of files that name none: those directly in ``source``, in folders of gestures, and XDF files
             and tables without a person. "" refuses them; None takes the name of the folder where there is one.
         guess_layout: if no layout is given or stated, take the most probable built-in one that can read the files.
+        pattern: description of files of other projects, or the path of its TOML file.
 
     Returns:
         The summary. Every source file is imported (possibly with warnings), left out, or rejected with a reason.
@@ -522,38 +473,34 @@ def import_recordings(
     """
     began = time.perf_counter()
     source, dest = Path(source), Path(dest)
-    given = layout if isinstance(layout, Layout) or layout is None else load_layout(layout)
-    if gestures is not None and not isinstance(gestures, GestureSet):
-        gestures = load_gestures(gestures)
-    mapping = None if str(subjects) == FOLDER else read_mapping(Path(subjects))
     if people is not None and not Path(people).exists():
         raise DatasetError(f"There is no people's file '{people}': check the path.")
     people_info = {} if people is None else read_people(Path(people))
     if source.is_dir() and dest.resolve() != source.resolve() and dest.resolve().is_relative_to(source.resolve()):
         raise ConfigError(f"'{dest}' lies in '{source}', which is only read: give a folder outside of it.")
-    head = None
-    if add_to:
-        head = DatasetHead.read(dest)
-        if adopt_proposals:
-            raise ConfigError("--add keeps the layout of the data set: leave --adopt out.")
-        if given is not None and given.to_dict() != head.layout.to_dict():
-            raise DatasetError(f"'{dest}' has the layout '{head.layout.name}', not '{given.name}': leave --layout out.")
-        if name or licence or consent:
-            raise ConfigError("--add keeps the name, licence and consent statement of the data set: leave them out.")
-    # An inferred set cannot decide which markers of an XDF file are gestures.
-    known = gestures if head is None or head.gestures.inferred else head.gestures
     with _temporary_folders(dest) as new_folder:
-        options = ImportOptions(
-            given if head is None else head.layout,
-            known,
-            mapping,
-            new_folder,
-            "the given layout" if head is None else "that of the data set",
-            columns or {},
-            limits or UnpackLimits(),
-            person,
-            guess_layout,
-        )
+        options = _options(new_folder, layout, gestures, subjects, columns, limits, person, guess_layout, pattern)
+        given, known, head = options.layout, options.gestures, None
+        if add_to:
+            head = DatasetHead.read(dest)
+            if adopt_proposals:
+                raise ConfigError("--add keeps the layout of the data set: leave --adopt out.")
+            if layout is not None and given is not None and given.to_dict() != head.layout.to_dict():
+                own = head.layout.name
+                raise DatasetError(f"'{dest}' has the layout '{own}', not '{given.name}': leave --layout out.")
+            # The rate, gap and offsets may have been adopted from the recordings.
+            if layout is None and given is not None and _grid(given) != _grid(head.layout):
+                raise DatasetError(
+                    f"'{dest}' has the channels {', '.join(head.layout.names)}, but the pattern has "
+                    f"{', '.join(given.names)}, or other steps: a data set has one layout, so import them apart."
+                )
+            if name or licence or consent:
+                raise ConfigError(
+                    "--add keeps the name, licence and consent statement of the data set: leave them out."
+                )
+            # An inferred set cannot decide which markers of an XDF file are gestures.
+            of_set = known if head.gestures.inferred else head.gestures
+            options = replace(options, layout=head.layout, gestures=of_set, layout_origin="that of the data set")
         search = scan_source(source, options)
         search.simulated = search.simulated or simulated
         if head is None:
@@ -570,7 +517,7 @@ def import_recordings(
             _propose(done, adopt_proposals)
         else:
             try:
-                done = add_to_dataset(dest, search, gestures, people_info, progress)
+                done = add_to_dataset(dest, search, known, people_info, progress)
             except OSError as cause:
                 raise DatasetError(
                     f"'{dest}' cannot be written ({cause.strerror or cause}, {cause.filename}), but is as valid as "

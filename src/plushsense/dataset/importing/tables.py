@@ -1,21 +1,20 @@
-"""Import a table with one row per sample: ``subject, [session], [recording], label, time`` and the channels.
+"""Import tables with one row per sample: ``subject, [session], [recording], label, time`` and the channels.
 
-A Parquet table may also have one row per recording or stream, with lists of samples as cells, as in data sets of
-Hugging Face.
+Objects of JSON and rows of Parquet may also hold lists of samples, as in data sets of Hugging Face: one for each
+recording or stream.
 
 Rows are grouped by person and session, in the order of the file. A recording is a run of rows with the same label (and
 the same ``recording``, if there is such a column); without that column it also ends where the time decreases or pauses
-for more than a second. Rows without a label belong to no recording; a session with such rows is also written as stream.
+for more than a second. A file whose path names the label or the take is one recording. Rows without a label belong to
+no recording; a session with such rows is also written as stream.
 """
 
 from __future__ import annotations
 
-import csv
 import itertools
 import json
-from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,9 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError, FileFormatError, nearest, need
 from plushsense.core.gestures import plain_label
-from plushsense.core.layouts import DEVICE_MS, HOST_MS, Layout
+from plushsense.core.layouts import HOST_MS, Layout
 from plushsense.core.recorder_csv import (
     LONGEST_LABEL,
     STREAM_NAME,
@@ -33,11 +31,13 @@ from plushsense.core.recorder_csv import (
     format_header,
     format_rows,
     recording_filename,
-    write_recording,
 )
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.files import sha256_of
+from plushsense.dataset.importing.pattern import UNITS, ImportPattern
 from plushsense.dataset.importing.sources import COMPANIONS, SourceFile
+from plushsense.dataset.importing.table_files import ImportedColumns, TableFile, read_rows, unit_of_time
+from plushsense.dataset.quality.measurements import in_order
 from plushsense.dataset.store import RECORDINGS, STREAMS
 
 ORIGIN = "origin.json"
@@ -49,11 +49,15 @@ _BETWEEN = 0.05
 
 @dataclass(frozen=True)
 class LabelledSegment:
-    """Labelled part of a session: the rows from ``start`` to before ``stop`` of its frames."""
+    """Labelled part of a session: the rows from ``start`` to before ``stop`` of its frames.
+
+    ``spelling`` is the label as the source spells it, "" if it is the same.
+    """
 
     label: str
     start: int
     stop: int
+    spelling: str = ""
 
 
 @dataclass(frozen=True)
@@ -65,10 +69,13 @@ class ConvertedSource:
     more: dict[str, Any]
 
     @cached_property
-    def text(self) -> str:
-        """Text of ``origin.json``: the source, its SHA-256 and ``more``."""
-        table = {"source": self.display_name, "sha256": sha256_of(self.path)} | self.more
-        return json.dumps(table, ensure_ascii=False, indent=1) + "\n"
+    def table(self) -> dict[str, Any]:
+        """Content of ``origin.json``: the source, its SHA-256 and ``more``."""
+        return {"source": self.display_name, "sha256": sha256_of(self.path)} | self.more
+
+
+def _json(table: Mapping[str, Any]) -> str:
+    return json.dumps(table, ensure_ascii=False, indent=1) + "\n"
 
 
 def whole_steps(values: NDArray[np.float64], layout: Layout) -> tuple[NDArray[np.int64], str]:
@@ -106,10 +113,13 @@ def write_session(
     original: ConvertedSource,
     *,
     with_stream: bool,
+    taken: set[str] | None = None,
 ) -> Iterator[SourceFile]:
     """Write one session into the new ``folder``: recordings, with ``with_stream`` the stream, and ``origin.json``.
 
     For a layout with a label on every row, one labelled stream is written instead of recordings. Yields the files.
+    ``taken`` are names of recordings in other files of the session, to which the new ones are added; with it, no
+    ``origin.json`` is written.
     """
     folder.mkdir(parents=True)
     where = f"{original.display_name}: {subject}{f', session {session}' if session else ''}"
@@ -130,208 +140,28 @@ def write_session(
             for start in range(0, len(frames), 20_000):
                 file.write(format_rows(frames.slice(start, start + 20_000), layout))
         yield SourceFile(main, STREAMS, subject, session=session, origin=f"{where}, the whole stream")
-    written_paths: set[Path] = set()
+    names = set[str]() if taken is None else taken
     clock = frames.device_ms if frames.host_ms is None or HOST_MS not in layout.csv.columns else frames.host_ms
     for cut in cuts:
-        name = f"{where}, rows {cut.start + 1} to {cut.stop} ('{cut.label[:40]}')"
+        name = f"{where}, rows {cut.start + 1} to {cut.stop} ('{(cut.spelling or cut.label)[:40]}')"
         at_ms = abs(int(clock[cut.start]))
         # Recordings of the same label and length would have the same name if their clocks all begin at 0.
-        while (path := folder / recording_filename(cut.label, at_ms, cut.stop - cut.start)) in written_paths:
+        while (path := folder / recording_filename(cut.label, at_ms, cut.stop - cut.start)).name in names:
             at_ms += 1
-        written_paths.add(path)
+        names.add(path.name)
         if len(path.name.encode("utf-8")) > LONGEST_LABEL:
             note = Sentence("its label is too long for a file name", reason="label_too_long")
             yield SourceFile(path, "", origin=name, reason=note)
             continue
-        write_recording(path, frames.slice(cut.start, cut.stop), layout)
+        # Nothing is lost if these temporary files are: they need not be on the disk before the import copies them.
+        rows = format_rows(frames.slice(cut.start, cut.stop), layout)
+        path.write_text(format_header(layout) + rows, encoding="utf-8", newline="\n")
         yield SourceFile(path, RECORDINGS, subject, session=session, origin=name)
+    if taken is not None:
+        return
     about = folder / ORIGIN
-    about.write_text(original.text, encoding="utf-8", newline="\n")
+    about.write_text(_json(original.table), encoding="utf-8", newline="\n")
     yield SourceFile(about, COMPANIONS, subject, session=session, origin=f"{where}, {ORIGIN}", beside=main)
-
-
-PAUSE_MS = 1000.0
-STREAM_ROLE = "stream"
-# Accepted column names by role.
-ROLES: dict[str, tuple[str, ...]] = {
-    "subject": ("subject", "participant", "person", "subject_id", "participant_id"),
-    "session": ("session", "session_id"),
-    "recording": ("recording", "recording_id", "trial"),
-    "label": ("label", "gesture", "activity"),
-    "time": (DEVICE_MS, "time", "timestamp", "time_ms", "time_s", "timestamp_ms", "timestamp_s", "t"),
-    HOST_MS: (HOST_MS,),
-}
-_TEXTS = ("subject", "session", "recording", "label")
-_UNITS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1000.0}
-
-
-@dataclass(frozen=True)
-class ImportedColumns:
-    """Columns of a table by role or channel: their ``names``, texts, and numbers (T,) with NaN for missing ones."""
-
-    names: dict[str, str]
-    texts: dict[str, list[str]]
-    numbers: dict[str, NDArray[np.float64]]
-    malformed: int = 0
-    in_ms: bool = False
-    """Whether the time column had a temporal type and was converted to milliseconds."""
-
-
-def check_roles(columns: Mapping[str, str], layout: Layout) -> None:
-    """Raise ConfigError for an unknown role in ``columns`` (the option ``--column``)."""
-    known = (*ROLES, STREAM_ROLE, *layout.names)
-    for role in columns:
-        if role not in known:
-            raise ConfigError(f"--column {role}=…: accepted are {', '.join(known)}.{nearest(role, known)}")
-
-
-def choose_columns(there: list[str], layout: Layout, given: Mapping[str, str], display_name: str) -> dict[str, str]:
-    """Return the name in ``there`` (the table's columns) for each role and channel; ``given`` overrides the defaults.
-
-    Raises:
-        FileFormatError: for a missing column, or two columns of the same name.
-    """
-    plain = [name.strip().casefold() for name in there]
-    candidates: dict[str, tuple[str, ...]] = dict(ROLES)
-    headers = dict(zip(layout.csv.columns, layout.csv.header, strict=True))
-    candidates |= {n: (n, headers.get(n, n)) for n in layout.names}
-    for key, role in ((DEVICE_MS, "time"), (HOST_MS, HOST_MS)):
-        candidates[role] = (*candidates[role], headers.get(key, key))
-    chosen = {}
-    for role, names in candidates.items():
-        if role in given:
-            names = (given[role],)
-        match = next((n.strip().casefold() for n in names if n.strip().casefold() in plain), None)
-        if match is not None and plain.count(match) > 1:
-            message = f"'{display_name}' has two columns '{match}': rename one of them"
-            raise FileFormatError(message, reason="column_twice", file=display_name, column=match)
-        if match is not None:
-            chosen[role] = there[plain.index(match)]
-        elif role in given or role in ("label", "time") or role in layout.names:
-            if not any(plain):
-                message = f"'{display_name}' begins with no line of column names: a table needs a header"
-                raise FileFormatError(message, reason="table_no_header", file=display_name)
-            listed = ", ".join(t[:30] for t in there[:20]) + (", …" if len(there) > 20 else "")
-            raise FileFormatError(
-                f"'{display_name}' has no column '{names[0]}'; it has {listed}: name the right one with "
-                f"--column {role}=NAME",
-                reason="table_column_missing",
-                file=display_name,
-                column=names[0],
-                there=listed,
-            )
-    return chosen
-
-
-def read_csv(path: Path, display_name: str, layout: Layout, given: Mapping[str, str]) -> ImportedColumns:
-    """Read a CSV table in UTF-8 with a header and ``,``, ``;`` or tab as separator; skip lines of another width."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            first = file.readline()
-            separator = max(",;\t", key=first.count)
-            there = next(csv.reader([first], delimiter=separator), [])
-            names = choose_columns(there, layout, given, display_name)
-            at = {role: there.index(name) for role, name in names.items()}
-            texts: dict[str, list[str]] = {role: [] for role in names if role in _TEXTS}
-            numbers = {role: array("d") for role in names if role not in _TEXTS}
-            text_at = [(values.append, at[role]) for role, values in texts.items()]
-            number_at = [(values.append, at[role]) for role, values in numbers.items()]
-            same: dict[str, str] = {}
-            malformed = 0
-            for row in csv.reader(file, delimiter=separator):
-                if len(row) != len(there):
-                    malformed += bool(row)
-                    continue
-                for append, index in text_at:
-                    text = row[index].strip()
-                    append(same.setdefault(text, text))
-                for push, index in number_at:
-                    push(_number(row[index]))
-    except UnicodeDecodeError:
-        message = f"'{display_name}' is not UTF-8: save it as UTF-8"
-        raise FileFormatError(message, reason="table_not_utf8", file=display_name) from None
-    except csv.Error as cause:
-        message = f"'{display_name}' is no CSV table: {cause}"
-        raise FileFormatError(message, reason="table_damaged", file=display_name) from None
-    return ImportedColumns(
-        names, texts, {role: np.array(v, dtype=np.float64) for role, v in numbers.items()}, malformed
-    )
-
-
-def _number(text: str) -> float:
-    try:
-        # Python would accept 1_000 as a number.
-        return float(text) if "_" not in text else float("nan")
-    except ValueError:
-        return float("nan")
-
-
-def read_parquet(path: Path, display_name: str, layout: Layout, given: Mapping[str, str]) -> ImportedColumns:
-    """Read a Parquet table with polars; each value of a list becomes a row, and a row of lists a recording."""
-    with path.open("rb") as file:
-        if file.read(4) != b"PAR1":
-            message = f"'{display_name}' is no Parquet file: it does not begin with PAR1"
-            raise FileFormatError(message, reason="table_damaged", file=display_name)
-    pl = need("polars", extra="tables")
-    try:
-        with path.open("rb") as file:
-            there = list(pl.read_parquet_schema(file))
-        names = choose_columns(there, layout, given, display_name)
-        with path.open("rb") as file:
-            table = pl.read_parquet(file, columns=list(dict.fromkeys(names.values())))
-        lists = [n for n in table.columns if table[n].dtype.base_type() in (pl.List, pl.Array)]
-        if lists:
-            row = "row" + "_" * max(map(len, table.columns))
-            table = table.with_row_index(row).explode(lists)
-            if "recording" not in names:
-                names["recording"] = row
-        nested = next((n for n in table.columns if table[n].dtype.is_nested()), None)
-        if nested is not None:
-            message = f"'{display_name}' has more than one value in a cell of column '{nested}'"
-            raise FileFormatError(message, reason="table_damaged", file=display_name)
-        texts = {
-            r: [text.strip() for text in table[n].cast(pl.String).fill_null("").to_list()]
-            for r, n in names.items()
-            if r in _TEXTS
-        }
-        numbers = {r: _parquet_numbers(pl, table[n]) for r, n in names.items() if r not in _TEXTS}
-        in_ms = table[names["time"]].dtype.is_temporal()
-    except FileFormatError:
-        raise
-    except BaseException as cause:
-        # A panic of polars on damaged bytes is a BaseException but no Exception.
-        if not isinstance(cause, Exception) and type(cause).__name__ != "PanicException":
-            raise
-        message = " ".join(str(cause).split())[:120] or type(cause).__name__
-        message = f"'{display_name}' cannot be read as Parquet: {message}"
-        raise FileFormatError(message, reason="table_damaged", file=display_name) from None
-    return ImportedColumns(names, texts, numbers, in_ms=in_ms)
-
-
-def _parquet_numbers(pl: Any, column: Any) -> NDArray[np.float64]:
-    if column.dtype.is_temporal():
-        microseconds = column.dt.total_microseconds() if column.dtype == pl.Duration else column.dt.epoch("us")
-        column = microseconds.cast(pl.Float64) / 1000.0
-    return np.asarray(column.cast(pl.Float64, strict=False).fill_null(float("nan")).to_numpy())
-
-
-def milliseconds(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple[float, str]:
-    """Return the milliseconds per unit of the time column, and a note if its name does not state the unit.
-
-    In that case, the unit is the one that agrees best with the layout's rate.
-    """
-    plain = name.strip().casefold().rstrip(")")
-    for unit, factor in _UNITS.items():
-        if plain.endswith((f"_{unit}", f"({unit}", f"[{unit}]")):
-            return factor, ""
-    steps = np.diff(times[:100_000])
-    forward = steps[np.isfinite(steps) & (steps > 0)]
-    if not len(forward):
-        return 1.0, Sentence(f"column '{name}' is read as milliseconds", reason="time_unit", column=name, unit="ms")
-    step = float(np.median(forward))
-    unit = min(_UNITS, key=lambda u: abs(np.log(step * _UNITS[u] * rate_hz / 1000.0)))
-    message = f"column '{name}' is read as {unit}, as the rate of {rate_hz:g} Hz suggests"
-    return _UNITS[unit], Sentence(message, reason="time_unit", column=name, unit=unit)
 
 
 def about_file(name: str, note: str) -> Sentence:
@@ -346,81 +176,169 @@ def _codes(texts: Iterable[str]) -> tuple[NDArray[np.int64], list[str]]:
     return np.array(numbers, dtype=np.int64), list(known)
 
 
-def read_table(
-    path: Path, display_name: str, folder: Path, subject: str | None, layout: Layout, given: Mapping[str, str]
-) -> Iterator[SourceFile | str]:
-    """Write the recordings of a table into the new ``folder``; yield the files, and warnings as text.
+PAUSE_MS = 1000.0
 
-    ``subject`` is the person if the table has no such column.
 
-    Raises:
-        FileFormatError: for a table that cannot be read, lacks a column, or has no usable row.
-        MissingExtraError: for Parquet without polars.
+@dataclass
+class TableImport:
+    """Conversion of tables into recordings below the new ``folder``.
+
+    ``person`` is the person of files that name none, None if it is not known.
     """
-    read = read_parquet if path.suffix.lower() == ".parquet" else read_csv
-    columns = read(path, display_name, layout, given)
-    if "subject" not in columns.names and subject is None:
-        raise FileFormatError(
-            f"'{display_name}' has no column 'subject': name the right one with --column subject=NAME, or the person "
-            "with --subjects map.csv (file,subject)",
-            reason="person_unknown",
+
+    folder: Path
+    layout: Layout
+    pattern: ImportPattern
+    _taken: dict[tuple[str, str], set[str]] = field(default_factory=dict)
+    _origins: dict[tuple[str, str], list[dict[str, Any]]] = field(default_factory=dict)
+    _written: int = 0
+
+    def convert(
+        self, path: Path, display_name: str, person: str | None, place: Mapping[str, str] | None = None
+    ) -> Iterator[SourceFile | Sentence]:
+        """Write the recordings of a table; yield the files, and warnings as `about_file` makes them.
+
+        ``place`` are the parts of the path, None without a pattern, when each session gets its ``origin.json`` at once.
+
+        Raises:
+            FileFormatError: for a table that cannot be read, lacks a column, or has no usable row.
+            MissingExtraError: for Parquet without polars.
+        """
+        table = TableFile(path, display_name, self.layout, self.pattern, place)
+        columns = read_rows(table)
+        place = place or {}
+        subject = place.get("subject", person)
+        if "subject" not in columns.names and subject is None:
+            raise table.error(
+                f"has no column 'subject': {table.hint('subject')}, or the person with --subjects map.csv "
+                "(file,subject)",
+                reason="person_unknown",
+            )
+        times = columns.numbers["time"]
+        factor, note = self._factor(columns, times)
+        if note:
+            yield about_file(display_name, note)
+        device = times * factor
+        host = columns.numbers.get(HOST_MS, device)
+        rows = len(device)
+
+        def part(role: str, otherwise: str) -> tuple[NDArray[np.int64], list[str]]:
+            return _codes(columns.texts.get(role) or itertools.repeat(place.get(role, otherwise), rows))
+
+        people, codes = part("subject", subject or "")
+        # Files with rows between their recordings are sessions of their own, since each is a stream.
+        sessions, session_names = part(
+            "session", path.stem if table.place is not None and not place.get("label") else ""
         )
-    raw = np.column_stack([columns.numbers[n] for n in layout.names])
-    times = columns.numbers["time"]
-    factor, note = (1.0, "") if columns.in_ms else milliseconds(columns.names["time"], times, layout.rate_hz)
-    device = times * factor
-    host = columns.numbers.get(HOST_MS, device)
-    rows = len(device)
-    people, codes = _codes(columns.texts.get("subject", itertools.repeat(subject or "", rows)))
-    sessions, session_names = _codes(columns.texts.get("session", itertools.repeat("", rows)))
-    labels, label_names = _codes(columns.texts["label"])
-    takes, _ = _codes(columns.texts.get("recording", itertools.repeat("", rows)))
-    known = np.array([bool(c) for c in codes], dtype=bool)[people] if rows else np.empty(0, bool)
-    good = usable_rows(raw, device, host)
-    if note:
-        yield about_file(display_name, note)
-    for count, reason in (
-        (columns.malformed, "of another width than the header"),
-        (int(np.sum(~good)), "without a number in every column"),
-        (int(np.sum(good & ~known)), "without a subject"),
+        labels, spellings = part("label", "")
+        takes, _ = part("recording", "")
+        label_names = [self.pattern.label_of(text) for text in spellings]
+        raw = np.column_stack([columns.numbers[n] for n in self.layout.names])
+        invalid = np.isinf(raw)
+        raw[invalid] = 0.0
+        good = usable_rows(raw, device, host)
+        known = np.array([bool(c) for c in codes], dtype=bool)[people] if rows else np.empty(0, bool)
+        yield from _left_out(table, columns, good, known)
+        good &= known
+        if not good.any():
+            raise table.error(
+                f"has no usable row: each needs a subject, a time and {self.layout.n_channels} numbers",
+                reason="rows_unusable",
+                n=self.layout.n_channels,
+            )
+        values, note = whole_steps(raw[good], self.layout)
+        if note:
+            yield about_file(display_name, note)
+        if count := int(invalid[good].sum()):
+            # A value beyond the valid range is invalid for every reader, which repeats the last valid one.
+            values = np.where(invalid[good], self.layout.valid_max_int + 1, values)
+            words = ", ".join(f"'{word}'" for word in self.pattern.missing)
+            yield about_file(display_name, f"{count} values are missing ({words}): they count as invalid")
+        device_ms, host_ms = (np.round(clock[good]).astype(np.int64) for clock in (device, host))
+        people, sessions, labels, takes = people[good], sessions[good], labels[good], takes[good]
+        named = np.array([bool(plain_label(n)) and len(n) <= LONGEST_LABEL for n in label_names], dtype=bool)
+        whole_file = bool({"label", "recording"} & set(place)) or columns.own_recordings
+        group = people * len(session_names) + sessions
+        order = np.argsort(group, kind="stable")
+        edges = [0, *(np.flatnonzero(np.diff(group[order])) + 1).tolist(), len(order)]
+        original = ConvertedSource(path, display_name, {"columns": columns.names})
+        for first, last in itertools.pairwise(edges):
+            mine = order[first:last]
+            moved = in_order(device_ms[mine])
+            if table.place is not None and (n := int(np.sum(moved != np.arange(len(moved))))):
+                yield about_file(display_name, f"{n} rows put into the order of their times")
+                mine = mine[moved]
+            frames = Frames(values[mine], device_ms[mine], host_ms[mine])
+            new = (np.diff(labels[mine]) != 0) | (np.diff(takes[mine]) != 0)
+            if "recording" not in columns.names and not whole_file:
+                steps = np.diff(frames.device_ms)
+                new |= (steps < 0) | (steps > PAUSE_MS)
+            runs = [0, *(np.flatnonzero(new) + 1).tolist(), len(mine)]
+            labelled = named[labels[mine]]
+            texts = [(label_names[k], spellings[k]) for k in labels[mine[runs[:-1]]]]
+            cuts = [
+                LabelledSegment(label, a, b, spelling)
+                for (label, spelling), (a, b) in zip(texts, itertools.pairwise(runs), strict=True)
+                if labelled[a]
+            ]
+            key = codes[people[mine[0]]], session_names[sessions[mine[0]]]
+            taken = None if table.place is None else self._taken.setdefault(key, set())
+            written = write_session(
+                self.folder / str(self._written),
+                *key,
+                frames,
+                cuts,
+                self.layout,
+                original,
+                with_stream=not labelled.all(),
+                taken=taken,
+            )
+            self._written += 1
+            files = list(written)
+            yield from files
+            if taken is not None:
+                made = {f.source.name: f.origin for f in files if f.kind == RECORDINGS}
+                self._origins.setdefault(key, []).append(original.table | {"recordings": made})
+
+    def _factor(self, columns: ImportedColumns, times: NDArray[np.float64]) -> tuple[float, str]:
+        """Return the milliseconds per unit of the time column, and a note if the unit is stated nowhere."""
+        if columns.in_ms:
+            return 1.0, ""
+        if self.pattern.time_unit:
+            return UNITS[self.pattern.time_unit], ""
+        name = columns.names["time"]
+        unit, stated = unit_of_time(name, times, self.layout.rate_hz)
+        if stated:
+            return UNITS[unit], ""
+        suggests = len(times) > 1 and np.any(np.diff(times) > 0)
+        why = f", as the rate of {self.layout.rate_hz:g} Hz suggests" if suggests else ""
+        message = f"column '{name}' is read as {unit if suggests else 'milliseconds'}{why}"
+        return UNITS[unit], Sentence(message, reason="time_unit", column=name, unit=unit)
+
+    def origins(self) -> Iterator[SourceFile]:
+        """Write ``origin.json`` of each session that was converted with a pattern, with the original names."""
+        for number, ((subject, session), sources) in enumerate(self._origins.items()):
+            about = self.folder / "origins" / str(number) / ORIGIN
+            about.parent.mkdir(parents=True)
+            about.write_text(_json({"sources": sources}), encoding="utf-8", newline="\n")
+            where = f"{subject}{f', session {session}' if session else ''}, {ORIGIN}"
+            yield SourceFile(about, COMPANIONS, subject, session=session, origin=where)
+
+
+def _left_out(
+    table: TableFile, columns: ImportedColumns, good: NDArray[np.bool_], known: NDArray[np.bool_]
+) -> Iterator[Sentence]:
+    """Yield notes about the rows that are not used, with the line of the first of each kind."""
+
+    def first(bad: NDArray[np.bool_]) -> str:
+        return f"line {columns.lines[int(np.argmax(bad))]}" if len(columns.lines) and bad.any() else ""
+
+    for count, reason, where in (
+        (columns.malformed, columns.why_malformed, columns.first_malformed),
+        (int(np.sum(~good)), "without a number in every column", first(~good)),
+        (int(np.sum(good & ~known)), "without a subject", first(good & ~known)),
     ):
         if count:
-            message = f"{count} row{'s' if count > 1 else ''} {reason} left out"
-            yield about_file(display_name, Sentence(message, reason="rows_left_out", n=count))
-    good &= known
-    if not good.any():
-        raise FileFormatError(
-            f"'{display_name}' has no usable row: each needs a subject, a time and {layout.n_channels} numbers",
-            reason="rows_unusable",
-            n=layout.n_channels,
-        )
-    values, note = whole_steps(raw[good], layout)
-    if note:
-        yield about_file(display_name, note)
-    device_ms, host_ms = (np.round(clock[good]).astype(np.int64) for clock in (device, host))
-    people, sessions, labels, takes = people[good], sessions[good], labels[good], takes[good]
-    named = np.array([bool(plain_label(n)) and len(n) <= LONGEST_LABEL for n in label_names], dtype=bool)
-    group = people * len(session_names) + sessions
-    order = np.argsort(group, kind="stable")
-    edges = [0, *(np.flatnonzero(np.diff(group[order])) + 1).tolist(), len(order)]
-    original = ConvertedSource(path, display_name, {"columns": columns.names})
-    for number, (first, last) in enumerate(itertools.pairwise(edges)):
-        mine = order[first:last]
-        frames = Frames(values[mine], device_ms[mine], host_ms[mine])
-        new = (np.diff(labels[mine]) != 0) | (np.diff(takes[mine]) != 0)
-        if "recording" not in columns.names:
-            steps = np.diff(frames.device_ms)
-            new |= (steps < 0) | (steps > PAUSE_MS)
-        runs = [0, *(np.flatnonzero(new) + 1).tolist(), len(mine)]
-        labelled = named[labels[mine]]
-        cuts = [LabelledSegment(label_names[labels[mine[a]]], a, b) for a, b in itertools.pairwise(runs) if labelled[a]]
-        yield from write_session(
-            folder / str(number),
-            codes[people[mine[0]]],
-            session_names[sessions[mine[0]]],
-            frames,
-            cuts,
-            layout,
-            original,
-            with_stream=not labelled.all(),
-        )
+            at = f" (the first: {where})" if where else ""
+            message = f"{count} row{'s' if count > 1 else ''} {reason} left out{at}"
+            yield about_file(table.display_name, Sentence(message, reason="rows_left_out", n=count))

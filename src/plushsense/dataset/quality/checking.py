@@ -58,6 +58,7 @@ CHECKS: dict[str, Check] = {
     "clock-reset": Check(
         recordings.clock_reset, (_R, _S), "error", "trim it to one side, or exclude it", True, _RESTART
     ),
+    "out-of-order": Check(recordings.out_of_order, (_R, _S), "warning", "check the radio; readers restart there", True),
     "gaps": Check(recordings.gaps, (_R, _S), "warning", "exclude it if the gesture is hit, or accept", True, _RESTART),
     "lost-frames": Check(recordings.lost_frames, (_R, _S), "warning", _RADIO),
     "rate": Check(recordings.rate, (_R, _S), "warning", "check firmware and layout; training resamples it", True),

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from plushsense.core.gestures import NOBODY
+from plushsense.core.layouts import BINARY, COUNT
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.quality.findings import PARTLY_THERE, Issue
 from plushsense.dataset.quality.measurements import (
@@ -107,13 +108,17 @@ def duration(w: DatasetSummary) -> Iterator[Issue]:
 
 
 def flat(w: DatasetSummary) -> Iterator[Issue]:
-    """Find channels that never change in a recording or stream; those constant in most recordings, once for all."""
+    """Find channels that never change in a recording or stream; those constant in most recordings, once for all.
+
+    A binary or counting channel is reported only if it is constant in every recording and stream.
+    """
     names = w.dataset.layout.names
+    discrete = np.array([ch.is_discrete for ch in w.dataset.layout.channels])
     long = [o for o in w.recordings if o.rows >= _FLAT_ROWS]
     if not long:
         return
     constant = np.array([o.runs >= o.rows for o in long])
-    always = constant.mean(axis=0) > 0.5
+    always = np.where(discrete, constant.all(axis=0), constant.mean(axis=0) > 0.5)
     for c in np.flatnonzero(always):
         n, of = int(constant[:, c].sum()), len(long)
         message = f"channel {names[c]} does not change in {n} of {of} recordings"
@@ -123,7 +128,7 @@ def flat(w: DatasetSummary) -> Iterator[Issue]:
             severity="warning",
         )
     for o in (*long, *(s for s in w.streams if s.rows >= _FLAT_ROWS)):
-        dead = np.flatnonzero((o.runs >= o.rows) & ~always & ~(w.zeroed & (o.zeros == o.rows)))
+        dead = np.flatnonzero((o.runs >= o.rows) & ~always & ~discrete & ~(w.zeroed & (o.zeros == o.rows)))
         if len(dead):
             stream = isinstance(o.info, StreamInfo)
             message = (
@@ -175,10 +180,11 @@ def stuck(w: DatasetSummary) -> Iterator[Issue]:
         return
     names = w.dataset.layout.names
     limit = np.maximum(w.limits.stuck_s * 1000, 10 * w.usual_run_ms)
+    discrete = np.array([ch.is_discrete for ch in w.dataset.layout.channels])
     for o, least in [(o, limit) for o in w.recordings] + [(o, 4 * limit) for o in w.streams]:
         run_ms = o.runs * o.period_ms
         # The check `zeroed` reports an axis that stays at 0 because low values were replaced.
-        affected = np.flatnonzero((run_ms > least) & (o.runs < o.rows) & ~(w.zeroed & (o.zeros >= o.runs)))
+        affected = np.flatnonzero((run_ms > least) & (o.runs < o.rows) & ~discrete & ~(w.zeroed & (o.zeros >= o.runs)))
         if not len(affected):
             continue
         c = int(affected[np.argmax(run_ms[affected])])
@@ -199,7 +205,10 @@ def stuck(w: DatasetSummary) -> Iterator[Issue]:
 
 
 def saturated(w: DatasetSummary) -> Iterator[Issue]:
-    """Find channels that change but stay at their highest or lowest value, probably the limit of the sensor's range."""
+    """Find channels that change but stay at their highest or lowest value, probably the limit of the sensor's range.
+
+    A binary channel has no range, and the limit of one that counts is its ``valid_max``.
+    """
     if not w.recordings:
         return
     names = w.dataset.layout.names
@@ -209,22 +218,28 @@ def saturated(w: DatasetSummary) -> Iterator[Issue]:
     rail = tops.max(axis=0)
     shared = (tops >= _RAIL * rail).sum(axis=0) >= _ALIKE
     most = np.maximum(w.limits.saturated_s * 1000, 4 * w.usual_top_ms)
+    channels = w.dataset.layout.channels
+    ranged = np.array([ch.kind != BINARY for ch in channels])
+    counting = np.array([ch.kind == COUNT for ch in channels])
+    least = np.where(counting, w.dataset.layout.valid_max_int, w.dataset.layout.valid_min_int)
     for o in w.recordings:
         at_rail = shared & (np.abs(o.top) >= _RAIL * rail)
         run_ms = o.top_runs * o.period_ms
         long = np.where(at_rail, run_ms >= most / 2, run_ms >= most) & (o.top_runs >= 3)
         often = at_rail & (o.top_rows >= 10) & (o.top_rows >= _OFTEN * o.rows)
         moving = (o.spread > 0.5 * usual) & (o.spread > 0) & (o.runs < o.rows)
-        affected = np.flatnonzero((long | often) & moving & ~(w.zeroed & (o.top == 0)))
+        affected = np.flatnonzero((long | often) & moving & ranged & (o.top >= least) & ~(w.zeroed & (o.top == 0)))
         if not len(affected):
             continue
         c = int(affected[np.argmax(run_ms[affected])])
         first = int(o.top_at[c]) + o.first_row
+        value, unit = channels[c].in_units(int(o.top[c]))
         message = (
             f"{_channels(names, affected)} {'stays' if len(affected) == 1 else 'stay'} at the highest or lowest value, "
-            f"{names[c]} for {run_ms[c]:.0f} ms at {o.top[c]:g} (from row {first + 1}), {o.top_rows[c]} rows in all"
+            f"{names[c]} for {run_ms[c]:.0f} ms at {value:g}{unit} (from row {first + 1}), {o.top_rows[c]} rows in all"
         )
-        values = {"ms": round(float(run_ms[c])), "value": float(o.top[c]), "row": first + 1, "rows": int(o.top_rows[c])}
+        values = {"ms": round(float(run_ms[c])), "value": value, "unit": unit}
+        values |= {"row": first + 1, "rows": int(o.top_rows[c])}
         yield Issue(
             Sentence(message, "saturated", channels=_names(names, affected), channel=names[c], **values),
             ((first, first + int(o.top_runs[c])),),
@@ -249,14 +264,23 @@ def drift(w: DatasetSummary) -> Iterator[Issue]:
         affected = np.array([c for c in level if abs(share[c]) > w.limits.drift], dtype=np.int64)
         if len(affected):
             c = int(affected[np.argmax(np.abs(share[affected]))])
-            percent, by = round(float(abs(share[c])) * 100), round(float(change[c]))
+            percent = round(float(abs(share[c])) * 100)
+            by, unit = layout.channels[c].in_units(round(float(change[c])))
             message = (
                 f"the baseline of {_channels(layout.names, affected)} drifts over {key}, {layout.names[c]} by "
-                f"{by:+d}: {percent} % of its signal when touched"
+                f"{by:+g}{unit}: {percent} % of its signal when touched"
             )
             channels = _names(layout.names, affected)
             yield Issue(
-                Sentence(message, "drift", channels=channels, channel=layout.names[c], by=f"{by:+d}", percent=percent),
+                Sentence(
+                    message,
+                    "drift",
+                    channels=channels,
+                    channel=layout.names[c],
+                    by=by,
+                    unit=unit,
+                    percent=percent,
+                ),
                 channels=tuple(affected.tolist()),
                 about=about,
             )

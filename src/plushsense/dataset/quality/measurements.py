@@ -22,6 +22,56 @@ SLOW_FACTOR = 2.5
 _BURSTS = 0.05
 
 
+# Rows that came late are at most this many, by at most this time; otherwise the clock was set back.
+_LATE_ROWS, _LATE_MS = 20, 1000
+# Rows that came late leave their place empty: with them, the time is as long as that many rows usually take.
+_LEFT_EMPTY = 0.7
+
+
+def backward_steps(times: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Tell resets of a clock from rows that came late, as packets of a radio do that overtake each other.
+
+    Args:
+        times: (T,) device time of each row in ms.
+
+    Returns:
+        The rows after which the clock was reset, and those after which a row came late.
+    """
+    back = np.flatnonzero(np.diff(times) < 0)
+    if not len(back):
+        return back, back
+    forward = np.diff(np.sort(times))
+    period = float(np.median(forward[forward > 0])) if (forward > 0).any() else 0.0
+    late = np.zeros(len(back), dtype=np.bool_)
+    begin, seen, top = 0, 0, int(times[0])
+    for k, at in enumerate(back.tolist()):
+        top, seen = max(top, int(times[seen : at + 1].max())), at + 1
+        returned = np.flatnonzero(times[at + 1 : at + 2 + _LATE_ROWS] >= top)
+        n = int(returned[0]) if len(returned) else len(times) - at - 1
+        around = times[max(begin, at - n - 1) : at + n + 2]
+        late[k] = (
+            n <= _LATE_ROWS
+            and top - int(times[at + 1 : at + 1 + n].min()) <= _LATE_MS
+            and int(np.ptp(around)) >= _LEFT_EMPTY * (len(around) - 1) * period
+        )
+        if not late[k]:
+            begin, top = at + 1, int(times[at + 1])
+    return back[~late], back[late]
+
+
+def in_order(times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the indices (T,) that bring rows that came late into the order of their times.
+
+    Rows before and after a reset of the clock stay apart.
+    """
+    rows = np.arange(len(times), dtype=np.int64)
+    resets, late = backward_steps(times)
+    if not len(late):
+        return rows
+    parts = np.split(rows, resets + 1)
+    return np.concatenate([part[np.argsort(times[part], kind="stable")] for part in parts])
+
+
 @dataclass(frozen=True)
 class Examination:
     """Input of the checks of one recording or stream.
@@ -46,6 +96,17 @@ class Examination:
     def steps(self) -> NDArray[np.int64]:
         """Device time from each row to the next in ms, (T − 1,)."""
         return np.diff(self.frames.device_ms)
+
+    @cached_property
+    def back(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows after which the device clock was reset, and rows after which a row came late, see `backward_steps`."""
+        return backward_steps(self.frames.device_ms)
+
+    @cached_property
+    def ordered_steps(self) -> NDArray[np.int64]:
+        """Like `steps`, after rows that came late are put in order, so that they leave no gaps."""
+        times = self.frames.device_ms
+        return np.diff(times[in_order(times)]) if len(self.back[1]) else self.steps
 
     @cached_property
     def period_ms(self) -> float:
@@ -95,7 +156,7 @@ class Examination:
     @cached_property
     def gaps(self) -> NDArray[np.int64]:
         """Rows after which frames are missing for longer than `gap_ms`."""
-        gaps = np.setdiff1d(np.flatnonzero(self.steps > self.gap_ms), self.jumps)
+        gaps = np.setdiff1d(np.flatnonzero(self.ordered_steps > self.gap_ms), self.jumps)
         if not self.uneven or not len(gaps):
             return gaps
         # With uneven stamps, a delay that later frames catch up is no gap: compare the duration of the rows around it

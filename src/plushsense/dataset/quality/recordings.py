@@ -72,8 +72,9 @@ def garbage(s: Examination) -> Iterator[Issue]:
 
 
 def blank_rows(s: Examination) -> Iterator[Issue]:
+    """Find rows in which every channel reads 0; cells that nothing touches do so without a fault."""
     rows = ~s.frames.values.any(axis=1)
-    if s.layout.n_channels > 1 and rows.any():
+    if sum(not ch.is_discrete for ch in s.layout.channels) > 1 and rows.any():
         n, row = int(rows.sum()), s.row(int(np.argmax(rows)))
         yield Issue(
             Sentence(
@@ -95,6 +96,7 @@ def spikes(s: Examination) -> Iterator[Issue]:
     usual = np.percentile(np.abs(steps), 95, axis=0)
     usual = np.maximum(usual, _OF_SPREAD * np.subtract(*np.percentile(values, (98, 2), axis=0)))
     far = (size > s.limits.spike * np.maximum(usual, 1)) & (size > 3 * np.abs(values[2:] - values[:-2]))
+    far &= ~np.array([ch.is_discrete for ch in s.layout.channels])
     # Another check reports values outside the valid range.
     far &= (values[1:-1] >= s.layout.valid_min_int) & (values[1:-1] <= s.layout.valid_max_int)
     rows = np.flatnonzero(far.any(axis=1)) + 1
@@ -129,7 +131,7 @@ def format_duration(ms: float) -> str:
 
 
 def clock_reset(s: Examination) -> Iterator[Issue]:
-    back = np.flatnonzero(s.steps < 0)
+    back, _ = s.back
     of_stream: Severity | None = None
     if s.stream:
         # The first rows of a stream may be old ones from the buffer of the serial port.
@@ -155,10 +157,19 @@ def clock_reset(s: Examination) -> Iterator[Issue]:
         )
 
 
+def out_of_order(s: Examination) -> Iterator[Issue]:
+    """Find rows that came after later ones, as packets of a radio do that overtake each other."""
+    _, late = s.back
+    if len(late):
+        n, row, by = len(late), s.row(int(late[0]) + 1), format_duration(-int(s.steps[late].min()))
+        message = f"{_plural(n, 'row')} out of order by the device clock (first row {row}, by at most {by})"
+        yield Issue(Sentence(message, "out_of_order", n=n, row=row, by=by), _ranges(late, s, 2))
+
+
 def gaps(s: Examination) -> Iterator[Issue]:
     if len(s.gaps):
-        longest = int(s.steps[s.gaps].max())
-        at = int(s.gaps[int(np.argmax(s.steps[s.gaps]))])
+        longest = int(s.ordered_steps[s.gaps].max())
+        at = int(s.gaps[int(np.argmax(s.ordered_steps[s.gaps]))])
         n, limit, row = len(s.gaps), round(s.gap_ms), s.row(at)
         message = f"{_plural(n, 'gap')} over {limit} ms, the longest {longest} ms (after row {row})"
         yield Issue(
@@ -173,11 +184,11 @@ def lost_frames(s: Examination) -> Iterator[Issue]:
     if s.period_ms <= 0:
         return
     # Other checks report pauses and restarts.
-    good = (s.steps > 0) & (s.steps <= _STANDSTILL_MS)
+    good = (s.ordered_steps > 0) & (s.ordered_steps <= _STANDSTILL_MS)
     good[s.jumps] = False
-    usual = float(np.mean(s.steps[good & (s.steps < 1.5 * s.period_ms)])) if good.any() else s.period_ms
-    missing = np.where(good, np.rint(s.steps / usual) - 1, 0)
-    long = s.gaps if s.uneven else np.flatnonzero((s.steps > 1.6 * s.period_ms) & (missing >= 1))
+    usual = float(np.mean(s.ordered_steps[good & (s.ordered_steps < 1.5 * s.period_ms)])) if good.any() else s.period_ms
+    missing = np.where(good, np.rint(s.ordered_steps / usual) - 1, 0)
+    long = s.gaps if s.uneven else np.flatnonzero((s.ordered_steps > 1.6 * s.period_ms) & (missing >= 1))
     lost = int(missing[long].sum())
     share = lost / (lost + len(s.frames))
     if lost >= _FEW_LOST and share > s.limits.lost:

@@ -1,0 +1,533 @@
+"""Read the rows of a table: text with separators, JSON lines or Parquet, as an `ImportPattern` describes it.
+
+To support another format, add a function to ``READERS`` and its endings to `pattern.ENDINGS`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import itertools
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from math import isfinite
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.errors import FileFormatError, need
+from plushsense.core.layouts import DEVICE_MS, HOST_MS, Layout
+from plushsense.core.toml import loads_json
+from plushsense.dataset.importing.pattern import PARTS, ROLES, UNITS, ImportPattern
+
+_NOT_A_NUMBER, _MISSING = float("nan"), float("inf")
+_SEPARATORS = ",;\t"
+
+
+@dataclass(frozen=True)
+class ImportedColumns:
+    """Columns of a table by role or channel.
+
+    Attributes:
+        names: column of each role or channel.
+        texts: person, session, label and take of each row, as far as there are such columns.
+        numbers: channels and clocks (T,): NaN if a cell is no number, infinite for a missing-value word.
+        malformed: number of rows that are not like the others.
+        first_malformed: the first of these, as "line 12: '3,4'".
+        why_malformed: how they differ.
+        lines: line of the file of each row, from 1; empty if the format has no lines.
+        in_ms: whether the times were dates and are milliseconds now.
+        own_recordings: whether the file tells recordings apart itself, as by objects that hold whole recordings.
+    """
+
+    names: dict[str, str]
+    texts: dict[str, list[str]]
+    numbers: dict[str, NDArray[np.float64]]
+    malformed: int = 0
+    first_malformed: str = ""
+    why_malformed: str = "of another width than the header"
+    lines: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    in_ms: bool = False
+    own_recordings: bool = False
+
+
+@dataclass(frozen=True)
+class TableFile:
+    """A table to read: ``place`` are the parts that its path gives, None without a pattern; see `ImportPattern`."""
+
+    path: Path
+    display_name: str
+    layout: Layout
+    pattern: ImportPattern
+    place: Mapping[str, str] | None = None
+
+    def error(self, message: str, reason: str = "", **values: object) -> FileFormatError:
+        """Return the error that this file cannot be used."""
+        return FileFormatError(f"'{self.display_name}' {message}", reason=reason, **values)
+
+    def hint(self, role: str) -> str:
+        """Return how to say in which column a role stands."""
+        if self.place is None:
+            return f"name the right one with --column {role}=NAME"
+        or_path = f", or let {{{role}}} stand in paths" if role in PARTS else ""
+        clock = ", or give row_rate_hz if there is no clock" if role == "time" else ""
+        return f'name the right one with  {role} = "NAME"  under [columns] of the pattern{or_path}{clock}'
+
+    def choose_columns(self, there: Sequence[str]) -> dict[str, int]:
+        """Return the index in ``there``, the names of all columns, for each role and channel that has a column.
+
+        Raises:
+            FileFormatError: for a missing column, or two columns of the same name.
+        """
+        plain = [name.strip().casefold() for name in there]
+        layout, given = self.layout, self.pattern.columns
+        headers = dict(zip(layout.csv.columns, layout.csv.header, strict=True))
+        candidates: dict[str, tuple[str, ...]] = ROLES | {n: (n, headers.get(n, n)) for n in layout.names}
+        for key, role in ((DEVICE_MS, "time"), (HOST_MS, HOST_MS)):
+            candidates[role] = (*candidates[role], headers.get(key, key))
+        needed = {"label", "time", *layout.names} - set(self.place or ())
+        if self.pattern.row_rate_hz:
+            needed -= {"time"}
+            del candidates["time"]
+        chosen: dict[str, int] = {}
+        for role, names in candidates.items():
+            if role in given:
+                names = (given[role],)
+            elif role in (self.place or ()):
+                continue
+            at = self.column_index(names, plain)
+            if at is not None:
+                chosen[role] = at
+            elif role in given or (role in needed and not (self.pattern.bits and role in layout.names)):
+                if not any(plain):
+                    raise self.error(
+                        "begins with no line of column names: a table needs a header"
+                        + (", or names in the pattern" if self.place is not None else ""),
+                        reason="table_no_header",
+                        file=self.display_name,
+                    )
+                listed = ", ".join(t.strip()[:30] for t in there[:20]) + (", …" if len(there) > 20 else "")
+                missing = given.get(role, role)
+                raise self.error(
+                    f"has no column '{missing}'; it has {listed}: {self.hint(role)}",
+                    reason="table_column_missing",
+                    file=self.display_name,
+                    column=missing,
+                    there=listed,
+                )
+        return chosen
+
+    def column_index(self, names: Sequence[str], plain: list[str]) -> int | None:
+        """Return the index of the first column that ``names`` name: ``x``, ``x#2`` (the second x) or ``#3``."""
+        for name in (n.strip().casefold() for n in names):
+            if name in plain:
+                if plain.count(name) > 1:
+                    raise self.error(
+                        f"has two columns '{name}': rename one of them"
+                        + (f", or name them {name}#1 and {name}#2 under [columns]" if self.place is not None else ""),
+                        reason="column_twice",
+                        file=self.display_name,
+                        column=name,
+                    )
+                return plain.index(name)
+            base, sign, number = name.rpartition("#")
+            if sign and number.isdecimal() and int(number):
+                same = [k for k, other in enumerate(plain) if other == base] if base else range(len(plain))
+                if int(number) <= len(same):
+                    return same[int(number) - 1]
+        return None
+
+    def parser(self, role: str) -> Callable[[str], float]:
+        """Return the function that reads the number in a cell: NaN if it holds none, infinite for a missing-value word.
+
+        Dates in a column of times become milliseconds, in UTC if they name no zone.
+        """
+        missing, comma = self.pattern.missing, self.pattern.decimal == ","
+
+        def number(text: str) -> float:
+            if missing and text.strip() in missing:
+                return _MISSING
+            if comma:
+                text = text.replace(".", "_").replace(",", ".")
+            try:
+                value = float(text)
+            except ValueError:
+                return _NOT_A_NUMBER
+            # Python would accept 1_000 as a number.
+            return value if isfinite(value) and "_" not in text else _NOT_A_NUMBER
+
+        def date(text: str) -> float:
+            try:
+                found = datetime.fromisoformat(text.strip())
+            except ValueError:
+                return number(text)
+            return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp() * 1000.0
+
+        return date if self.pattern.time_unit == "iso" and role in ("time", HOST_MS) else number
+
+    def digits(self, texts: Iterable[str], n: int) -> list[float] | None:
+        """Return the ``n`` digits of a row whose channels are characters; None if there is another number of them."""
+        text = "".join("".join(texts).split())
+        return [float(c) if c in "0123456789" else _NOT_A_NUMBER for c in text] if len(text) == n else None
+
+
+class _Rows:
+    """Rows that are read one by one, as columns; ``roles`` are those of the cells of each row."""
+
+    def __init__(self, file: TableFile, at: Mapping[str, int], there: Sequence[str], extra: Sequence[str] = ()) -> None:
+        self._file = file
+        self.roles = (*at, *extra)
+        self._by_digit = bit_channels(file, at)
+        self.names = {role: there[index].strip() for role, index in at.items()}
+        self.names |= {name: "+".join(file.pattern.bits) for name in self._by_digit}
+        self.texts: dict[str, list[str]] = {role: [] for role in self.roles if role in PARTS}
+        self.numbers = {role: array("d") for role in (*self.roles, *self._by_digit) if role not in PARTS}
+        self.lines = array("q")
+        self.malformed, self.first = 0, ""
+        self.why_malformed = ImportedColumns.why_malformed
+        same: dict[str, str] = {}
+
+        def text_of(cell: str) -> str:
+            text = cell.strip()
+            return same.setdefault(text, text)
+
+        # One function for each cell of a row: a table may have millions of cells.
+        self._store: list[tuple[Callable[[Any], None], Callable[[str], Any]]] = [
+            (self.texts[r].append, text_of) if r in self.texts else (self.numbers[r].append, file.parser(r))
+            for r in self.roles
+        ]
+
+    def add(self, line: int, cells: Iterable[str], bits: Iterable[str] = ()) -> bool:
+        """Add a row, with its cell for each role; return False for another number of digits than channels."""
+        if self._by_digit:
+            digits = self._file.digits(bits, len(self._by_digit))
+            if digits is None:
+                return False
+            for name, value in zip(self._by_digit, digits, strict=True):
+                self.numbers[name].append(value)
+        for (store, read), cell in zip(self._store, cells, strict=True):
+            store(read(cell))
+        self.lines.append(line)
+        return True
+
+    def leave_out(self, line: int, text: str) -> None:
+        self.malformed += 1
+        if not self.first:
+            self.first = f"line {line}: '{text.strip()[:60]}'"
+
+    def columns(self, row_numbers: Sequence[int], own_recordings: bool = False) -> ImportedColumns:
+        """Return the columns; ``row_numbers`` are the numbers of all rows, from which times follow without a clock."""
+        numbers = {role: np.array(values, dtype=np.float64) for role, values in self.numbers.items()}
+        rate = self._file.pattern.row_rate_hz
+        if rate:
+            numbers["time"] = np.array(row_numbers, dtype=np.float64) * (1000.0 / rate)
+        return ImportedColumns(
+            self.names | ({"time": "row number"} if rate else {}),
+            self.texts,
+            numbers,
+            self.malformed,
+            self.first,
+            self.why_malformed,
+            np.array(self.lines, dtype=np.int64),
+            bool(rate) or self._file.pattern.time_unit == "iso",
+            own_recordings,
+        )
+
+
+def bit_channels(file: TableFile, at: Mapping[str, int]) -> list[str]:
+    """Return the channels that are digits of the columns ``bits``: those without a column of their own."""
+    return [name for name in file.layout.names if name not in at] if file.pattern.bits else []
+
+
+def read_csv(file: TableFile) -> ImportedColumns:
+    """Read a table of text with a header; skip lines of another width. See `ImportPattern` for what can differ."""
+    pattern = file.pattern
+    try:
+        with file.path.open(encoding=pattern.text_encoding, newline="") as text:
+            for _ in range(pattern.skip_before):
+                text.readline()
+            skipped = pattern.skip_before
+            first = text.readline()
+            separator = pattern.separator or max(_SEPARATORS, key=first.count)
+            if file.place is not None and not pattern.separator and separator not in first and len(first.split()) > 1:
+                separator = " "
+            if pattern.names:
+                there, begin = list(pattern.names), [first]
+            else:
+                there, begin = next(_split([first], separator), []), []
+                skipped += 1
+                for _ in range(pattern.skip_after):
+                    text.readline()
+                skipped += pattern.skip_after
+            at = file.choose_columns(there)
+            bits_at = [_bit_column(file, name, there) for name in pattern.bits]
+            rows = _Rows(file, at, there)
+            places = list(at.values())
+            numbers, row_number = array("q"), 0
+            for line, row in _numbered(text, begin, separator, skipped):
+                while len(row) > len(there) and not row[-1].strip():
+                    row.pop()
+                if not row:
+                    continue
+                if row[-1].endswith(";"):
+                    # Some loggers end each line so.
+                    row[-1] = row[-1].rstrip("; ")
+                whole = len(row) == len(there)
+                if whole and rows.add(line, [row[k] for k in places], [row[k] for k in bits_at]):
+                    numbers.append(row_number)
+                else:
+                    rows.leave_out(line, separator.join(row))
+                # Rows that are left out have taken their time too.
+                row_number += 1
+    except UnicodeError:
+        message = f"is not {pattern.encoding.upper()}: save it as UTF-8"
+        hint = ", or name its encoding in the pattern" if file.place is not None else ""
+        raise file.error(message + hint, reason="table_not_utf8", file=file.display_name) from None
+    except csv.Error as cause:
+        raise file.error(f"is no CSV table: {cause}", reason="table_damaged", file=file.display_name) from None
+    return rows.columns(numbers)
+
+
+def _split(lines: Iterable[str], separator: str) -> Iterator[list[str]]:
+    if separator == " ":
+        return (line.split() for line in lines)
+    return csv.reader(lines, delimiter=separator)
+
+
+def _numbered(text: TextIO, begin: list[str], separator: str, skipped: int) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number of the line, from 1, and the cells of each row behind ``skipped`` lines."""
+    if separator == " ":
+        yield from enumerate(_split(itertools.chain(begin, text), separator), skipped + 1)
+        return
+    reader = csv.reader(itertools.chain(begin, text), delimiter=separator)
+    for row in reader:
+        yield skipped + reader.line_num, row
+
+
+def _bit_column(file: TableFile, name: str, there: Sequence[str]) -> int:
+    at = file.column_index((name,), [t.strip().casefold() for t in there])
+    if at is None:
+        listed = ", ".join(t.strip()[:30] for t in there[:20])
+        raise file.error(f"has no column '{name}', which bits names; it has {listed}", reason="")
+    return at
+
+
+def read_json(file: TableFile) -> ImportedColumns:
+    """Read JSON objects, one a line or in a list: an object is a row, or a recording if its values are lists."""
+    path = file.path
+    try:
+        text = path.read_text(encoding=file.pattern.text_encoding)
+    except UnicodeError:
+        raise file.error("is not UTF-8: save it as UTF-8", reason="table_not_utf8", file=file.display_name) from None
+    objects = list(_objects(text))
+    first = next((item for _, item in objects if isinstance(item, dict)), None)
+    if first is None:
+        raise file.error("holds no JSON object: accepted is one object a line, or a list of objects")
+    try:
+        there = list(dict.fromkeys(_paths(first)))
+    except RecursionError:
+        raise file.error("holds JSON objects that are nested too deeply") from None
+    at = file.choose_columns(there)
+    for name in file.pattern.bits:
+        _bit_column(file, name, there)
+    paths = [there[k].split(".") for k in at.values()]
+    in_objects = _length([_value(first, path) for path in paths]) is not None
+    # An object that holds a whole recording tells it apart from others by its line.
+    numbered = ("recording",) if in_objects and "recording" not in at else ()
+    rows = _Rows(file, at, there, numbered)
+    rows.why_malformed = "without a JSON object whose lists have one length"
+    numbers, row_number, lists = array("q"), 0, False
+    for line, item in objects:
+        values = [_value(item, path) for path in paths] if isinstance(item, dict) else []
+        bits = [_value(item, name.split(".")) for name in file.pattern.bits]
+        length = _length([*values, *bits]) if isinstance(item, dict) else -1
+        lists |= length not in (None, -1)
+        if length == -1:
+            rows.leave_out(line, str(item))
+            row_number += 1
+            continue
+        for k in range(1 if length is None else length):
+            cells = [_cell(value, k) for value in values] + [str(line) for _ in numbered]
+            if rows.add(line, cells, [_cell(b, k) for b in bits]):
+                numbers.append(row_number)
+            else:
+                rows.leave_out(line, str(item))
+            row_number += 1
+    return rows.columns(numbers, own_recordings=lists)
+
+
+def _objects(text: str) -> Iterator[tuple[int, Any]]:
+    """Yield the line, from 1 (in a list the number of the item), and the value of each object; a text if damaged."""
+    if text.lstrip()[:1] == "[":
+        try:
+            yield from enumerate(loads_json(text), 1)
+        except (ValueError, RecursionError):
+            yield 1, text
+        return
+    lines = [(line, row) for line, row in enumerate(text.splitlines(), 1) if row.strip()]
+    for line, row in lines:
+        try:
+            value = loads_json(row)
+        except (ValueError, RecursionError):
+            # A text is no object, and shows in messages what the line holds.
+            value = row
+            if line == lines[0][0]:
+                # A single object may take many lines.
+                with contextlib.suppress(ValueError, RecursionError):
+                    yield line, loads_json(text)
+                    return
+        yield line, value
+
+
+def json_cells(text: str) -> dict[str, tuple[list[str], bool]]:
+    """Return the cells of each value in JSON objects by its path, and whether an object has a list of them."""
+    found: dict[str, tuple[list[str], bool]] = {}
+    for _, item in _objects(text):
+        for path in dict.fromkeys(_paths(item)) if isinstance(item, dict) else ():
+            value = _value(item, path.split("."))
+            in_list = isinstance(value, list)
+            cells = value if in_list else [value]
+            if not any(isinstance(cell, list | dict) for cell in cells):
+                found.setdefault(path, ([], in_list))[0].extend(_cell(cell, 0) for cell in cells)
+    # The items of a list of plain values are its cells already.
+    return {path: cells for path, cells in found.items() if path.rpartition(".")[0] not in found}
+
+
+def _paths(item: Any, before: str = "") -> Iterator[str]:
+    """Yield the path of every value in a JSON object, such as ``touch.x`` or ``acc.0``."""
+    if isinstance(item, dict):
+        for key, value in item.items():
+            yield from _paths(value, f"{before}{key}.")
+        return
+    yield before[:-1]
+    if isinstance(item, list) and item:
+        if isinstance(item[0], dict):
+            yield from _paths(item[0], before)
+        else:
+            inner = item[0] if isinstance(item[0], list) else item
+            yield from (f"{before}{k}" for k in range(min(len(inner), 64)))
+
+
+def _value(item: Any, steps: Sequence[str]) -> Any:
+    """Return the value at ``steps`` in a JSON value; None if there is none.
+
+    In a list of objects or of lists, it is the list of the values in each of them.
+    """
+    for k, step in enumerate(steps):
+        if isinstance(item, dict):
+            item = item.get(step)
+        elif isinstance(item, list) and any(isinstance(inner, dict | list) for inner in item):
+            return [_value(inner, steps[k:]) for inner in item]
+        elif isinstance(item, list) and step.isdecimal() and int(step) < len(item):
+            item = item[int(step)]
+        else:
+            return None
+    return item
+
+
+def _length(values: Iterable[Any]) -> int | None:
+    """Return the common length of the lists among ``values``; None without lists, -1 if they differ."""
+    lengths = {len(value) for value in values if isinstance(value, list)}
+    return None if not lengths else lengths.pop() if len(lengths) == 1 else -1
+
+
+def _cell(value: Any, at: int) -> str:
+    """Return a JSON value, or item ``at`` of a list, as the text of a cell."""
+    if isinstance(value, list):
+        value = value[at]
+    return "" if value is None else str(int(value)) if isinstance(value, bool) else str(value)
+
+
+def read_parquet(file: TableFile) -> ImportedColumns:
+    """Read a Parquet table with polars; each value of a list becomes a row, and a row of lists a recording."""
+    name = file.display_name
+    with file.path.open("rb") as opened:
+        if opened.read(4) != b"PAR1":
+            raise file.error("is no Parquet file: it does not begin with PAR1", reason="table_damaged", file=name)
+    pattern = file.pattern
+    if pattern.bits or pattern.missing:
+        key = "bits" if pattern.bits else "missing"
+        raise file.error(f"is a Parquet table, whose columns have types: {key} is for text, leave it out")
+    pl = need("polars", extra="tables")
+    try:
+        with file.path.open("rb") as opened:
+            there = list(pl.read_parquet_schema(opened))
+        names = {role: there[at] for role, at in file.choose_columns(there).items()}
+        with file.path.open("rb") as opened:
+            table = pl.read_parquet(opened, columns=list(dict.fromkeys(names.values())))
+        lists = [n for n in table.columns if table[n].dtype.base_type() in (pl.List, pl.Array)]
+        if lists:
+            row = "row" + "_" * max(map(len, table.columns))
+            table = table.with_row_index(row).explode(lists)
+            names.setdefault("recording", row)
+        nested = next((n for n in table.columns if table[n].dtype.is_nested()), None)
+        if nested is not None:
+            message = f"has more than one value in a cell of column '{nested}'"
+            raise file.error(message, reason="table_damaged", file=name)
+        texts = {
+            r: [text.strip() for text in table[n].cast(pl.String).fill_null("").to_list()]
+            for r, n in names.items()
+            if r in PARTS
+        }
+        numbers = {r: _parquet_numbers(pl, table[n]) for r, n in names.items() if r not in PARTS}
+        in_ms = "time" in names and table[names["time"]].dtype.is_temporal()
+        if pattern.time_unit == "iso" and "time" in names and not in_ms:
+            raise file.error(f"has no dates in column '{names['time']}': leave time_unit out, or give a unit")
+    except FileFormatError:
+        raise
+    except BaseException as cause:
+        # A panic of polars on damaged bytes is a BaseException but no Exception.
+        if not isinstance(cause, Exception) and type(cause).__name__ != "PanicException":
+            raise
+        message = " ".join(str(cause).split())[:120] or type(cause).__name__
+        raise file.error(f"cannot be read as Parquet: {message}", reason="table_damaged", file=name) from None
+    if pattern.row_rate_hz:
+        numbers["time"] = np.arange(len(table), dtype=np.float64) * (1000.0 / pattern.row_rate_hz)
+        names["time"], in_ms = "row number", True
+    return ImportedColumns(names, texts, numbers, in_ms=in_ms)
+
+
+def _parquet_numbers(pl: Any, column: Any) -> NDArray[np.float64]:
+    if column.dtype.is_temporal():
+        microseconds = column.dt.total_microseconds() if column.dtype == pl.Duration else column.dt.epoch("us")
+        column = microseconds.cast(pl.Float64) / 1000.0
+    numbers = np.asarray(column.cast(pl.Float64, strict=False).fill_null(_NOT_A_NUMBER).to_numpy())
+    return np.where(np.isinf(numbers), _NOT_A_NUMBER, numbers)
+
+
+READERS: dict[str, Callable[[TableFile], ImportedColumns]] = {
+    "csv": read_csv,
+    "json": read_json,
+    "parquet": read_parquet,
+}
+
+
+def read_rows(file: TableFile) -> ImportedColumns:
+    """Read a table in one of the formats of `READERS`.
+
+    Raises:
+        FileFormatError: for a table that cannot be read or lacks a column.
+        MissingExtraError: for Parquet without polars.
+    """
+    return READERS[file.pattern.format_of(file.path)](file)
+
+
+def unit_of_time(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple[str, bool]:
+    """Return the unit of a column of times, and whether its name states it.
+
+    Otherwise the unit is the one that agrees best with the layout's rate.
+    """
+    plain = name.strip().casefold().rstrip(")")
+    for unit in UNITS:
+        if plain.endswith((f"_{unit}", f"({unit}", f"[{unit}]")):
+            return unit, True
+    steps = np.diff(times[:100_000])
+    forward = steps[np.isfinite(steps) & (steps > 0)]
+    if not len(forward):
+        return "ms", False
+    step = float(np.median(forward))
+    return min(UNITS, key=lambda u: abs(np.log(step * UNITS[u] * rate_hz / 1000.0))), False
