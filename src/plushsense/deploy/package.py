@@ -26,6 +26,8 @@ SKETCH = f"{ARDUINO}/examples/PlushToy"
 LICENCE = "LICENSE"
 TWO_SLOTS = "examples/two_slots"
 _UPDATE = ("plush_update.h", "plush_update.c")
+ON_CHIP = "examples/verify_device"
+_DEVICE = ("plush_device.h", "plush_device.c", "plush_hooks.c")
 # Manifests must have an address; PlushSense has no page of its own. RFC 6761: nobody can own this one.
 NO_PAGE = "https://plushsense.invalid/"
 _WIRE = ("plush_wire.h", "plush_wire.c")
@@ -91,6 +93,9 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
         f"{IDF_EXAMPLE}/main/main.c": rendered["main.c"],
     }
     texts |= {f"{TWO_SLOTS}/{f}": (c_folder / "two_slots" / f).read_text(encoding="utf-8") for f in _UPDATE}
+    texts |= {f"{ON_CHIP}/{f}": (c_folder / "device" / f).read_text(encoding="utf-8") for f in _DEVICE}
+    harness = (c_folder / "harness.c").read_text(encoding="utf-8")
+    texts[f"{ON_CHIP}/plush_harness.c"] = f"#define PLUSH_HARNESS_DEVICE 1\n{harness}"
     for file in _WIRE:
         texts |= {f"{ARDUINO}/src/{file}": rendered[file], f"{IDF}/{_component_path(file)}": rendered[file]}
     for file in _EXAMPLE:
