@@ -28,7 +28,8 @@ from support.exports import bundle_of
 HOOKS = Path(__file__).parents[1] / "boards" / "chip" / "hooks.c"
 STRICT = ("-Wall", "-Wextra", "-Wconversion", "-Werror")
 Change = Callable[[bytes], bytes | None]
-EACH_WAY: list[tuple[str, str]] = [("cortex-m4", "tcp"), ("riscv32", "pty")]
+EACH_WAY: list[tuple[str, str]] = [("cortex-m4", "tcp"), ("riscv32", "pty"), ("xtensa", "tcp")]
+COUNTERS = {"riscv32": "mcycle", "xtensa": "CCOUNT"}
 
 
 @pytest.fixture(scope="module")
@@ -90,13 +91,31 @@ def test_a_chip_of_qemu_answers_over_its_uart(
     assert [s["name"] for s in report["streams"]] == ["golden", "patch"] and report["decisions"] > 30
     (run,) = report["runs"]
     assert run["vectors"] == sum(s["answers"] for s in report["streams"])
-    if target == "riscv32":
-        # Instructions, as the emulator counts: some for each multiplication.
+    if target in COUNTERS:
+        # They follow the emulator's instructions: some for each multiplication.
         macs = Export(export).model.network.arch.macs_per_step
-        assert run["cycles"]["counter"] == "mcycle" and run["cycles"]["steps"] > 30
+        assert run["cycles"]["counter"] == COUNTERS[target] and run["cycles"]["steps"] > 30
         assert 5 * macs < run["cycles"]["per_step"] < 60 * macs and run["cycles"]["longest"] < run["cycles"]["per_step"]
     else:
         assert run["cycles"] is None, "QEMU's M4 has the registers of the counter, but it stands still"
+
+
+def test_the_hooks_for_esp_idf_and_for_arm(export: Path, c_compiler: str, target_here: Callable[[str], str]) -> None:
+    """A check of the syntax only, and of what stands in the object: neither ran on a chip."""
+
+    def compiled(*words: object) -> subprocess.CompletedProcess[str]:
+        hooks = export / ON_CHIP / "plush_hooks.c"
+        command = [str(w) for w in (*words, *STRICT, f"-I{export}", f"-I{hooks.parent}", hooks)]
+        return subprocess.run(command, capture_output=True, text=True)
+
+    stubs = HOOKS.parents[1] / "idf"
+    done = compiled(c_compiler, "-std=gnu17", "-fsyntax-only", "-DESP_PLATFORM", f"-I{stubs}")
+    assert done.returncode == 0, done.stderr
+    assert "Write plush_hook_begin(), plush_hook_read()" in compiled(c_compiler, "-fsyntax-only").stderr
+    arm = TARGETS[target_here("cortex-m4")].compiler
+    for core, counts in (("cortex-m4", True), ("cortex-m33", True), ("cortex-m0plus", False)):
+        done = compiled(arm, "-mthumb", f"-mcpu={core}", "-O2", "-DPLUSH_HOOKS_ELSEWHERE", "-S", "-o", "-")
+        assert done.returncode == 0 and ("DWT CYCCNT" in done.stdout) == counts, done.stderr
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ int64_t esp_timer_get_time(void);
 
 typedef uint32_t TickType_t;
 #define portTICK_PERIOD_MS ((TickType_t)1)
+#define portMAX_DELAY ((TickType_t)UINT32_MAX)
 void vTaskDelay(TickType_t ticks);
 
 typedef int uart_port_t;
