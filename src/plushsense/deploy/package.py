@@ -22,6 +22,7 @@ from plushsense.windows.features import Scaler
 ARDUINO = "arduino/PlushSense"
 IDF = "esp-idf/plushsense"
 IDF_EXAMPLE = f"{IDF}/examples/PlushToy"
+IDF_TASKS = f"{IDF}/examples/RtosToy"
 SKETCH = f"{ARDUINO}/examples/PlushToy"
 LICENCE = "LICENSE"
 TWO_SLOTS = "examples/two_slots"
@@ -46,6 +47,9 @@ _TEMPLATES = {
     f"{IDF_EXAMPLE}/CMakeLists.txt": "project_CMakeLists.txt",
     f"{IDF_EXAMPLE}/main/CMakeLists.txt": "main_CMakeLists.txt",
     f"{IDF_EXAMPLE}/sdkconfig.defaults": "sdkconfig.defaults",
+    f"{IDF_TASKS}/CMakeLists.txt": "project_CMakeLists.txt",
+    f"{IDF_TASKS}/main/CMakeLists.txt": "rtos_main_CMakeLists.txt",
+    f"{IDF_TASKS}/sdkconfig.defaults": "rtos_sdkconfig.defaults",
 }
 
 
@@ -91,6 +95,8 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
         f"{ARDUINO}/keywords.txt": _keywords(header + rendered["plush_wire.h"]),
         f"{SKETCH}/PlushToy.ino": rendered["PlushToy.ino"],
         f"{IDF_EXAMPLE}/main/main.c": rendered["main.c"],
+        f"{IDF_TASKS}/main/main.c": (c_folder / "rtos" / "main.c").read_text(encoding="utf-8"),
+        **{f"{IDF_TASKS}/main/{file}": rendered[file] for file in ("plush_fake.h", "plush_fake.c")},
     }
     texts |= {f"{TWO_SLOTS}/{f}": (c_folder / "two_slots" / f).read_text(encoding="utf-8") for f in _UPDATE}
     texts |= {f"{ON_CHIP}/{f}": (c_folder / "device" / f).read_text(encoding="utf-8") for f in _DEVICE}
