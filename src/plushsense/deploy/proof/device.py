@@ -153,6 +153,8 @@ def verify_device(
 def _greet(packets: _PacketLink, export: Export) -> _Chip:
     """Ask until the chip answers, which may still boot, and check that it runs the harness of this export."""
     url, until = packets.link.url, time.monotonic() + HELLO_S
+    # The rest of a packet, if the chip still waits for it because a computer was stopped.
+    packets.link.send(bytes(MOST_BYTES + 4))
     while (now := time.monotonic()) < until:
         packets.send(b"H")
         asked_until = min(now + _AGAIN_S, until)
