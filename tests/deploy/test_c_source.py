@@ -17,6 +17,27 @@ from support.c_toy import C_FOLDER
 STRICT = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wsign-conversion", "-Wshadow", "-Werror"]
 
 
+# As IRAM_ATTR and DRAM_ATTR of Espressif place them.
+PLACED = [
+    f'-DPLUSH_{what}=__attribute__((section(".{ram}.plush")))' for what, ram in (("CODE", "iram1"), ("CONST", "dram1"))
+]
+
+
+def assert_a_step_is_placed(file: Path) -> None:
+    """Assert that the code of a step needs from other sections only what a gap or a fault does, and functions of C."""
+    listed = subprocess.run(["xtensa-lx106-elf-objdump", "-t", "-r", file], check=True, capture_output=True, text=True)
+    assert re.search(r"\.iram1\.plush\s+[0-9a-f]+ plush_push$", listed.stdout, re.M)
+    assert re.search(r"\.text\S*\s+[0-9a-f]+ plush_begin$", listed.stdout, re.M)
+    needed = set[str]()
+    for records in listed.stdout.split("RELOCATION RECORDS FOR ")[1:]:
+        if records.startswith("[.iram1"):
+            needed |= {line.split()[2].split("+")[0] for line in records.splitlines()[2:] if len(line.split()) == 3}
+    assert {".iram1.plush", ".dram1.plush"} <= needed
+    rare = {".text.unlikely.forget", ".text.unlikely.lose"}
+    own = {".iram1.plush", ".iram1.plush.literal", ".dram1.plush"}
+    assert needed <= own | rare | {"memcpy", "memset", "__udivsi3", "__umodsi3"}
+
+
 @pytest.mark.parametrize("cc", ["gcc", "clang"])
 @pytest.mark.parametrize("plain", [[], ["-DPLUSH_PLAIN"], ["-DPLUSH_WINDOW"]], ids=["fast", "plain", "window"])
 def test_no_warning_and_three_functions_of_the_c_library(
@@ -38,7 +59,7 @@ def test_no_warning_and_three_functions_of_the_c_library(
     [
         ("arm-none-eabi-gcc", ["-mcpu=cortex-m4", "-mthumb"], set()),
         ("arm-none-eabi-gcc", ["-mcpu=cortex-m0", "-mthumb"], {"__aeabi_uidiv", "__aeabi_uidivmod", "__aeabi_llsl"}),
-        ("xtensa-lx106-elf-gcc", ["-mlongcalls"], {"__udivsi3", "__umodsi3"}),
+        ("xtensa-lx106-elf-gcc", ["-mlongcalls", "-ffunction-sections", *PLACED], {"__udivsi3", "__umodsi3"}),
     ],
     ids=["cortex-m4", "cortex-m0", "lx106"],
 )
@@ -59,6 +80,8 @@ def test_small_cores_need_no_long_division(
             [cc.replace("gcc", "nm"), "-u", "plushsense.o"], check=True, cwd=tmp_path, capture_output=True, text=True
         )
         assert set(re.findall(r"U (\w+)", listed.stdout)) <= {"memcpy", "memset", "memcmp"} | also
+        if PLACED[0] in flags and (level == "-O2" or not window):
+            assert_a_step_is_placed(tmp_path / "plushsense.o")
     # No data that would have to be set up, and the size of a toy that exports speak of.
     sizes = subprocess.run(
         [cc.replace("gcc", "size"), "plushsense.o"], check=True, cwd=tmp_path, capture_output=True, text=True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -127,6 +128,13 @@ def test_the_model_as_c(tmp_path: Path, c_compiler: str) -> None:
     subprocess.run([*words, *sources, "-o", str(tmp_path / "run")], check=True)
     ran = subprocess.run([str(tmp_path / "run")], capture_output=True, check=True)
     assert ran.stdout == model.to_bytes()
+    placed = [*words, '-DPLUSH_CONST=__attribute__((section(".mine")))', "-S", "-o", "-", str(out / "plush_model.c")]
+    done = subprocess.run(placed, capture_output=True, check=True, text=True)
+    assert re.search(r"\.section\s+\.mine.*?\bplush_model:", done.stdout, re.S)
+    # The flash of an ESP8266 gives only whole words, unless its core is asked to take the exceptions.
+    refused = subprocess.run([*placed, "-DESP8266"], capture_output=True, text=True)
+    assert refused.returncode != 0 and "gives only aligned words: leave out PLUSH_CONST" in refused.stderr
+    subprocess.run([*placed, "-DESP8266", "-DNON32XFER_HANDLER"], capture_output=True, check=True)
 
 
 def test_c_names() -> None:

@@ -17,13 +17,23 @@ from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import Channel, Layout, load_layout
 from plushsense.deploy.emit import emit
 from plushsense.deploy.golden import answers_of, column, read_golden
-from plushsense.deploy.package import ARDUINO, FIRMWARE, SKETCH, changed_copies, copies, firmware, package
+from plushsense.deploy.package import (
+    ARDUINO,
+    FIRMWARE,
+    IDF,
+    IDF_TASKS,
+    SKETCH,
+    changed_copies,
+    copies,
+    firmware,
+    package,
+)
 from plushsense.deploy.quantize import integer_model
 from plushsense.devices.wire import LineParser, format_line
 from plushsense.runtime.image import IntegerModel
 from plushsense.windows.features import Scaler
 from support.exports import LAYOUTS, bundle_of
-from support.virtual_boards import BUILDS, SECONDS, WARNINGS, arduino, compiled, frames_of, idf, play, run, told
+from support.virtual_boards import BOARDS, BUILDS, SECONDS, WARNINGS, arduino, compiled, frames_of, idf, play, run, told
 
 Packages = dict[str, tuple[Path, IntegerModel]]
 
@@ -160,6 +170,14 @@ def test_the_sources_compile_for_the_chip(
         for source in [*(out / ARDUINO / "src").glob("*.c"), *(out / SKETCH).glob("*.c")]:
             words = ["-std=c99", "-Wpedantic", "-Wconversion", *WARNINGS, "-O2", f"-I{out / ARDUINO / 'src'}"]
             compiled(source, *target, *own, *words)
+
+
+def test_the_example_of_tasks_is_c(packages: Packages, c_compiler: str) -> None:
+    """A check of the syntax only, with names and types as in ESP-IDF, FreeRTOS and NimBLE: nothing of it ran."""
+    out = packages["plush-15"][0]
+    includes = (BOARDS / "idf", out / IDF / "include")
+    words = (c_compiler, "-std=gnu17", "-fsyntax-only", *WARNINGS, *(f"-I{folder}" for folder in includes))
+    run(*words, out / IDF_TASKS / "main" / "main.c")
 
 
 def test_noise_is_read_as_the_computer_reads_it(packages: Packages, tmp_path: Path, c_compiler: str) -> None:

@@ -93,6 +93,7 @@ def _patch(args: argparse.Namespace) -> int:
 def run_verify(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
     from plushsense.deploy.package import changed_copies
+    from plushsense.deploy.proof.device import verify_device
     from plushsense.deploy.proof.vectors import Export
     from plushsense.deploy.proof.verify import verify
 
@@ -100,6 +101,10 @@ def run_verify(args: argparse.Namespace) -> int:
         raise ConfigError("--subject chooses people of a data set: give --dataset too.")
     if args.samples is not None and args.samples < 1:
         raise ConfigError(f"--samples is {args.samples}: give 1 or more.")
+    for option in ("target", "faults", "trust") if args.device else ():
+        if getattr(args, option):
+            message = f"--{option} is for programs that are compiled here: leave it out, or leave out --device."
+            raise ConfigError(message)
     export = Export(args.export)
     if changed := changed_copies(export.folder):
         warn(f"only the originals are verified; these copies of them were changed: {', '.join(changed)}")
@@ -109,10 +114,12 @@ def run_verify(args: argparse.Namespace) -> int:
             warn(f"these recordings make {sum(v.samples for v in vectors):,} samples, not {args.samples:,}")
     else:
         vectors = export.made_up(args.samples or 0)
-    mutants = (lambda mutant: True) if args.faults else None
-    done = verify(
-        export, listed(*args.target), vectors, mutants=mutants, trust=args.trust, progress=ProgressReporter("verify")
-    )
+    progress = ProgressReporter("verify")
+    if args.device:
+        done = verify_device(export, args.device, vectors, progress=progress)
+    else:
+        mutants = (lambda mutant: True) if args.faults else None
+        done = verify(export, listed(*args.target), vectors, mutants=mutants, trust=args.trust, progress=progress)
     emit(args, {"export": args.export, **done.to_dict()}, verification_lines(done))
     return 0 if done.passed else 1
 
@@ -125,6 +132,12 @@ def verification_lines(done: VerificationReport) -> list[str]:
     ]
     head = ("target", "compiler", "flags", "vectors", "mismatches", "largest difference", "seconds")
     lines = [done.title, *streams, "", table(head, rows)]
+    lines += [
+        f"cycles of plush_push by {r.cycles.counter}: {r.cycles.per_step:,.0f} a step on average of {r.cycles.steps:,} "
+        f"steps; longest call {r.cycles.longest:,}"
+        for r in done.runs
+        if r.cycles
+    ]
     lines += [f"not run: {part} ({reason})" for part, reason in done.not_run]
     if done.mutants:
         targets = list(dict.fromkeys(m.target for m in done.mutants))

@@ -254,7 +254,7 @@ def measured(layout: Layout, scaler: Scaler) -> tuple[NDArray[np.float64], NDArr
 
 
 FRAMES, ANSWERS = "frames.bin", "answers.bin"
-ANSWER, EVENT, HEALTH = range(3)
+ANSWER, EVENT, HEALTH, PATCH = range(4)
 # The columns of each kind of row; logits and probabilities follow, which are 0 except in answers.
 COLUMNS = {
     ANSWER: (
@@ -267,6 +267,10 @@ COLUMNS = {
     ),
     HEALTH: (
         *("kind", "frame", "ms", "faults", "state", "suspect", "unused", "unused", "unused", "unused"),
+        *("restarts", "invalid"),
+    ),
+    PATCH: (
+        *("kind", "frame", "ms", "status", "unused", "unused", "unused", "unused", "unused", "unused"),
         *("restarts", "invalid"),
     ),
 }
@@ -325,22 +329,26 @@ def answers_over_swaps(parts: Sequence[tuple[IntegerModel, Ints]]) -> list[NDArr
 
 
 def answers_over_patches(
-    model: IntegerModel, parts: Sequence[tuple[IntegerDense | None, Ints]]
+    model: IntegerModel, parts: Sequence[tuple[IntegerDense | None, Ints]], statuses: Sequence[int] = ()
 ) -> list[NDArray[np.int32]]:
     """Compute the toy's rows when the dense layer of its model is replaced during a stream (``plush_patch``).
 
     Args:
         parts: each dense layer, None for the model's own, with the frames (n, 1 + C) that are read with it.
+        statuses: what ``plush_patch`` returns before each part but the first; each is a row after the rows of the part
+            before, with the kind `PATCH` and the index and time of its last frame. Empty: no such rows.
 
     Returns:
         The rows of each part, as from `answers_of`. The state is kept, so that the next step uses the new layer.
     """
     network = model.network.stepper()
     toy, frame, tables = _toy(model, network), 0, list[NDArray[np.int32]]()
-    for dense, frames in parts:
+    for (dense, frames), status in zip(parts, [*statuses, *[None] * (len(parts) - len(statuses))], strict=True):
         network.patch(dense)
         table = _RowTable(toy, model, frame)
         table.read(frames)
+        if status is not None:
+            table.add_patch(int(frames[-1, 0]), status)
         frame = table.frame
         tables.append(table.array())
     return tables
@@ -396,6 +404,12 @@ class _RowTable:
         health = self.toy.frames.health
         state = FAULT if health.fault else WARMING if self.toy.samples.warming else TRACKING
         self._add(HEALTH, ms, health.faults, state, int(health.suspect))
+
+    def add_patch(self, ms: int, status: int) -> None:
+        """Add what ``plush_patch`` returned after the last frame, of time ``ms``."""
+        self.frame -= 1
+        self._add(PATCH, ms, status)
+        self.frame += 1
 
     def _ms(self, time_us: int) -> int:
         return (time_us + self.toy.frames.zero_us) // 1000

@@ -22,10 +22,13 @@ from plushsense.windows.features import Scaler
 ARDUINO = "arduino/PlushSense"
 IDF = "esp-idf/plushsense"
 IDF_EXAMPLE = f"{IDF}/examples/PlushToy"
+IDF_TASKS = f"{IDF}/examples/RtosToy"
 SKETCH = f"{ARDUINO}/examples/PlushToy"
 LICENCE = "LICENSE"
 TWO_SLOTS = "examples/two_slots"
 _UPDATE = ("plush_update.h", "plush_update.c")
+ON_CHIP = "examples/verify_device"
+_DEVICE = ("plush_device.h", "plush_device.c", "plush_hooks.c")
 # Manifests must have an address; PlushSense has no page of its own. RFC 6761: nobody can own this one.
 NO_PAGE = "https://plushsense.invalid/"
 _WIRE = ("plush_wire.h", "plush_wire.c")
@@ -44,6 +47,9 @@ _TEMPLATES = {
     f"{IDF_EXAMPLE}/CMakeLists.txt": "project_CMakeLists.txt",
     f"{IDF_EXAMPLE}/main/CMakeLists.txt": "main_CMakeLists.txt",
     f"{IDF_EXAMPLE}/sdkconfig.defaults": "sdkconfig.defaults",
+    f"{IDF_TASKS}/CMakeLists.txt": "project_CMakeLists.txt",
+    f"{IDF_TASKS}/main/CMakeLists.txt": "rtos_main_CMakeLists.txt",
+    f"{IDF_TASKS}/sdkconfig.defaults": "rtos_sdkconfig.defaults",
 }
 
 
@@ -89,8 +95,13 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
         f"{ARDUINO}/keywords.txt": _keywords(header + rendered["plush_wire.h"]),
         f"{SKETCH}/PlushToy.ino": rendered["PlushToy.ino"],
         f"{IDF_EXAMPLE}/main/main.c": rendered["main.c"],
+        f"{IDF_TASKS}/main/main.c": (c_folder / "rtos" / "main.c").read_text(encoding="utf-8"),
+        **{f"{IDF_TASKS}/main/{file}": rendered[file] for file in ("plush_fake.h", "plush_fake.c")},
     }
     texts |= {f"{TWO_SLOTS}/{f}": (c_folder / "two_slots" / f).read_text(encoding="utf-8") for f in _UPDATE}
+    texts |= {f"{ON_CHIP}/{f}": (c_folder / "device" / f).read_text(encoding="utf-8") for f in _DEVICE}
+    harness = (c_folder / "harness.c").read_text(encoding="utf-8")
+    texts[f"{ON_CHIP}/plush_harness.c"] = f"#define PLUSH_HARNESS_DEVICE 1\n{harness}"
     for file in _WIRE:
         texts |= {f"{ARDUINO}/src/{file}": rendered[file], f"{IDF}/{_component_path(file)}": rendered[file]}
     for file in _EXAMPLE:

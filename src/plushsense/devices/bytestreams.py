@@ -1,4 +1,4 @@
-"""Toys that send lines over a serial port (of a cable or a Bluetooth driver; with pyserial) or over TCP."""
+"""Serial ports (of a cable or a Bluetooth driver; with pyserial), TCP connections, and toys that send lines there."""
 
 from __future__ import annotations
 
@@ -8,19 +8,22 @@ import re
 import socket
 import sys
 import time
+from abc import ABC, abstractmethod
 from pathlib import Path
 
 import serial as pyserial
 from serial.tools import list_ports
 
-from plushsense.core.errors import DeviceError
+from plushsense.core.errors import ConfigError, DeviceError
 from plushsense.core.layouts import Layout
 from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Device, Frame, now_ms
-from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
+from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing, parse_url
 from plushsense.devices.wire import LineParser
 
 BAUD = 115_200
+SEND_S = 10.0
+_SERIAL_S = 0.1
 
 # SerialException is an OSError; a port that disappears while it is opened or read raises one of the others.
 _FAULTS: tuple[type[Exception], ...] = (OSError, TypeError, ValueError)
@@ -42,32 +45,51 @@ def search_serial(_: float) -> DeviceListing:
     return DeviceListing([DeviceInfo(f"serial://{name}", "serial", name, about) for name, about in ports], notes)
 
 
-class SerialDevice(Device):
-    """A toy on a serial port. Reading raises DeviceError after it is unplugged."""
+class Link(ABC):
+    """An open connection that carries bytes both ways."""
 
-    def __init__(self, url: str, layout: Layout, port: str, baud: int = BAUD) -> None:
+    def __init__(self, url: str) -> None:
+        self.url = url
+        self.closed = False
+
+    @abstractmethod
+    def receive(self, wait_s: float) -> bytes | None:
+        """Return the received bytes, waiting at most ``wait_s`` for the first; None after the other side has closed.
+
+        Raises:
+            DeviceError: if the connection is lost.
+        """
+
+    @abstractmethod
+    def send(self, data: bytes) -> None:
+        """Send bytes; raise DeviceError if the connection is lost, or nothing was taken for `SEND_S`."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the connection, also while another thread reads."""
+
+
+class LineDevice(Device):
+    """A toy that sends lines. A link that is closed properly ends the frames; a lost one raises DeviceError."""
+
+    def __init__(self, url: str, layout: Layout, link: Link, *, joining: bool) -> None:
         super().__init__(url, layout)
-        try:
-            # Two readers would each get only part of the bytes, so a second one is refused (Windows always does so).
-            alone = True if os.name == "posix" else None
-            self._port = pyserial.Serial(port, baud, timeout=0.1, exclusive=alone)
-        except _FAULTS as cause:
-            raise _refusal(url, port, cause) from None
-        self._parser = LineParser(layout, self.counters, joining=True)
+        self._link = link
+        self._parser = LineParser(layout, self.counters, joining=joining)
 
     def read(self) -> list[Frame] | None:
-        """Return the received frames, waiting at most 0.1 s, or not at all if ``wait_s`` is 0."""
+        """Return the received frames, waiting at most ``wait_s``; return None after the other side has closed."""
         try:
-            waiting = self._port.in_waiting
-            if not waiting and self.wait_s <= 0.0:
-                return []
-            data = self._port.read(max(1, min(waiting, 65536)))
-        except _FAULTS as cause:  # pyserial raises various errors for a port closed by another thread
-            if self.closed:
-                return None
+            data = self._link.receive(self.wait_s)
+        except DeviceError:
             self._parser.finish()
-            message = f"'{self.url}' went away ({_reason(cause)}): was it unplugged or switched off?"
-            raise DeviceError(message, reason="toy_gone", url=self.url) from None
+            raise
+        if data is None:
+            if not self.closed:
+                self._parser.finish()
+            return None
+        if not data:
+            return []
         self.arrived_s = time.perf_counter()
         return self._parser.frames(data, now_ms())
 
@@ -77,6 +99,47 @@ class SerialDevice(Device):
         return self._parser.mismatch(self.url)
 
     def _shut(self) -> None:
+        self._link.close()
+
+
+class SerialLink(Link):
+    """A serial port."""
+
+    def __init__(self, url: str, port: str, baud: int = BAUD) -> None:
+        super().__init__(url)
+        try:
+            # Two readers would each get only part of the bytes, so a second one is refused (Windows always does so).
+            alone = True if os.name == "posix" else None
+            self._port = pyserial.Serial(port, baud, timeout=_SERIAL_S, write_timeout=SEND_S, exclusive=alone)
+        except _FAULTS as cause:
+            raise _refusal(url, port, cause) from None
+
+    def receive(self, wait_s: float) -> bytes | None:
+        """As in `Link`, waiting at most 0.1 s, or not at all if ``wait_s`` is 0; None only after `close`."""
+        try:
+            waiting = self._port.in_waiting
+            if not waiting and wait_s <= 0.0:
+                return b""
+            return bytes(self._port.read(max(1, min(waiting, 65536))))
+        except _FAULTS as cause:  # pyserial raises various errors for a port closed by another thread
+            if self.closed:
+                return None
+            raise self._gone(cause) from None
+
+    def send(self, data: bytes) -> None:
+        """As in `Link`."""
+        try:
+            self._port.write(data)
+        except _FAULTS as cause:
+            raise self._gone(cause) from None
+
+    def _gone(self, cause: Exception) -> DeviceError:
+        message = f"'{self.url}' went away ({_reason(cause)}): was it unplugged or switched off?"
+        return DeviceError(message, reason="toy_gone", url=self.url)
+
+    def close(self) -> None:
+        """As in `Link`."""
+        self.closed = True
         with contextlib.suppress(*_FAULTS):
             self._port.close()
 
@@ -133,9 +196,13 @@ def check_serial(address: DeviceAddress) -> None:
         raise _no_port(address.url, port)
 
 
-def open_serial(address: DeviceAddress, layout: Layout) -> SerialDevice:
+def _serial_link(address: DeviceAddress) -> SerialLink:
+    return SerialLink(address.url, _port_of(address), address.whole("baud", BAUD, 50, 4_000_000))
+
+
+def open_serial(address: DeviceAddress, layout: Layout) -> LineDevice:
     """Open ``serial:///dev/ttyUSB0?baud=115200`` or ``serial://COM3``."""
-    return SerialDevice(address.url, layout, _port_of(address), address.whole("baud", BAUD, 50, 4_000_000))
+    return LineDevice(address.url, layout, _serial_link(address), joining=True)
 
 
 CONNECT_S = 5.0
@@ -143,11 +210,11 @@ _KEEPALIVE = {"TCP_KEEPIDLE": 3, "TCP_KEEPALIVE": 3, "TCP_KEEPINTVL": 1, "TCP_KE
 """Seconds of silence (TCP_KEEPALIVE on macOS), seconds between probes, number of probes."""
 
 
-class TcpDevice(Device):
-    """A toy on a TCP connection. A proper close ends the frames; a broken connection raises DeviceError."""
+class TcpLink(Link):
+    """A TCP connection."""
 
-    def __init__(self, url: str, layout: Layout, host: str, port: int) -> None:
-        super().__init__(url, layout)
+    def __init__(self, url: str, host: str, port: int) -> None:
+        super().__init__(url)
         try:
             self._socket = socket.create_connection((host, port), timeout=CONNECT_S)
         except socket.gaierror:
@@ -166,35 +233,36 @@ class TcpDevice(Device):
             message = f"'{url}' cannot be reached: {reason}."
             raise DeviceError(message, reason="toy_unreachable", url=url) from None
         _enable_keepalive(self._socket)
-        self._parser = LineParser(layout, self.counters)
 
-    def read(self) -> list[Frame] | None:
-        """Return the received frames, waiting at most ``wait_s``; return None after the other side has closed."""
+    def receive(self, wait_s: float) -> bytes | None:
+        """As in `Link`."""
         try:
-            self._socket.settimeout(self.wait_s)
-            data = self._socket.recv(65536)
+            self._socket.settimeout(wait_s)
+            return self._socket.recv(65536) or None
         except BlockingIOError:
-            return []
+            return b""
         except OSError as cause:
             if self.closed:
                 return None
             if isinstance(cause, TimeoutError) and cause.errno is None:  # our timeout; others have a number
-                return []
-            self._parser.finish()
-            message = f"'{self.url}' went away: {cause.strerror or cause}."
-            raise DeviceError(message, reason="toy_gone", url=self.url) from None
-        self.arrived_s = time.perf_counter()
-        if not data:
-            self._parser.finish()
-            return None
-        return self._parser.frames(data, now_ms())
+                return b""
+            raise self._gone(cause) from None
 
-    @property
-    def mismatch(self) -> str:
-        """As in `Device`."""
-        return self._parser.mismatch(self.url)
+    def send(self, data: bytes) -> None:
+        """As in `Link`."""
+        try:
+            self._socket.settimeout(SEND_S)
+            self._socket.sendall(data)
+        except OSError as cause:
+            raise self._gone(cause) from None
 
-    def _shut(self) -> None:
+    def _gone(self, cause: OSError) -> DeviceError:
+        message = f"'{self.url}' went away: {cause.strerror or cause}."
+        return DeviceError(message, reason="toy_gone", url=self.url)
+
+    def close(self) -> None:
+        """As in `Link`."""
+        self.closed = True
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
@@ -219,6 +287,23 @@ def check_tcp(address: DeviceAddress) -> tuple[str, int]:
     return match[1].strip("[]"), int(match[2])
 
 
-def open_tcp(address: DeviceAddress, layout: Layout) -> TcpDevice:
+def open_tcp(address: DeviceAddress, layout: Layout) -> LineDevice:
     """Open ``tcp://host:port``."""
-    return TcpDevice(address.url, layout, *check_tcp(address))
+    return LineDevice(address.url, layout, TcpLink(address.url, *check_tcp(address)), joining=False)
+
+
+def open_link(url: str) -> Link:
+    """Open ``serial://…`` or ``tcp://host:port`` for any bytes.
+
+    Raises:
+        ConfigError: for another scheme, or a setting that is unknown or out of range.
+        DeviceError: for a port or host that does not exist or cannot be opened.
+    """
+    address = parse_url(url)
+    if "layout" in address.query:
+        raise ConfigError(f"'{url}': no lines are read here, so leave out layout.")
+    if address.scheme == "serial":
+        return _serial_link(address)
+    if address.scheme == "tcp":
+        return TcpLink(address.url, *check_tcp(address))
+    raise ConfigError(f"'{url}' carries no bytes both ways: accepted are serial:///dev/ttyUSB0 and tcp://host:port.")

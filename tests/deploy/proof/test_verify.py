@@ -19,7 +19,7 @@ from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
-from plushsense.deploy.golden import EVENT, FAULT, HEALTH, column
+from plushsense.deploy.golden import EVENT, FAULT, HEALTH, PATCH, TRACKING, answers_of, column
 from plushsense.deploy.package import ARDUINO, package
 from plushsense.deploy.profile import profile
 from plushsense.deploy.proof.mutants import RULES, mutants_of, source_mutants
@@ -92,8 +92,9 @@ def test_every_way_to_compile_on_the_host(all_compilers: None, small: Path) -> N
     assert {(cc, o) for cc in ("gcc", "clang") for o in ("-O0", "-O2", "-O3")} <= made
     assert {("gcc", "-O1 sanitizers"), ("gcc", "-O2 called from C++"), ("gcc", "-O2 plush_model.bin")} <= made
     assert all("sanitizers" in what for what, _ in done.not_run), "clang's are a package of their own"
-    rows = [len(v.answers) for v in (Export(small).golden, *Export(small).scenarios())]
-    assert min(rows) > 500 and {r.vectors for r in done.runs} == {sum(rows)}
+    export = Export(small)
+    rows = [len(v.answers) for v in (export.golden, *export.scenarios(), *export.patched())]
+    assert min(rows[:-1]) > 500 and {r.vectors for r in done.runs} == {sum(rows)}
 
 
 def test_a_last_layer_that_was_adapted_and_rules_that_were_fitted(c_compiler: str, tmp_path: Path) -> None:
@@ -121,6 +122,21 @@ def test_a_last_layer_that_was_adapted_and_rules_that_were_fitted(c_compiler: st
     assert FAULT in column(export.golden.answers, "state", HEALTH)
     done = verify(export, ["host"], only=plainly)
     assert done.passed and done.first is None
+
+
+def test_patches_are_used_refused_and_undone(small: Path) -> None:
+    """What every target is asked; that the status and the answers after it are compared is shown by the mutants."""
+    export = Export(small)
+    (patched,) = export.patched()
+    assert column(patched.answers, "status", PATCH).tolist() == [0, 3, 6, 3, 0, 6, 1, 0]
+    assert column(patched.answers, "restarts").max() == 1 and export.patched() == [patched]
+    at = column(patched.answers, "frame", PATCH)
+    own = answers_of(export.model, patched.frames)
+    tracked = (own[:, 0] == 0) & (own[:, 4] == TRACKING)
+    theirs = patched.answers[patched.answers[:, 0] == 0]
+    same = (theirs[:, 12:30] == own[own[:, 0] == 0][:, 12:30]).all(axis=1)[tracked[own[:, 0] == 0]]
+    frame = column(own, "frame")[tracked[own[:, 0] == 0]]
+    assert same[(frame <= at[0]) | (frame > at[-1])].all() and not same[(frame > at[0]) & (frame <= at[-1])].any()
 
 
 def test_scenarios_cover_all_outcomes(small: Path) -> None:
@@ -166,7 +182,7 @@ def test_every_fault_is_caught_on_the_host(c_compiler: str, small: Path, capsys:
     export = Export(small)
     done = verify(export, ["host"], only=plainly, mutants=lambda mutant: True)
     assert [f.name for f in done.mutants if not f.caught] == [] and done.passed
-    kinds = {"weight", "shift", "index", "rounding", "clamp", "rule", "constant", *RULES}
+    kinds = {"weight", "shift", "index", "rounding", "clamp", "rule", "constant", "patch", *RULES}
     assert {f.kind for f in done.mutants} == kinds
     assert len(done.mutants) == len([m for m in source_mutants() if m.when != "vectors" and m.library != "window"]) + 10
     # By an answer, not because the toy would not begin or crashed.
@@ -387,8 +403,8 @@ def test_recordings_go_through_the_c(
     out = exported(tmp_path / "out", bundle_of("accel-3", "5d1_4d3", "3,5"))
     code, report, err = run(capsys, str(out), "--target", "host", "--dataset", str(recorded), "--samples", "5000")
     assert code == 0 and report["mismatches"] == 0
-    assert [s["name"] for s in report["streams"]] == ["golden", "scenario", "recordings"]
-    assert report["streams"][2]["frames"] == 780 and "these recordings make" in err
+    assert [s["name"] for s in report["streams"]] == ["golden", "scenario", "patch", "recordings"]
+    assert report["streams"][3]["frames"] == 780 and "these recordings make" in err
     assert all(r["vectors"] == sum(s["answers"] for s in report["streams"]) for r in report["runs"])
     assert sorted(p.name for p in out.iterdir()) == sorted(
         p.name for p in exported(tmp_path / "b", Export(out).bundle).iterdir()
@@ -415,8 +431,8 @@ def test_long_streams_are_cut_where_an_emulator_has_no_more_room(
     vectors = export.made_up(5000)
     assert len(vectors) >= 3 and {len(v.frames) for v in vectors[:-1]} == {2000}
     done = verify(export, ["host"], vectors, only=plainly)
-    assert done.passed and [c.name for c in done.counts] == ["golden", "scenario", "made up"]
-    assert done.counts[2].samples >= 4900 and done.runs[0].vectors == sum(c.answers for c in done.counts)
+    assert done.passed and [c.name for c in done.counts] == ["golden", "scenario", "patch", "made up"]
+    assert done.counts[3].samples >= 4900 and done.runs[0].vectors == sum(c.answers for c in done.counts)
 
 
 def test_a_model_of_another_layout_among_the_files_is_named(c_compiler: str, own: Path, tmp_path: Path) -> None:

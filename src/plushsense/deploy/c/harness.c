@@ -3,18 +3,22 @@
  * every number of it.
  *
  * What is fed are cases, one after the other, of 32-bit little-endian numbers: the bytes of a model, and the model, filled
- * up to whole numbers (0 bytes: the export's own); how many silences, and after which frames; how many frames, and each:
- * milliseconds, then the measured channels. What is written are rows of the same kind:
+ * up to whole numbers (0 bytes: the export's own); then, again and again, how many frames, and each: milliseconds, then
+ * the measured channels; and what comes after them: 0, the case ends; 1, a silence; 2, a patch: its bytes, and the patch,
+ * filled up (0 bytes: the model's own layer is brought back). What is written are rows of the same kind:
  *
  *     0, frame, ms, sample, state, gesture, affect, confidence, answer, known, restarts, invalid, logits x classes,
  *         smooth x classes; while warming all from gesture to known is 0, and logits and smooth
  *     1, frame, ms, number, what, gesture, affect, source, since, 0, restarts, invalid, and zeros: an event
  *     2, frame, ms, faults, state, suspect, 0, 0, 0, 0, restarts, invalid, and zeros: health says something else
+ *     3, frame, ms, status, 0, 0, 0, 0, 0, 0, restarts, invalid, and zeros: what plush_patch() says
  *
  * When something is wrong that no row can show, one more row is written, not whole: words that say it.
  *
  * PLUSH_HARNESS_CHANNELS and PLUSH_HARNESS_CLASSES say of how many the frames and the expected rows are,
  * PLUSH_HARNESS_MEMORY_BYTES how much memory the cases' own models need.
+ * Cases are in memory, and rows go to target_write(). With PLUSH_HARNESS_DEVICE both go over a UART (plush_device.c), and
+ * it is measured how long plush_push() takes.
  * With PLUSH_HARNESS_IMAGE the export's model is not the one compiled in (plush_model.c) but the bytes of
  * plush_model.bin, as when a model is swapped without compiling the code again; with PLUSH_HARNESS_BOTH too they must be
  * the same bytes.
@@ -27,10 +31,16 @@
 #define HEAD 12u
 #define OWN_WORDS (PLUSH_HARNESS_MEMORY_BYTES / 4u)
 #define MEMORY_WORDS (PLUSH_MODEL_MEMORY_WORDS > OWN_WORDS ? PLUSH_MODEL_MEMORY_WORDS : OWN_WORDS)
-#define MOST_CLASSES 255u
+#define NUMBERS (2u * PLUSH_HARNESS_CLASSES)
 #define GUARD_WORDS 4u
 #define POISON UINT32_C(0xa5c35a3c)
 
+/* What comes after frames. */
+enum { END = 0, SILENCE = 1, PATCH = 2 };
+
+#ifdef PLUSH_HARNESS_DEVICE
+#include "plush_device.h"
+#else
 #ifdef __cplusplus
 extern "C" {
 #endif
@@ -43,11 +53,45 @@ extern const uint8_t image[], image_end[];
 }
 #endif
 
+static const uint8_t *next = cases;
+
+static int plush_device_case(void)
+{
+    return next < cases_end;
+}
+
+/* The next bytes of the case. Those that are kept stay until it ends, others until the next call. */
+static const uint8_t *plush_device_bytes(uint32_t n, int kept)
+{
+    const uint8_t *bytes = next;
+
+    (void)kept;
+    next += n;
+    return bytes;
+}
+
+static void plush_device_row(const uint8_t *bytes, uint32_t n)
+{
+    target_write(bytes, n);
+}
+
+static void plush_device_words(const char *words)
+{
+    target_write(words, (uint32_t)strlen(words));
+}
+
+static uint32_t plush_device_cycles(void)
+{
+    return 0;
+}
+#endif
+
 static plush_toy toy;
 /* One word before and some after, which nobody may touch. */
 static uint32_t memory[1u + MEMORY_WORDS + GUARD_WORDS];
-static uint8_t row[4u * (HEAD + 2u * MOST_CLASSES)];
+static uint8_t row[4u * (HEAD + NUMBERS)];
 static uint32_t answers, frame;
+static uint32_t apart; /* cycles of the harness inside of plush_push() */
 
 static uint8_t *put(uint8_t *to, uint32_t value)
 {
@@ -81,17 +125,17 @@ static void begin_row(uint32_t kind, uint32_t ms, const uint32_t what[7])
     for (i = 0; i < 7; i++)
         to = put(to, what[i]);
     to = put(put(to, toy.restarts), toy.invalid);
-    memset(to, 0, 4u * 2u * MOST_CLASSES);
+    memset(to, 0, 4u * NUMBERS);
 }
 
 static void end_row(void)
 {
-    target_write(row, 4u * (HEAD + 2u * toy.classes));
+    plush_device_row(row, sizeof row);
 }
 
 static void on_answer(const plush_toy *of, void *user)
 {
-    uint32_t what[7], i;
+    uint32_t from = plush_device_cycles(), what[7], i;
 
     (void)user;
     what[0] = of->answer.sample;
@@ -108,11 +152,12 @@ static void on_answer(const plush_toy *of, void *user)
     }
     end_row();
     answers++;
+    apart += plush_device_cycles() - from;
 }
 
 static void on_event(const plush_toy *of, void *user)
 {
-    uint32_t what[7];
+    uint32_t from = plush_device_cycles(), what[7];
 
     (void)user;
     what[0] = of->event.number;
@@ -124,6 +169,7 @@ static void on_event(const plush_toy *of, void *user)
     what[6] = 0;
     begin_row(1, of->event.ms, what);
     end_row();
+    apart += plush_device_cycles() - from;
 }
 
 static void on_health(uint32_t ms)
@@ -141,14 +187,8 @@ static void on_health(uint32_t ms)
 
 static int wrong(const char *words)
 {
-    target_write(words, (uint32_t)strlen(words));
+    plush_device_words(words);
     return 0;
-}
-
-static const uint8_t *failed(const char *words)
-{
-    wrong(words);
-    return NULL;
 }
 
 static int status_words(plush_status status)
@@ -169,42 +209,86 @@ static int status_words(plush_status status)
     }
 }
 
-/* The frames of a case: how many silences, after which frames; how many frames. Returns where the next case begins. */
-static const uint8_t *feed(const uint8_t *p)
+static uint32_t next_number(void)
 {
-    const uint8_t *silences = p + 4, *silent = silences + 4u * number(p), *end;
-    int32_t values[256];
-    uint32_t i, due = 0;
+    const uint8_t *p = plush_device_bytes(4, 0);
 
-    answers = 0;
-    p = silent + 4;
-    end = p + 4u * (1u + toy.channels) * number(silent);
-    for (frame = 0; p < end; p += 4u * (1u + toy.channels), frame++) {
-        int fault = toy.answer.state == PLUSH_FAULT, suspect = toy.suspect;
-
-        for (i = 0; i < toy.channels; i++)
-            values[i] = signed_number(p + 4u + 4u * i);
-        due += plush_push(&toy, number(p), values);
-        if (fault != (toy.answer.state == PLUSH_FAULT) || suspect != toy.suspect)
-            on_health(number(p));
-        if (silences < silent && number(silences) == frame) {
-            silences += 4;
-            plush_silence(&toy);
-        }
-    }
-    return due == answers && toy.answers == answers ? end : NULL;
+    return p == NULL ? 0 : number(p);
 }
 
-/* One case. Returns where the next one begins; NULL after words. */
-static const uint8_t *run(const uint8_t *p, const uint8_t *model, uint32_t bytes)
+/* So many bytes of the case, filled up, that stay. */
+static const uint8_t *next_kept(uint32_t bytes)
 {
-    uint32_t own = number(p), room, i;
+    return plush_device_bytes((bytes + 3u) / 4u * 4u, 1);
+}
 
-    p += 4;
+static void on_patch(uint32_t ms)
+{
+    uint32_t what[7] = {0, 0, 0, 0, 0, 0, 0}, bytes = next_number();
+
+    what[0] = (uint32_t)plush_patch(&toy, bytes == 0 ? NULL : next_kept(bytes), bytes);
+    begin_row(3, ms, what);
+    end_row();
+}
+
+static int push_next(uint32_t *ms, uint32_t *due)
+{
+    static int32_t values[PLUSH_HARNESS_CHANNELS];
+    const uint8_t *p = plush_device_bytes(4u * (1u + PLUSH_HARNESS_CHANNELS), 0);
+    int fault = toy.answer.state == PLUSH_FAULT, suspect = toy.suspect, tracking = toy.answer.state == PLUSH_TRACKING;
+    uint32_t i, n, from;
+
+    if (p == NULL)
+        return 0;
+    *ms = number(p);
+    for (i = 0; i < PLUSH_HARNESS_CHANNELS; i++)
+        values[i] = signed_number(p + 4u + 4u * i);
+    apart = 0;
+    from = plush_device_cycles();
+    n = plush_push(&toy, *ms, values);
+#ifdef PLUSH_HARNESS_DEVICE
+    plush_device_measure(plush_device_cycles() - from - apart, n,
+                         tracking && toy.answer.state == PLUSH_TRACKING);
+#else
+    (void)from;
+    (void)tracking;
+#endif
+    *due += n;
+    if (fault != (toy.answer.state == PLUSH_FAULT) || suspect != toy.suspect)
+        on_health(*ms);
+    return 1;
+}
+
+/* The frames of a case, and what comes between them. Says whether all came, and all answers were told. */
+static int feed(void)
+{
+    uint32_t due = 0, ms = 0, what, n;
+
+    answers = frame = 0;
+    do {
+        for (n = next_number(); n > 0; n--, frame++)
+            if (!push_next(&ms, &due))
+                return 0;
+        what = next_number();
+        frame--; /* of the newest frame */
+        if (what == SILENCE)
+            plush_silence(&toy);
+        else if (what == PATCH)
+            on_patch(ms);
+        frame++;
+    } while (what != END);
+    return (due == answers && toy.answers == answers) ||
+           wrong("plush_push() or toy.answers counts other answers than on_answer saw.");
+}
+
+/* One case, with the export's model or its own. Says whether all was well; otherwise words were written. */
+static int run(const uint8_t *model, uint32_t bytes)
+{
+    uint32_t own = next_number(), room, i;
+
     if (own != 0) {
-        model = p;
+        model = next_kept(own);
         bytes = own;
-        p += (own + 3u) / 4u * 4u;
     }
     /* What was in the memory before must not matter. */
     for (i = 0; i < sizeof memory / sizeof memory[0]; i++)
@@ -212,29 +296,32 @@ static const uint8_t *run(const uint8_t *p, const uint8_t *model, uint32_t bytes
     memset(&toy, 0xa5, sizeof toy);
     room = own != 0 ? plush_memory_bytes(model, bytes) : PLUSH_MODEL_MEMORY_BYTES;
     if (plush_memory_bytes(model, bytes) > room)
-        return failed("PLUSH_MODEL_MEMORY_BYTES is less than plush_memory_bytes() says.");
+        return wrong("PLUSH_MODEL_MEMORY_BYTES is less than plush_memory_bytes() says.");
     if (room > 4u * MEMORY_WORDS)
-        return failed("plush_memory_bytes() says more than PlushSense does.");
+        return wrong("plush_memory_bytes() says more than PlushSense does.");
     if (!status_words(plush_begin(&toy, model, bytes, memory + 1, room)))
-        return NULL;
+        return 0;
     if (toy.channels != PLUSH_MODEL_CHANNELS || toy.classes != PLUSH_MODEL_CLASSES)
-        return failed("PLUSH_MODEL_CHANNELS or PLUSH_MODEL_CLASSES is not that of the model.");
+        return wrong("PLUSH_MODEL_CHANNELS or PLUSH_MODEL_CLASSES is not that of the model.");
     if (toy.channels != PLUSH_HARNESS_CHANNELS || toy.classes != PLUSH_HARNESS_CLASSES)
-        return failed("The model has other channels or classes than model.plush: put the files of one export together.");
+        return wrong("The model has other channels or classes than model.plush: put the files of one export together.");
     toy.on_answer = on_answer;
     toy.on_event = on_event;
-    p = feed(p);
-    if (p == NULL)
-        return failed("plush_push() or toy.answers counts other answers than on_answer saw.");
+    if (!feed())
+        return 0;
     if (memory[0] != POISON)
-        return failed("A word before the toy's memory was written to.");
+        return wrong("A word before the toy's memory was written to.");
     for (i = 1u + room / 4u; i < sizeof memory / sizeof memory[0]; i++)
         if (memory[i] != POISON)
-            return failed("A word after the toy's memory was written to.");
-    return p;
+            return wrong("A word after the toy's memory was written to.");
+    return 1;
 }
 
+#ifdef PLUSH_HARNESS_DEVICE
+void plush_device_cases(void)
+#else
 int main(void)
+#endif
 {
 #ifdef PLUSH_HARNESS_IMAGE
     const uint8_t *model = image;
@@ -243,15 +330,16 @@ int main(void)
     const uint8_t *model = plush_model;
     uint32_t bytes = PLUSH_MODEL_BYTES;
 #endif
-    const uint8_t *p = cases;
+    int well = PLUSH_MODEL_MEMORY_BYTES <= 4u * PLUSH_MODEL_MEMORY_WORDS ||
+               wrong("PLUSH_MODEL_MEMORY_WORDS is less than PLUSH_MODEL_MEMORY_BYTES.");
 
-    if (PLUSH_MODEL_MEMORY_BYTES > 4u * PLUSH_MODEL_MEMORY_WORDS)
-        return wrong("PLUSH_MODEL_MEMORY_WORDS is less than PLUSH_MODEL_MEMORY_BYTES.");
-    while (p != NULL && p < cases_end)
-        p = run(p, model, bytes);
+    while (well && plush_device_case())
+        well = run(model, bytes);
 #ifdef PLUSH_HARNESS_BOTH
     if (bytes != PLUSH_MODEL_BYTES || memcmp(image, plush_model, PLUSH_MODEL_BYTES) != 0)
-        return wrong("plush_model.c does not hold the bytes of plush_model.bin.");
+        wrong("plush_model.c does not hold the bytes of plush_model.bin.");
 #endif
+#ifndef PLUSH_HARNESS_DEVICE
     return 0;
+#endif
 }

@@ -23,11 +23,21 @@
 
 /* Not copied to where it is called: for the registers of a loop, or for the flash. */
 #if defined(__GNUC__)
-#define PLUSH_APART __attribute__((noinline))
+#define PLUSH_APART __attribute__((noinline)) PLUSH_CODE
+#define PLUSH_SMALL_APART __attribute__((noinline, cold))
 #define PLUSH_SMALL __attribute__((cold)) /* compiled for size */
 #else
-#define PLUSH_APART
+#define PLUSH_APART PLUSH_CODE
+#define PLUSH_SMALL_APART
 #define PLUSH_SMALL
+#endif
+
+/* Where the code of a step, and its tables, are placed: nothing, or an attribute such as IRAM_ATTR and DRAM_ATTR. */
+#ifndef PLUSH_CODE
+#define PLUSH_CODE
+#endif
+#ifndef PLUSH_CONST
+#define PLUSH_CONST
 #endif
 
 /* What a model may ask for, so that every sum, size and address below is sure to fit. */
@@ -106,6 +116,7 @@ static uint32_t le16(const uint8_t *p)
     return (uint32_t)p[0] | ((uint32_t)p[1] << 8);
 }
 
+PLUSH_CODE
 static uint32_t le32(const uint8_t *p)
 {
     return le16(p) | (le16(p + 2) << 16);
@@ -200,6 +211,7 @@ static uint32_t square_root(uint64_t v)
 }
 
 /* The square root, rounded down. */
+PLUSH_CODE
 static uint32_t short_root(uint32_t v)
 {
     uint32_t root = 0, bit = UINT32_C(1) << 30;
@@ -222,7 +234,7 @@ static uint32_t distance_of(int32_t one, int32_t other)
     return one >= other ? (uint32_t)one - (uint32_t)other : (uint32_t)other - (uint32_t)one;
 }
 
-PLUSH_SMALL PLUSH_APART
+PLUSH_SMALL_APART
 static uint32_t word_at(const uint8_t *p)
 {
     return le32(p);
@@ -243,7 +255,7 @@ PLUSH_SMALL static uint32_t checksum(const uint8_t *bytes, uint32_t n) /* CRC-32
 }
 
 /* A model, or a patch of one: they begin with the same head but for its first four bytes. */
-PLUSH_SMALL PLUSH_APART
+PLUSH_SMALL_APART
 static plush_status check(const uint8_t *model, uint32_t bytes, const char *magic)
 {
     if (model == NULL || bytes < HEAD_BYTES || memcmp(model, magic, 4) != 0)
@@ -708,6 +720,7 @@ typedef struct {
 } taps_on;
 
 /* The taps of the next position of a layer that can read `made` samples of a window of `span`. */
+PLUSH_CODE
 static taps_on next_taps(const plush_layer *layer, uint32_t made, uint32_t span)
 {
     uint32_t reach = (layer->kernel - 1u) * (uint32_t)layer->dilation, around = 2u * (span - 1u), before;
@@ -737,6 +750,7 @@ static uint32_t row_under(const plush_layer *layer, int32_t at, int32_t first)
     return (uint32_t)(at + first < 0 ? at + first + layer->rows : at + first);
 }
 
+PLUSH_CODE
 static void go_on(taps_on *taps)
 {
     taps->at += taps->by;
@@ -940,6 +954,7 @@ static uint32_t requantize(int32_t sum, const uint8_t *scale)
 
 /* One new position of a layer, (filters) activations. */
 #ifdef PLUSH_WINDOW
+PLUSH_CODE
 static void advance(plush_layer *layer, taps_on taps, uint8_t *out)
 {
     const uint8_t *weights = layer->weights, *scale = layer->scales;
@@ -1017,13 +1032,13 @@ static void network_sample(plush_toy *toy)
 /* ---- From pooled sums to an answer ----------------------------------------------------------------------------- */
 
 /* round(65535 exp(-i / 4)) and round(65535 exp(-i / 256)) */
-static const uint16_t coarse[64] = {
+PLUSH_CONST static const uint16_t coarse[64] = {
     65535, 51039, 39749, 30957, 24109, 18776, 14623, 11388, 8869, 6907, 5379, 4190, 3263, 2541, 1979, 1541,
     1200, 935, 728, 567, 442, 344, 268, 209, 162, 127, 99, 77, 60, 47, 36, 28,
     22, 17, 13, 10, 8, 6, 5, 4, 3, 2, 2, 1, 1, 1, 1, 1,
     0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0
 };
-static const uint16_t fine[64] = {
+PLUSH_CONST static const uint16_t fine[64] = {
     65535, 65280, 65025, 64771, 64519, 64267, 64017, 63767, 63519, 63271, 63024, 62779, 62534, 62290, 62047, 61805,
     61564, 61324, 61085, 60847, 60610, 60374, 60138, 59904, 59670, 59438, 59206, 58975, 58745, 58516, 58288, 58061,
     57834, 57609, 57384, 57161, 56938, 56716, 56495, 56274, 56055, 55837, 55619, 55402, 55186, 54971, 54757, 54543,
@@ -1125,12 +1140,14 @@ static uint32_t decide(plush_toy *toy)
 
 /* ---- Events ---------------------------------------------------------------------------------------------------- */
 
+PLUSH_CODE
 static uint32_t setting(const plush_toy *toy, uint32_t which)
 {
     return le16(toy->event_plan + which);
 }
 
 /* No setting asks for more than 16 bits can count. */
+PLUSH_CODE
 static void count_up(uint16_t *count)
 {
     if (*count < UINT16_MAX)
@@ -1143,6 +1160,7 @@ static uint32_t share_of(const plush_toy *toy, uint32_t gesture)
 }
 
 /* The share of all classes of an affect together; idle ones are nobody's. */
+PLUSH_CODE
 static uint32_t mass_of(const plush_toy *toy, uint32_t affect)
 {
     uint32_t sum = 0, k;
@@ -1209,7 +1227,7 @@ static void end_event(plush_toy *toy, uint32_t since, uint32_t ms)
 }
 
 /* The signal is gone: what is going on ends, all but the count of events is forgotten. */
-PLUSH_SMALL PLUSH_APART
+PLUSH_SMALL_APART
 static void lose(plush_toy *toy, uint32_t ms)
 {
     if (going_on(toy))
@@ -1221,6 +1239,7 @@ static void lose(plush_toy *toy, uint32_t ms)
 }
 
 /* A step in which nothing spoke for the event. */
+PLUSH_CODE
 static void miss(plush_toy *toy, uint32_t ms)
 {
     if (toy->away == 0)
@@ -1402,6 +1421,7 @@ static void answer(plush_toy *toy, uint32_t ms)
 /* ---- The gate -------------------------------------------------------------------------------------------------- */
 
 /* The inputs `back` samples before those that are being read. */
+PLUSH_CODE
 static int32_t *past_inputs(const plush_toy *toy, uint32_t back)
 {
     uint32_t rows = toy->gate_past + 1u, at = toy->gate_newest + rows - back;
@@ -1537,6 +1557,7 @@ static void gate_sample(plush_toy *toy, uint32_t ms)
 /* ---- Health ---------------------------------------------------------------------------------------------------- */
 
 /* Whether a value lies between two that stand in the model. */
+PLUSH_CODE
 static int lies_in(const uint8_t *range, int32_t value)
 {
     return value >= as_signed(le32(range)) && value <= as_signed(le32(range + 4));
@@ -1632,6 +1653,7 @@ static void count_means(plush_toy *toy)
 }
 
 /* What a channel of the network becomes in 8 bits. */
+PLUSH_CODE
 static uint8_t to_code(int32_t x, const uint8_t *scale)
 {
     int32_t offset = as_signed(le32(scale)), limit = (int32_t)(UINT32_MAX >> (17 - scale[10]));
@@ -1800,6 +1822,7 @@ static void read_inputs(plush_toy *toy)
 }
 
 /* One even sample, in toy->sample. Returns 1 when an answer fell due. */
+PLUSH_CODE
 static uint32_t push_sample(plush_toy *toy, uint32_t ms)
 {
     read_inputs(toy);
@@ -1887,7 +1910,7 @@ struct plush_aligned {
 
 /* A toy with this model and memory. Nothing is written to the memory; a toy of which this does not say PLUSH_OK is of no
  * use. */
-PLUSH_SMALL PLUSH_APART
+PLUSH_SMALL_APART
 static plush_status prepare(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                             uint32_t memory_bytes)
 {
@@ -1991,6 +2014,7 @@ void plush_silence(plush_toy *toy)
         lose(toy, toy->seen_ms);
 }
 
+PLUSH_CODE
 uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
 {
     uint32_t between, due = 0;

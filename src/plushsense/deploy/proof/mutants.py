@@ -20,7 +20,7 @@ from plushsense.core.toml import load_table, read_toml
 from plushsense.runtime.fixed import PROBABILITY_BITS
 from plushsense.runtime.image import GROUP, HEAD_BYTES, image_head
 
-Kind = Literal["weight", "shift", "index", "rounding", "clamp", "rule", "constant", "event", "gate", "health"]
+Kind = Literal["weight", "shift", "index", "rounding", "clamp", "rule", "constant", "patch", "event", "gate", "health"]
 RULES: tuple[Kind, ...] = ("event", "gate", "health")  # kinds that the test scenarios are made to detect
 
 

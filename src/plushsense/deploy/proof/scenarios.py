@@ -1,9 +1,9 @@
-"""Test scenarios: variants of an exported model whose decision rules often apply, to test the rules in the C.
+"""Test scenarios: variants of an exported model whose decision rules often apply, to test the rules in the C; patches.
 
 On generated frames the rules of a trained model rarely apply, so that an error in their C would not be detected. A
 scenario keeps the layers and the input scale of the model. It shifts and scales the logits so that each class is
 sometimes the best one, changes affects and idle classes, and chooses the thresholds of health, gate and events from
-quantiles of the generated frames.
+quantiles of the generated frames. Patches of the last layer are offered to the model itself.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from plushsense.deploy.golden import (
     TRACKING,
     FrameGenerator,
     answers_of,
+    answers_over_patches,
     column,
     measured,
 )
@@ -33,7 +34,7 @@ from plushsense.runtime.events import ANSWERS, BEGUN, ENDED, GATE, KINDS, NO_GES
 from plushsense.runtime.fixed import LOGIT_LIMIT, PROBABILITY_BITS, Ints, LogitScale, known_score, split_ratio
 from plushsense.runtime.gate import JERK, LEVEL, Gate, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
-from plushsense.runtime.image import IntegerModel
+from plushsense.runtime.image import HEAD_BYTES, MAGIC, PATCH_MAGIC, IntegerModel, image_head, patch_bytes
 from plushsense.runtime.integer import IntegerDense
 from plushsense.windows.clock import resample
 from plushsense.windows.features import Scaler, network_inputs
@@ -86,12 +87,14 @@ class Scenario:
         frames: (n, 1 + C), the time in ms and the channels.
         silences: indices of the frames after which a silence is reported.
         rows: (m, 12 + 2 K), as `answers_of` computes them.
+        patches: indices of the frames after which a patch is offered, and its bytes; none: the patch is undone.
     """
 
     model: IntegerModel
     frames: Ints
     silences: tuple[int, ...]
     rows: NDArray[np.int32]
+    patches: tuple[tuple[int, bytes], ...] = ()
 
 
 def scenarios_of(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[Scenario]:
@@ -100,6 +103,51 @@ def scenarios_of(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[S
         _scenario(replace(model, rules=Rules(), gestures=_gestures(model, settings)), scaler, settings, seed)
         for seed, settings in enumerate(SCENARIO_SETTINGS, 1 + repeat * len(SCENARIO_SETTINGS))
     ]
+
+
+# What ``plush_patch`` returns.
+OK, NOT_A_MODEL, DAMAGED, OTHER_MODEL = 0, 1, 3, 6
+
+
+def patches_of(model: IntegerModel, scaler: Scaler) -> Scenario:
+    """Generate frames between which patches of the model's last layer are used, refused and undone."""
+    dense, arch = model.network.dense, model.network.arch
+    scale = LogitScale(*(np.roll(getattr(dense.scale, name), 1) for name in ("before", "multiplier", "after")))
+    rolled = IntegerDense(np.roll(dense.weights, 1, axis=0), np.roll(dense.bias, 1), scale)
+    halved = replace(rolled, weights=(rolled.weights // 2).astype(np.int8), bias=rolled.bias // 2)
+    adapted = [replace(model, network=replace(model.network, dense=layer)) for layer in (rolled, halved)]
+    first, second = (patch_bytes(model, other) for other in adapted)
+    body = second[HEAD_BYTES:]
+
+    def sealed(changed: bytes) -> bytes:
+        """Return a patch with a valid checksum."""
+        return image_head(changed, PATCH_MAGIC, model.image_version) + changed
+
+    offers: list[tuple[bytes, int, IntegerDense | None]] = [
+        (first, OK, rolled),
+        (second[:-1] + bytes([second[-1] ^ 1]), DAMAGED, rolled),
+        (sealed(bytes([body[0] ^ 1]) + body[1:]), OTHER_MODEL, rolled),
+        (sealed(body[:8] + b"\xff\xff" + body[10:]), DAMAGED, rolled),  # a multiplier of more than 15 bits
+        (second, OK, halved),
+        (sealed(body[:-1]), OTHER_MODEL, halved),
+        (MAGIC + first[len(MAGIC) :], NOT_A_MODEL, halved),
+        (b"", OK, None),
+    ]
+    generator = FrameGenerator(model.layout, scaler, np.random.default_rng(1))
+    generator.touches(arch.span + 60)
+    cuts = []
+    for n in range(len(offers)):
+        cuts.append(len(generator.rows))
+        generator.touches(4 * arch.step + 20)
+        if n == 0:  # a restart keeps the patch
+            generator.wait(model.layout.gap_ms + 1)
+            generator.touches(arch.span + 60)
+    frames = np.array(generator.rows, dtype=np.int64)
+    layers = [None, *(layer for _, _, layer in offers)]
+    parts = list(zip(layers, np.split(frames, cuts), strict=True))
+    rows = np.concatenate(answers_over_patches(model, parts, [status for _, status, _ in offers]))
+    patches = tuple((cut - 1, patch) for cut, (patch, _, _) in zip(cuts, offers, strict=True))
+    return Scenario(model, frames, (), rows, patches)
 
 
 def all_outcomes() -> set[str]:

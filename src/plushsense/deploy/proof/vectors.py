@@ -27,7 +27,7 @@ from plushsense.deploy.emit import (
     without_prefix,
 )
 from plushsense.deploy.golden import COLUMNS, HEAD, TRACKING, answers_of, column, golden_frames, read_golden
-from plushsense.deploy.proof.scenarios import scenarios_of
+from plushsense.deploy.proof.scenarios import patches_of, scenarios_of
 from plushsense.deploy.quantize import integer_model
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.fixed import Ints
@@ -90,7 +90,7 @@ MOST_FRAME_BYTES = 8 << 20
 class Vectors:
     """Frames (n, 1 + C) and the expected rows (m, 12 + 2 K); ``samples`` is the length of the resampled frames.
 
-    ``model``: model to run, if not that of the export; ``silences``: number of frames before each silence.
+    ``model``: model to run, if not that of the export; ``silences`` and ``patches``: as in `Scenario`.
     """
 
     name: str
@@ -99,6 +99,7 @@ class Vectors:
     samples: int
     model: IntegerModel | None = None
     silences: tuple[int, ...] = ()
+    patches: tuple[tuple[int, bytes], ...] = ()
 
     @property
     def decisions(self) -> int:
@@ -110,13 +111,31 @@ class Vectors:
         """Bytes of memory that ``model`` needs; 0 for the model of the export."""
         return memory_bytes(self.model) if self.model else 0
 
+    @property
+    def kept_bytes(self) -> int:
+        """Bytes of the model and the patches, which the test program keeps until the end."""
+        model = len(self.model.to_bytes()) if self.model else 0
+        return sum(-(-n // 4) * 4 for n in (model, *(len(patch) for _, patch in self.patches)))
+
     def to_bytes(self) -> bytes:
-        """Serialise for the test program: model (empty: that of the export), silences and frames, each with a count."""
-        image = self.model.to_bytes() if self.model else b""
-        counts = [struct.pack("<I", n) for n in (len(image), len(self.silences), len(self.frames))]
-        frames = (self.frames & 0xFFFFFFFF).astype("<u4").tobytes()
-        silences = struct.pack(f"<{len(self.silences)}I", *self.silences)
-        return counts[0] + image + bytes(-len(image) % 4) + counts[1] + silences + counts[2] + frames
+        """Serialise for the test program, whose source describes the format: model, frames, silences and patches."""
+        pieces = [_counted(self.model.to_bytes() if self.model else b"")]
+        between = [(at, struct.pack("<I", _SILENCE)) for at in self.silences]
+        between += [(at, struct.pack("<I", _PATCH) + _counted(patch)) for at, patch in self.patches]
+        frames, begin = (self.frames & 0xFFFFFFFF).astype("<u4"), 0
+        for at, action in (*sorted(between), (len(frames) - 1, struct.pack("<I", _END))):
+            pieces += [struct.pack("<I", at + 1 - begin), frames[begin : at + 1].tobytes(), action]
+            begin = at + 1
+        return b"".join(pieces)
+
+
+# What comes after frames.
+_END, _SILENCE, _PATCH = range(3)
+
+
+def _counted(data: bytes) -> bytes:
+    """Return the number of bytes, and the bytes, filled up to whole 32-bit numbers."""
+    return struct.pack("<I", len(data)) + data + bytes(-len(data) % 4)
 
 
 @dataclass(frozen=True)
@@ -166,6 +185,7 @@ class Export:
         self._files = {f: c if f == IMAGE else without_prefix(c, name) for f, c in files.items()} if name else None
         self.image, self.source = files[IMAGE], without_prefix(files[LIBRARY[1]], name)
         self._scenarios: dict[int, list[Vectors]] = {}
+        self._patched: Vectors | None = None
         arch = self.model.network.arch
         frames, answers = read_golden(self.folder / GOLDEN, len(self.model.layout.channels), arch.classes)
         self.golden = Vectors("golden", frames, answers, self.samples_of(frames))
@@ -253,6 +273,15 @@ class Export:
             ]
         return self._scenarios[repeat]
 
+    def patched(self) -> list[Vectors]:
+        """Return frames between which patches of the last layer are offered; empty if plush_model.bin differs."""
+        if not self.is_own:
+            return []
+        if self._patched is None:
+            s = patches_of(self.model, self.bundle.scaler)
+            self._patched = Vectors("patch", s.frames, s.rows, self.samples_of(s.frames), patches=s.patches)
+        return [self._patched]
+
     def made_up(self, samples: int) -> list[Vectors]:
         """Generate further frames like the golden ones, for at least ``samples`` samples."""
         seed, n_samples = 2, 0
@@ -321,7 +350,7 @@ def compare(expected: NDArray[np.int32], got: bytes, labels: Sequence[str]) -> R
 
 def _row(row: NDArray[Any]) -> str:
     """Return the kind and the frame of a row as text."""
-    kind = ("answer", "event", "health")[int(row[0])] if int(row[0]) in COLUMNS else "of no kind"
+    kind = ("answer", "event", "health", "patch")[int(row[0])] if int(row[0]) in COLUMNS else "of no kind"
     return f"{kind}, frame {int(row[1])}"
 
 

@@ -75,8 +75,21 @@ def settings_of(target: str) -> list[Setting]:
 
 
 @dataclass(frozen=True)
+class Cycles:
+    """Cycles of ``plush_push`` on a chip while the toy was tracking: per step on average, and of the longest call."""
+
+    counter: str
+    steps: int
+    per_step: float
+    longest: int
+
+
+@dataclass(frozen=True)
 class SettingResult:
-    """Result of one setting: ``vectors`` counts rows, ``first`` describes the first one that differs."""
+    """Result of one setting: ``vectors`` counts rows, ``first`` describes the first one that differs.
+
+    ``cycles``: of a connected chip that counts them.
+    """
 
     target: str
     compiler: str
@@ -86,10 +99,12 @@ class SettingResult:
     max_abs_diff: int
     seconds: float
     first: str | None = None
+    cycles: Cycles | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain values for JSON."""
-        return {**vars(self), "seconds": round(self.seconds, 2)}
+        cycles = dict(vars(self.cycles)) if self.cycles else None
+        return {**vars(self), "seconds": round(self.seconds, 2), "cycles": cycles}
 
 
 @dataclass(frozen=True)
@@ -200,8 +215,9 @@ def verify(
     if not trust:
         export.require_unchanged()
     settings, not_run = _choose(targets, only)
-    scenarios = export.scenarios()
-    streams = [(export.golden,), *([tuple(scenarios)] if scenarios else []), *((v,) for v in vectors)]
+    patched = export.patched()
+    scenarios = (*export.scenarios(), *patched)
+    streams = [(export.golden,), *([scenarios] if scenarios else []), *((v,) for v in vectors)]
     selected: list[Mutant] = []
     if mutants:
         export.require_own()
@@ -232,7 +248,12 @@ def verify(
         first_of = {target: next(s for s in settings if s.target == target) for target in chosen}
         pairs = [(mutant, first_of[target]) for mutant in selected for target in chosen]
         mutant_cases = cases[: 1 + bool(scenarios)]
-        for outcome in pool.map(runner.run_mutant, *zip(*pairs, strict=True), repeat(mutant_cases)) if pairs else ():
+        patch_cases = [runner.write_cases(tuple(patched))] if selected else []
+
+        def outcome_of(mutant: Mutant, setting: Setting) -> MutantResult:
+            return runner.run_mutant(mutant, setting, patch_cases if mutant.kind == "patch" else mutant_cases)
+
+        for outcome in pool.map(outcome_of, *zip(*pairs, strict=True)) if pairs else ():
             results.append(outcome)
             report()
         # Other scenarios may contain the rare sequences of steps that a mutant affects.
@@ -249,8 +270,7 @@ def verify(
             for at, outcome in zip(missed, repeated, strict=True):
                 results[at] = outcome
     all_vectors = [v for stream in streams for v in stream]
-    # Scenarios have models of their own.
-    decisions = sum(v.decisions for v in all_vectors if v.model is None)
+    decisions = sum(v.decisions for v in all_vectors if v not in scenarios)
     return VerificationReport(
         export.title, export.changed, decisions, counted(all_vectors), tuple(runs), tuple(not_run), tuple(results)
     )
@@ -349,7 +369,8 @@ class _Runner:
     def run_mutant(self, mutant: Mutant, setting: Setting, streams: Sequence[Cases]) -> MutantResult:
         """Build a copy with one mutant and compare its results for the golden vectors and the test scenarios.
 
-        Scenarios have their own models, so that only golden vectors can detect a mutant of the export's model.
+        Scenarios have their own models, so that only golden vectors can detect a mutant of the export's model. A mutant
+        of patches has frames of its own.
         """
         out = self._new_folder()
         copy = out / "export"
@@ -379,7 +400,8 @@ class _Runner:
         """
         stream, path = cases
         labels = self.export.labels
-        where = f"On {setting.target} ({setting.compiler} {setting.options}), {stream[0].name}"
+        names = " and ".join(dict.fromkeys(v.name for v in stream))
+        where = f"On {setting.target} ({setting.compiler} {setting.options}), {names}"
         expected = np.concatenate([v.answers for v in stream])
         both = both and setting.image
         defines = {

@@ -1,4 +1,4 @@
-/* As much of ESP-IDF as main.c asks for, with the names and types of its headers, on a clock of the test's own. */
+/* As much of ESP-IDF as the examples ask for, with the names and types of its headers, on a clock of the test's own. */
 #ifndef IDF_H
 #define IDF_H
 #include <stdbool.h>
@@ -12,7 +12,13 @@ void esp_check(esp_err_t result);
 int64_t esp_timer_get_time(void);
 
 typedef uint32_t TickType_t;
+typedef int BaseType_t;
+typedef unsigned UBaseType_t;
+#define pdTRUE ((BaseType_t)1)
+#define pdPASS pdTRUE
+#define pdMS_TO_TICKS(ms) ((TickType_t)(ms))
 #define portTICK_PERIOD_MS ((TickType_t)1)
+#define portMAX_DELAY ((TickType_t)UINT32_MAX)
 void vTaskDelay(TickType_t ticks);
 
 typedef int uart_port_t;
@@ -32,6 +38,15 @@ typedef struct {
     uart_sclk_t source_clk;
 } uart_config_t;
 typedef struct QueueDefinition *QueueHandle_t;
+QueueHandle_t xQueueCreate(UBaseType_t length, UBaseType_t bytes);
+BaseType_t xQueueSend(QueueHandle_t queue, const void *item, TickType_t wait);
+BaseType_t xQueueOverwrite(QueueHandle_t queue, const void *item);
+BaseType_t xQueueReceive(QueueHandle_t queue, void *item, TickType_t wait);
+BaseType_t xQueuePeek(QueueHandle_t queue, void *item, TickType_t wait);
+typedef struct tskTaskControlBlock *TaskHandle_t;
+typedef void (*TaskFunction_t)(void *);
+BaseType_t xTaskCreatePinnedToCore(TaskFunction_t task, const char *name, uint32_t stack, void *user, UBaseType_t priority,
+                                   TaskHandle_t *handle, BaseType_t core);
 esp_err_t uart_driver_install(uart_port_t port, int rx, int tx, int queue_size, QueueHandle_t *queue, int flags);
 esp_err_t uart_param_config(uart_port_t port, const uart_config_t *config);
 esp_err_t uart_get_tx_buffer_free_size(uart_port_t port, size_t *size);
@@ -91,6 +106,8 @@ esp_err_t i2c_master_bus_add_device(i2c_master_bus_handle_t bus, const i2c_devic
 esp_err_t i2c_master_transmit(i2c_master_dev_handle_t device, const uint8_t *bytes, size_t n, int wait_ms);
 esp_err_t i2c_master_transmit_receive(i2c_master_dev_handle_t device, const uint8_t *bytes, size_t n, uint8_t *to,
                                       size_t size, int wait_ms);
+
+esp_err_t nvs_flash_init(void);
 
 typedef enum { TOUCH_PAD_NUM0 } touch_pad_t;
 typedef enum { TOUCH_FSM_MODE_TIMER = 0 } touch_fsm_mode_t;

@@ -1,0 +1,3 @@
+#include "idf.h"
+void nimble_port_freertos_init(TaskFunction_t host);
+void nimble_port_freertos_deinit(void);

@@ -1,0 +1,1 @@
+void ble_svc_gatt_init(void);
