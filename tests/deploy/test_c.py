@@ -26,7 +26,7 @@ from plushsense.runtime.image import IntegerModel, memory_bytes
 from support.c_toy import answers, seat
 from support.integers import INT32, any_frames, edged_model, models, plain_model, ruled_model
 
-OK, TOO_SMALL = 0, 4
+OK, TOO_SMALL, NOT_ALIGNED = 0, 4, 7
 
 
 # ---- The same answers ------------------------------------------------------------------------------------------------
@@ -108,6 +108,15 @@ def test_misaligned_or_no_memory(c_library: Any) -> None:
     image = plain_model().to_bytes()
     toy = (ctypes.c_uint64 * 256)()
     assert c_library.plush_begin(toy, image, len(image), None, 1 << 20) == TOO_SMALL
+    room = ctypes.create_string_buffer(len(image) + 4)
+    for off in range(5):
+        at = ctypes.addressof(room) + off
+        ctypes.memmove(at, image, len(image))
+        aligned = at % 4 == 0
+        status = c_library.plush_begin(toy, ctypes.c_void_p(at), len(image), None, 1 << 20)
+        assert status == (TOO_SMALL if aligned else NOT_ALIGNED)
+        size = c_library.plush_memory_bytes(ctypes.c_void_p(at), len(image))
+        assert size == (memory_bytes(plain_model()) if aligned else 0)
 
 
 # ---- Restarts, several toys, other models ----------------------------------------------------------------------------

@@ -56,7 +56,7 @@ def sealed(body: bytes) -> bytes:
 def test_a_good_checksum_makes_no_model(c_library: Any) -> None:
     """Every count that could lead a reader astray is refused, one at a time."""
     body = plain_model().to_bytes()[16:]
-    layer = 28 + 4 * 12 + (3 + 1) + (3 + 3) + 4 + 2 * 12
+    layer = 28 + 4 * 12 + (3 + 1) + (3 + 3) + 4 + 2 + 2 * 12
     assert struct.unpack_from("<HHHH", body, layer) == (5, 2, 2, 6)
     changes = {
         "no layers": (0, b"\0"),
@@ -87,10 +87,11 @@ def test_a_good_checksum_makes_no_model(c_library: Any) -> None:
         "vectors that are not there": (86, b"\1"),
         "kernels of no vector": (87, b"\2"),
         "taps of no vector": (88, b"\1"),
-        "bias": (94, struct.pack("<i", 1 << 30)),
-        "input multiplier": (98, struct.pack("<H", 32768)),
-        "input shift before": (100, b"\x11"),
-        "input shift after": (101, b"\x1f"),
+        "a filling that is not 0": (91, b"\1"),
+        "bias": (96, struct.pack("<i", 1 << 30)),
+        "input multiplier": (100, struct.pack("<H", 32768)),
+        "input shift before": (102, b"\x11"),
+        "input shift after": (103, b"\x1f"),
         "kernel 0": (layer, struct.pack("<H", 0)),
         "kernel beyond the end": (layer, struct.pack("<H", 65535)),
         "dilation 0": (layer + 2, struct.pack("<H", 0)),
@@ -352,10 +353,10 @@ def test_sanitizers_find_nothing_in_any_bytes(sanitized: list[Path], tmp_path: P
     wide = np.zeros((60, 40), dtype=np.int64)
     wide[:, : frames.shape[1]] = frames
     base = ruled_model(4).to_bytes()[16:]
-    layers = [m.start() for m in re.finditer(re.escape(struct.pack("<HHHH", 4, 3, 6, 5)), base)] + [92]
+    layers = [m.start() for m in re.finditer(re.escape(struct.pack("<HHHH", 4, 3, 6, 5)), base)] + [116]
     spots = [
         *range(28),
-        *range(60, 92),
+        *range(60, 116),
         *(at + i for at in layers for i in range(24)),
         *range(base.index(b"gesture 0") - 3, len(base)),
     ]
@@ -374,7 +375,7 @@ def test_sanitizers_find_nothing_in_any_bytes(sanitized: list[Path], tmp_path: P
         # A span that fits the changed layers lets more of them through.
         if kind > 0.4 and len(body) > 130:
             rows = 0
-            at = 92
+            at = 116
             kernel, dilation = struct.unpack_from("<HH", body, at)
             rows += (kernel - 1) * dilation
             rows += sum((struct.unpack_from("<H", base, at)[0] - 1) * 3 for at in layers[:1])
@@ -413,7 +414,7 @@ def test_sanitizers_find_nothing_in_window_networks(sanitized_window: list[Path]
 
     collect()
     base = window_model(window=12).to_bytes()[16:]
-    layers = [m.start() for m in re.finditer(re.escape(struct.pack("<HHHH", 4, 3, 6, 5)), base)] + [92]
+    layers = [m.start() for m in re.finditer(re.escape(struct.pack("<HHHH", 4, 3, 6, 5)), base)] + [116]
     spots = [*range(12), *(at + i for at in layers for i in range(8))]
     wide = np.zeros((60, 40), dtype=np.int64)
     wide[:, 0] = 10 * np.arange(60)
@@ -422,7 +423,7 @@ def test_sanitizers_find_nothing_in_window_networks(sanitized_window: list[Path]
         body = bytearray(base)
         for _ in range(int(rng.integers(1, 3))):
             body[int(rng.choice(spots))] = int(rng.choice([0, 1, 2, 3, 5, 12, 255]))
-        damaged.append((image_head(bytes(body), version=5) + bytes(body), wide))
+        damaged.append((image_head(bytes(body), version=7) + bytes(body), wide))
     (tmp_path / "cases").write_bytes(cases(*good, *damaged))
     output = {run(program, tmp_path / "cases") for program in sanitized_window}
     assert len(output) == 1

@@ -112,8 +112,8 @@ def test_a_patch_of_a_window_network(window_libraries: list[Any]) -> None:
 
 
 def test_each_library_takes_its_own_models_only(c_library: Any, window_libraries: list[Any]) -> None:
-    assert struct.unpack_from("<H", plain_model().to_bytes(), 4) == (4,)
-    assert struct.unpack_from("<H", window_model().to_bytes(), 4) == (5,)
+    assert struct.unpack_from("<H", plain_model().to_bytes(), 4) == (6,)
+    assert struct.unpack_from("<H", window_model().to_bytes(), 4) == (7,)
     assert seat(c_library, window_model()).status == OTHER_VERSION
     for library in window_libraries:
         assert seat(library, plain_model()).status == OTHER_VERSION
@@ -133,22 +133,22 @@ def test_a_good_checksum_makes_no_window_model(window_libraries: list[Any]) -> N
     for what, (at, change) in changes.items():
         wrong = body[:at] + change + body[at + len(change) :]
         for library in window_libraries:
-            assert Seat(library, image_head(wrong, version=5) + wrong, 4, 3).status == DAMAGED, what
+            assert Seat(library, image_head(wrong, version=7) + wrong, 4, 3).status == DAMAGED, what
     vectors = vector_model().to_bytes()[16:]
     vectors = vectors[:6] + bytes(2) + vectors[8:]
     for library in window_libraries:
-        assert Seat(library, image_head(vectors, version=5) + vectors, 4, 3).status == DAMAGED
+        assert Seat(library, image_head(vectors, version=7) + vectors, 4, 3).status == DAMAGED
 
 
 def test_neither_library_holds_the_code_of_the_other() -> None:
-    """So that a streaming toy pays nothing: ``next_taps`` and ``oldest`` stand for the two ways."""
+    """So that a streaming toy pays nothing: ``next_taps`` and ``pair_sums`` stand for the two ways."""
     streaming, window = (library_text(LIBRARY[1], window=w) for w in (False, True))
     for text in (streaming, window, *(library_text(LIBRARY[0], window=w) for w in (False, True))):
         assert "PLUSH_WINDOW" not in text
     assert "next_taps" not in streaming and "next_taps" in window
-    assert "at = oldest(layer) * row" in streaming and "at = oldest(layer) * row" not in window
-    assert "#define PLUSH_IMAGE_VERSION 4\n" in library_text(LIBRARY[0], window=False)
-    assert "#define PLUSH_IMAGE_VERSION 5 " in library_text(LIBRARY[0], window=True)
+    assert "pair_sums" in streaming and "pair_sums" not in window
+    assert "#define PLUSH_IMAGE_VERSION 6\n" in library_text(LIBRARY[0], window=False)
+    assert "#define PLUSH_IMAGE_VERSION 7 " in library_text(LIBRARY[0], window=True)
 
 
 @pytest.fixture(scope="module")

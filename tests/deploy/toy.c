@@ -269,7 +269,9 @@ int32_t try_as_signed(uint32_t v) { return as_signed(v); }
 uint32_t try_root(uint64_t v) { return square_root(v); }
 uint64_t try_square(int32_t v) { return square(v); }
 uint32_t try_exponential(int32_t d) { return exponential(d); }
-uint32_t try_requantize(int32_t sum, const uint8_t *scale) { return requantize(sum, scale); }
+uint32_t try_requantize(int32_t sum, const uint8_t *scale) {
+    return requantize(sum, le16(scale + 4), scale[6], scale[7]);
+}
 uint32_t try_part_of(uint32_t distance, uint32_t into, uint32_t by, uint32_t add, uint32_t narrow)
 {
     return part_of(distance, into, by, add, narrow);

@@ -25,7 +25,7 @@ BUNDLE = "model.plush"
 LIBRARY = ("plushsense.h", "plushsense.c")
 MODEL = ("plush_model.h", "plush_model.c")
 GOLDEN = "golden"
-TOY_BYTES = 484  # size of a plush_toy with 32-bit pointers (a test compiles it)
+TOY_BYTES = 516  # size of a plush_toy with 32-bit pointers (a test compiles it)
 
 Extra = Callable[[Path, dict[str, Any]], object]
 

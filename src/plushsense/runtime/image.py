@@ -11,6 +11,7 @@ of everything after the head. The following sections come in this order:
   measured channels
 - vector layer: u8 vectors, u8 filters, u16 taps (all 0 without one); then for each vector: u8 shift + 16, and for each
   filter: u8 down, taps × u8 weight + 128
+- 0 to 3 bytes 0, up to a multiple of 4 bytes from the beginning: scales and weights of all layers are then aligned
 - for each input, or with a vector layer each of its outputs: i32 offset, i32 bias, u16 multiplier, u8 before, u8 after
 - for each layer: u16 kernel, u16 dilation, u16 input channels, u16 filters; for each filter: i32 bias, u16 multiplier,
   u8 before, u8 after; then the weights + 128 as u8, in blocks of 4 filters × 4 channels, ordered by group of 4 filters,
@@ -59,11 +60,13 @@ from plushsense.runtime.vectors import MOST_AXIS_SHIFT, IntegerVectors
 
 MAGIC = b"PLSH"
 PATCH_MAGIC = b"PLPT"
-IMAGE_VERSION = 4  # 2: settings of events, gate and health; 3: zeros and the vector layer; 4: another known score
-WINDOW_IMAGE_VERSION = 5  # of window networks; otherwise as 4
+# 2: settings of events, gate and health; 3: zeros and the vector layer; 4: another known score; 6: aligned weights
+IMAGE_VERSION = 6
+WINDOW_IMAGE_VERSION = 7  # of window networks; otherwise as 6
 HEAD_BYTES = 16
 IDLE_BIT = 4
 GROUP = 4  # number of filters, and of channels, in a block of weights
+SPARE = 4  # rows for new samples in each phase of a streaming layer
 MOST_TAPS = 255  # of a vector layer
 MOST_ROWS = (1 << 16) - 1  # samples that a layer remembers
 _DENSE = "dense layer"  # how the descriptions of its sections begin
@@ -206,6 +209,7 @@ class IntegerModel:
             source = bytes([_INPUT_KINDS.index(kind), len(parts), shift, *parts])
             sections.append((f"input '{name}': {kind}, measured channels", source))
         sections += _vectors(self.network.vectors)
+        sections.append(("filling up to a multiple of 4 bytes", bytes(-sum(len(piece) for _, piece in sections) % 4)))
         scale = self.network.inputs
         for i in range(len(scale)):
             row = (int(getattr(scale, n)[i]) for n in ("offset", "bias", "multiplier", "before", "after"))
@@ -333,13 +337,15 @@ def memory_bytes(model: IntegerModel) -> int:
         pieces.append(0 if gate.rules else 4 * arch.channels)  # inputs
         pieces += [6 * arch.vector.vectors * arch.vector.kernel, 12 * arch.vector.filters]  # axes, horizontal parts
     for n, (layer, read) in enumerate(zip(arch.layers, arch.inputs, strict=True)):
+        dilation = layer.dilation if layer.kernel > 1 else 1
         # A window network remembers the inputs of the window, and of the other layers only what is read again.
-        rows = layer.reach + 1 if not model.is_window else arch.window if n == 0 else min(layer.reach + 1, arch.window)
-        pieces.append(rows * _filled(read))
-        pieces.append(4 * (layer.dilation if layer.kernel > 1 else 1))  # sums under the taps
+        rows = arch.window if n == 0 else min(layer.reach + 1, arch.window)
+        pieces.append((rows if model.is_window else dilation * (layer.kernel + SPARE)) * _filled(read))
+        pieces.append(4 * dilation)  # sums under the taps
     pieces.append(2 * features * model.pooled_steps)
     pieces += [4 * features, 4 * arch.classes, 4 * arch.classes + 4]  # sums, logits, smoothed probabilities and known
-    pieces += [channels, features]  # which channels are valid, the newest features
+    # Which channels are valid, and the newest features: of one position or two.
+    pieces += [channels, features if model.is_window else 2 * features]
     health = model.rules.health
     if health.low or health.still_ms:
         pieces.append(4 * channels)  # the frame before

@@ -204,6 +204,8 @@ static int status_words(plush_status status)
         return wrong("plush_begin() says PLUSH_DAMAGED: the checksum does not match.");
     case PLUSH_MEMORY_TOO_SMALL:
         return wrong("plush_begin() says PLUSH_MEMORY_TOO_SMALL.");
+    case PLUSH_NOT_ALIGNED:
+        return wrong("plush_begin() says PLUSH_NOT_ALIGNED.");
     default:
         return wrong("plush_begin() says something that it cannot say.");
     }

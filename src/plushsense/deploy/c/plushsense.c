@@ -1,8 +1,8 @@
 /*
  * PlushSense: what a soft toy feels, in whole numbers. See plushsense.h for how to use it.
  *
- * From top to bottom: small arithmetic - reading the model - layers - pooling, dense layer, probabilities - events -
- * health - inputs, samples and frames - the functions that others call.
+ * From top to bottom: small arithmetic - reading the model - what differs from core to core - layers - pooling, dense
+ * layer, probabilities - events - health - inputs, samples and frames - the functions that others call.
  *
  * Every rule here is stated in PlushSense's Python too (windows/clock, windows/features, runtime/fixed,
  * runtime/vectors, runtime/integer, runtime/events, runtime/gate, runtime/health), which defines what is right.
@@ -19,6 +19,7 @@
 #define RANGE_BYTES 12u     /* lowest and highest valid value of a channel, and its zero */
 #define INPUT_BYTES 12u     /* offset, bias, multiplier and two shifts of one channel of the network */
 #define LOGIT_LIMIT 16384
+#define SPARE 4u            /* rows for new samples, before those under the taps move */
 #define WEIGHT_ZERO 128u    /* weights are stored with this added: some cores cannot load a signed byte */
 
 /* Not copied to where it is called: for the registers of a loop, or for the flash. */
@@ -109,6 +110,11 @@ enum { BASELINE, NOISE, SIZE, SIGNAL_WORDS };
 #define TOLD_AFFECT 3u
 #define TOLD_IDLE 4u
 
+struct plush_aligned {
+    uint8_t byte;
+    uint32_t word;
+};
+
 /* ---- Small arithmetic ------------------------------------------------------------------------------------------ */
 
 static uint32_t le16(const uint8_t *p)
@@ -126,6 +132,11 @@ static uint32_t le32(const uint8_t *p)
 static int32_t as_signed(uint32_t bits)
 {
     return bits <= INT32_MAX ? (int32_t)bits : -(int32_t)(UINT32_MAX - bits) - 1;
+}
+
+static int is_aligned(const void *p)
+{
+    return (uintptr_t)p % offsetof(struct plush_aligned, word) == 0;
 }
 
 static uint32_t bits_of(int32_t v)
@@ -291,6 +302,18 @@ PLUSH_SMALL static const uint8_t *next_bytes(source *from, uint32_t bytes)
     return start;
 }
 
+/* Zeros, up to a multiple of 4 bytes: what follows may be loaded in words. */
+PLUSH_SMALL static int next_fill(source *from)
+{
+    while ((uintptr_t)from->at % GROUP != 0) {
+        const uint8_t *fill = next_bytes(from, 1);
+
+        if (fill == NULL || *fill != 0)
+            return 0;
+    }
+    return 1;
+}
+
 /* The next text of a model; NULL when it does not end. */
 PLUSH_SMALL static const uint8_t *next_text(source *from)
 {
@@ -439,6 +462,8 @@ PLUSH_SMALL static int read_vectors(plush_toy *toy, source *from)
                     return 0;
         }
     }
+    if (!next_fill(from))
+        return 0;
     toy->input_scales = scale = next_bytes(from, INPUT_BYTES * toy->features);
     if (scale == NULL)
         return 0;
@@ -472,7 +497,11 @@ PLUSH_SMALL static int read_layer(plush_layer *layer, uint32_t channels, source 
         return 0;
     layer->groups = (uint16_t)(row / GROUP);
     layer->filters = (uint16_t)filters;
+#ifdef PLUSH_WINDOW
     layer->rows = (uint16_t)rows;
+#else
+    layer->row = layer->kernel;
+#endif /* PLUSH_WINDOW */
     layer->weights = next_bytes(from, layer->kernel * row * fill_up(filters));
     return 1;
 }
@@ -627,7 +656,7 @@ PLUSH_SMALL static int read_model(plush_toy *toy, const uint8_t *model)
         if (!read_layer(&toy->layer[i], toy->features, &from))
             return 0;
         toy->features = toy->layer[i].filters;
-        span += toy->layer[i].rows - 1u;
+        span += (toy->layer[i].kernel - 1u) * (uint32_t)toy->layer[i].dilation;
     }
     return toy->span == span && read_dense_and_names(toy, &from) && read_event_plan(toy, &from) &&
            read_health_plan(toy, &from) && read_gate_plan(toy, &from) && from.left == 0;
@@ -654,6 +683,14 @@ PLUSH_SMALL static int has_gate(const plush_toy *toy)
     return toy->gate_rules != 0;
 }
 
+#ifndef PLUSH_WINDOW
+/* How many rows a phase has room for. */
+static uint32_t phase_rows(const plush_layer *layer)
+{
+    return layer->kernel + SPARE;
+}
+
+#endif /* PLUSH_WINDOW */
 /* Hands out the memory of a model that was read. Returns the bytes of it. */
 PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 {
@@ -669,7 +706,11 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
     for (i = 0; i < toy->layers; i++) {
         plush_layer *layer = &toy->layer[i];
 
-        layer->ring = (uint8_t *)take(memory, &used, (uint32_t)layer->rows * layer->groups * GROUP);
+#ifdef PLUSH_WINDOW
+        layer->ring = (uint32_t *)take(memory, &used, (uint32_t)layer->rows * layer->groups * GROUP);
+#else
+        layer->ring = (uint32_t *)take(memory, &used, layer->dilation * phase_rows(layer) * layer->groups * GROUP);
+#endif /* PLUSH_WINDOW */
         layer->tap_sums = (uint32_t *)take(memory, &used, UINT32_C(4) * layer->dilation);
     }
 #ifndef PLUSH_WINDOW
@@ -689,28 +730,202 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         toy->gate_bytes = (uint16_t)(used - start);
     }
     toy->valid = (uint8_t *)take(memory, &used, toy->channels);
+#ifdef PLUSH_WINDOW
     toy->top = (uint8_t *)take(memory, &used, toy->features);
+#else
+    toy->top = (uint8_t *)take(memory, &used, 2u * toy->features);
+#endif /* PLUSH_WINDOW */
     toy->memory_bytes = used; /* what a restart forgets: health has its own rules */
     toy->last = (int32_t *)take(memory, &used, last_matters(toy) ? 4u * toy->channels : 0);
     return used;
 }
 
+/* ---- What differs from core to core ----------------------------------------------------------------------------- */
+
+/* Three ways to the same numbers: instructions for several bytes at once where a core has them, otherwise plain C.
+ * PLUSH_PLAIN asks for plain C everywhere.
+ *
+ *     PLUSH_ALONE            the next 4 activations at `x`, times the weights (with 128 added) of 4 filters at `w`
+ *     PLUSH_PAIR             the same of 2 filters, at `x` and at `y`: a weight is loaded once for two positions. Not
+ *                            where it takes longer.
+ *     PLUSH_SUM_BYTES(s, v)  the four bytes of a word, into `s`
+ *     PLUSH_LIMIT(v, bits)   a number below 2^31, at most the highest of so many bits
+ */
+#if defined(__GNUC__) && defined(__ARM_FEATURE_DSP) && defined(__thumb2__) && !defined(PLUSH_PLAIN)
+
+#define PLUSH_DSP
+#define PLUSH_SUM_BYTES(s, v) __asm__("usada8 %0, %1, %2, %0" : "+r"(s) : "r"(v), "r"(0))
+#define PLUSH_LIMIT(v, bits) __asm__("usat %0, %1, %0" : "+r"(v) : "i"(bits))
+
+/* Two halves in a register: activations of channels 0 and 2 in `a`, 1 and 3 in `b`; weights of one filter in `c` and `d`,
+ * of the next in `e` and `f`. */
+#define PLUSH_SPLIT(even, odd) "uxtb16 " odd ", " even ", ror #8\n\tuxtb16 " even ", " even "\n\t"
+#define PLUSH_ACTIVATIONS "ldr %[a], [%[x]], #4\n\t" PLUSH_SPLIT("%[a]", "%[b]")
+#define PLUSH_WEIGHTS(step) \
+    "ldrd %[c], %[e], [%[w]], #" step "\n\t" PLUSH_SPLIT("%[c]", "%[d]") PLUSH_SPLIT("%[e]", "%[f]")
+#define PLUSH_PRODUCTS                                                   \
+    "smlad %[s], %[a], %[c], %[s]\n\tsmlad %[t], %[a], %[e], %[t]\n\t"   \
+    "smlad %[s], %[b], %[d], %[s]\n\tsmlad %[t], %[b], %[f], %[t]"
+#define PLUSH_ALONE                                                                                        \
+    do {                                                                                                   \
+        uint32_t a, b, c, d, e, f;                                                                         \
+        __asm__ volatile(PLUSH_ACTIVATIONS PLUSH_WEIGHTS("8") PLUSH_PRODUCTS                               \
+                         : [x] "+&r"(x), [w] "+&r"(w), [s] "+&r"(s0), [t] "+&r"(s1), [a] "=&r"(a),         \
+                           [b] "=&r"(b), [c] "=&r"(c), [d] "=&r"(d), [e] "=&r"(e), [f] "=&r"(f)            \
+                         :                                                                                 \
+                         : "memory");                                                                      \
+        __asm__ volatile(PLUSH_WEIGHTS("8") PLUSH_PRODUCTS                                                 \
+                         : [w] "+&r"(w), [s] "+&r"(s2), [t] "+&r"(s3), [c] "=&r"(c), [d] "=&r"(d),         \
+                           [e] "=&r"(e), [f] "=&r"(f)                                                      \
+                         : [a] "r"(a), [b] "r"(b)                                                          \
+                         : "memory");                                                                      \
+    } while (0)
+#ifndef PLUSH_WINDOW
+#define PLUSH_PAIR                                                                                         \
+    do {                                                                                                   \
+        uint32_t a, b, c, d, e, f;                                                                         \
+        __asm__ volatile(PLUSH_WEIGHTS("16") PLUSH_ACTIVATIONS PLUSH_PRODUCTS                              \
+                         : [x] "+&r"(x), [w] "+&r"(w), [s] "+&r"(s0), [t] "+&r"(s1), [a] "=&r"(a),         \
+                           [b] "=&r"(b), [c] "=&r"(c), [d] "=&r"(d), [e] "=&r"(e), [f] "=&r"(f)            \
+                         :                                                                                 \
+                         : "memory");                                                                      \
+        __asm__ volatile(PLUSH_ACTIVATIONS PLUSH_PRODUCTS                                                  \
+                         : [x] "+&r"(y), [s] "+&r"(t0), [t] "+&r"(t1), [a] "=&r"(a), [b] "=&r"(b)          \
+                         : [c] "r"(c), [d] "r"(d), [e] "r"(e), [f] "r"(f)                                  \
+                         : "memory");                                                                      \
+    } while (0)
+#endif /* PLUSH_WINDOW */
+
+#elif defined(__SSE2__) && !defined(PLUSH_PLAIN)
+
+#include <emmintrin.h>
+
+/* Every product of 8 x 8 bits fits 16; each sum is kept as two halves, of channels 0 and 1 and of 2 and 3. */
+#define PLUSH_SUMS __m128i zero = _mm_setzero_si128(), s01 = zero, s23 = zero
+#define PLUSH_ALONE                                                                      \
+    do {                                                                                 \
+        int32_t four;                                                                    \
+        __m128i a, b = _mm_loadu_si128((const __m128i *)(const void *)w);                \
+        memcpy(&four, x, 4);                                                             \
+        a = _mm_unpacklo_epi8(_mm_shuffle_epi32(_mm_cvtsi32_si128(four), 0), zero);      \
+        s01 = _mm_add_epi32(s01, _mm_madd_epi16(a, _mm_unpacklo_epi8(b, zero)));         \
+        s23 = _mm_add_epi32(s23, _mm_madd_epi16(a, _mm_unpackhi_epi8(b, zero)));         \
+        x += 4;                                                                          \
+        w += 16;                                                                         \
+    } while (0)
+#define PLUSH_GIVE                                     \
+    do {                                               \
+        uint32_t halves[8], n;                         \
+        memcpy(halves, &s01, sizeof s01);              \
+        memcpy(halves + 4, &s23, sizeof s23);          \
+        for (n = 0; n < GROUP; n++)                    \
+            sum[n] = halves[2 * n] + halves[2 * n + 1]; \
+    } while (0)
+
+#else
+
+/* Keeps a value in a register, and what is done to it in the written order: otherwise compilers add products up in trees,
+ * for which small cores have too few registers. */
+#if defined(__GNUC__) && defined(__thumb__) && !defined(__thumb2__)
+#define PLUSH_KEEP(v) __asm__ volatile("" : "+l"(v))
+#elif defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__)
+#define PLUSH_KEEP(v) __asm__ volatile("" : "+r"(v))
+#else
+#define PLUSH_KEEP(v) ((void)0)
+#endif
+#define PLUSH_ADD(s, v) \
+    do {                \
+        (s) += (v);     \
+        PLUSH_KEEP(s);  \
+    } while (0)
+#define PLUSH_CHANNEL(i)                \
+    do {                                \
+        uint32_t a = x[i];              \
+        PLUSH_ADD(s0, a * w[i]);        \
+        PLUSH_ADD(s1, a * w[4 + (i)]);  \
+        PLUSH_ADD(s2, a * w[8 + (i)]);  \
+        PLUSH_ADD(s3, a * w[12 + (i)]); \
+    } while (0)
+#define PLUSH_ALONE       \
+    do {                  \
+        PLUSH_CHANNEL(0); \
+        PLUSH_CHANNEL(1); \
+        PLUSH_CHANNEL(2); \
+        PLUSH_CHANNEL(3); \
+        x += 4;           \
+        w += 16;          \
+    } while (0)
+#ifndef PLUSH_WINDOW
+#if !defined(__thumb__) || defined(__thumb2__)
+/* Four loads, then two products, then two sums: in a pipeline, what was loaded or multiplied is there one or two cycles
+ * later. */
+#define PLUSH_PRODUCTS(s, t, v)            \
+    do {                                   \
+        uint32_t p = (v) * a, q = (v) * b; \
+        PLUSH_KEEP(p);                     \
+        PLUSH_KEEP(q);                     \
+        PLUSH_ADD(s, p);                   \
+        PLUSH_ADD(t, q);                   \
+    } while (0)
+#define PLUSH_CHANNEL_OF_PAIR(i)                              \
+    do {                                                      \
+        uint32_t a = x[i], b = y[i], c = w[i], d = w[4 + (i)]; \
+        PLUSH_KEEP(a);                                        \
+        PLUSH_KEEP(b);                                        \
+        PLUSH_KEEP(c);                                        \
+        PLUSH_KEEP(d);                                        \
+        PLUSH_PRODUCTS(s0, t0, c);                            \
+        PLUSH_PRODUCTS(s1, t1, d);                            \
+    } while (0)
+#define PLUSH_PAIR                \
+    do {                          \
+        PLUSH_CHANNEL_OF_PAIR(0); \
+        PLUSH_CHANNEL_OF_PAIR(1); \
+        PLUSH_CHANNEL_OF_PAIR(2); \
+        PLUSH_CHANNEL_OF_PAIR(3); \
+        x += 4;                   \
+        y += 4;                   \
+        w += 16;                  \
+    } while (0)
+#endif
+#endif /* PLUSH_WINDOW */
+
+#endif
+
+#ifndef PLUSH_SUMS
+#define PLUSH_SUMS uint32_t s0 = 0, s1 = 0, s2 = 0, s3 = 0
+#define PLUSH_GIVE   \
+    do {             \
+        sum[0] = s0; \
+        sum[1] = s1; \
+        sum[2] = s2; \
+        sum[3] = s3; \
+    } while (0)
+#endif
+#ifndef PLUSH_DSP
+#define PLUSH_SUM_BYTES(s, v)                                                      \
+    do {                                                                           \
+        uint32_t four = (v), two = (four & 0xff00ffu) + ((four >> 8) & 0xff00ffu); \
+        (s) += (two & 0xffffu) + (two >> 16);                                      \
+    } while (0)
+#define PLUSH_LIMIT(v, bits)           \
+    do {                               \
+        if ((v) >> (bits) != 0)        \
+            (v) = (1u << (bits)) - 1u; \
+    } while (0)
+#endif
+
 /* ---- The network ----------------------------------------------------------------------------------------------- */
 
-/* The row of the oldest sample that a layer remembers: under its first tap, and the next to be written over. */
-static uint32_t oldest(const plush_layer *layer)
-{
-    return layer->newest + 1u < layer->rows ? layer->newest + 1u : 0u;
-}
-
+#ifdef PLUSH_WINDOW
 /* Room for a new sample. */
+PLUSH_CODE
 static uint8_t *next_row(plush_layer *layer)
 {
-    layer->newest = (uint16_t)oldest(layer);
-    return layer->ring + (uint32_t)layer->newest * layer->groups * GROUP;
+    layer->newest = (uint16_t)(layer->newest + 1u < layer->rows ? layer->newest + 1u : 0u);
+    return (uint8_t *)(layer->ring + (uint32_t)layer->newest * layer->groups);
 }
 
-#ifdef PLUSH_WINDOW
 /* Where the taps of a position lie on the window: the first one at `at`, the next one `by` further. Before the first
  * sample and after the last, they turn around. */
 typedef struct {
@@ -745,9 +960,10 @@ static taps_on next_taps(const plush_layer *layer, uint32_t made, uint32_t span)
     return taps;
 }
 
-static uint32_t row_under(const plush_layer *layer, int32_t at, int32_t first)
+PLUSH_CODE
+static const uint32_t *row_under(const plush_layer *layer, int32_t at, int32_t first)
 {
-    return (uint32_t)(at + first < 0 ? at + first + layer->rows : at + first);
+    return layer->ring + (uint32_t)(at + first < 0 ? at + first + layer->rows : at + first) * layer->groups;
 }
 
 PLUSH_CODE
@@ -760,23 +976,60 @@ static void go_on(taps_on *taps)
     }
 }
 
-#endif /* PLUSH_WINDOW */
-static uint32_t row_sum(const plush_layer *layer, uint32_t row)
+#else
+/* The newest row under these taps. */
+PLUSH_CODE
+static uint32_t *newest_row(const plush_layer *layer, uint32_t *taps)
 {
-    const uint8_t *x = layer->ring + row * layer->groups * GROUP;
+    return taps + (layer->kernel - 1u) * (uint32_t)layer->groups;
+}
+
+/* Room for a new sample. Samples `dilation` apart follow each other in the memory of their phase, so that all rows under
+ * the taps are one piece. When a phase is full, the newest `kernel` rows move to its beginning. */
+PLUSH_CODE
+static uint8_t *next_row(plush_layer *layer)
+{
+    uint32_t width = layer->groups, *phase;
+
+    layer->taps[1] = layer->taps[0];
+    if (++layer->phase >= layer->dilation) {
+        layer->phase = 0;
+        if (++layer->row >= phase_rows(layer))
+            layer->row = layer->kernel;
+    }
+    phase = layer->ring + layer->phase * phase_rows(layer) * width;
+    if (layer->row == layer->kernel) {
+        uint32_t *to = phase, *from = phase + SPARE * width, words;
+
+        for (words = layer->kernel * width; words > 0; words--)
+            *to++ = *from++;
+    }
+    layer->taps[0] = phase + (layer->row + 1u - layer->kernel) * width;
+    if (layer->dilation == 1) /* then the row before may have moved, too */
+        layer->taps[1] = layer->taps[0] - width;
+    return (uint8_t *)newest_row(layer, layer->taps[0]);
+}
+
+#endif /* PLUSH_WINDOW */
+/* The sum of all bytes of a row. */
+PLUSH_CODE
+static uint32_t row_sum(const plush_layer *layer, const uint32_t *row)
+{
     uint32_t sum = 0, n;
 
-    for (n = layer->groups * GROUP; n > 0; n--)
-        sum += *x++;
+    for (n = layer->groups; n > 0; n--)
+        PLUSH_SUM_BYTES(sum, *row++);
     return sum;
 }
 
-/* What every weight's + 128 adds to the sums of the newest position: 128 times all activations under the taps. Their
- * sum is that of `dilation` samples ago, less the row that has left, plus the one that has come. */
+/* What every weight's + 128 adds to the sums of a position: 128 times all activations under the taps. Their sum is that
+ * of `dilation` samples ago, less the row that has left, plus the one that has come. */
 #ifdef PLUSH_WINDOW
+PLUSH_CODE
 static uint32_t surplus(plush_layer *layer, taps_on taps)
 {
-    uint32_t *kept = &layer->tap_sums[layer->phase], first = row_under(layer, taps.at, taps.first), sum = 0;
+    uint32_t *kept = &layer->tap_sums[layer->phase], sum = 0;
+    const uint32_t *first = row_under(layer, taps.at, taps.first);
 
     if (layer->done < layer->dilation) {
         uint32_t n;
@@ -787,195 +1040,149 @@ static uint32_t surplus(plush_layer *layer, taps_on taps)
         sum = *kept + row_sum(layer, row_under(layer, layer->done, taps.first));
     }
     *kept = sum - row_sum(layer, first);
-#else
-static uint32_t surplus(plush_layer *layer)
-{
-    uint32_t *kept = &layer->tap_sums[layer->phase], sum = *kept + row_sum(layer, layer->newest);
-
-    *kept = sum - row_sum(layer, oldest(layer));
-#endif /* PLUSH_WINDOW */
     layer->phase = (uint16_t)(layer->phase + 1u < layer->dilation ? layer->phase + 1u : 0u);
     return sum * WEIGHT_ZERO;
 }
-
-/* Four products for each of four filters: `x` 4 activations, `w` 4 filters x 4 channels, weights with 128 added.
- * Three ways to the same sums: several multiplications at once where a core has them; otherwise plain C, in which small
- * cores must keep the written order, or their few registers overflow. PLUSH_PLAIN asks for plain C everywhere. */
-#if defined(__GNUC__) && defined(__ARM_FEATURE_DSP) && defined(__ARM_ARCH_ISA_THUMB) && !defined(PLUSH_PLAIN)
-
-/* Channels 0 and 2, then 1 and 3, each pair as two halves of a register. */
-#define PLUSH_PAIRS(even, odd, four) \
-    __asm__ volatile("uxtb16 %0, %2\n\tuxtb16 %1, %2, ror #8" : "=&r"(even), "=r"(odd) : "r"(four))
-#define PLUSH_FILTER(s, i)                                              \
-    do {                                                                \
-        uint32_t four, e, o;                                            \
-        memcpy(&four, w + 4 * (i), 4);                                  \
-        PLUSH_PAIRS(e, o, four);                                        \
-        __asm__ volatile("smlad %0, %1, %2, %0\n\tsmlad %0, %3, %4, %0" \
-                         : "+&r"(s)                                     \
-                         : "r"(even), "r"(e), "r"(odd), "r"(o));        \
-        __asm__ volatile("" ::: "memory");                              \
-    } while (0)
-#define PLUSH_SUMS uint32_t s0 = 0, s1 = 0, s2 = 0, s3 = 0
-#define PLUSH_SIXTEEN                 \
-    do {                              \
-        uint32_t both, even, odd;     \
-        memcpy(&both, x, 4);          \
-        PLUSH_PAIRS(even, odd, both); \
-        PLUSH_FILTER(s0, 0);          \
-        PLUSH_FILTER(s1, 1);          \
-        PLUSH_FILTER(s2, 2);          \
-        PLUSH_FILTER(s3, 3);          \
-    } while (0)
-
-#elif defined(__SSE2__) && !defined(PLUSH_PLAIN)
-
-#include <emmintrin.h>
-
-/* Every product of 8 x 8 bits fits 16; each sum is kept as two halves, of channels 0 and 1 and of 2 and 3. */
-#define PLUSH_SUMS __m128i zero = _mm_setzero_si128(), s01 = zero, s23 = zero
-#define PLUSH_SIXTEEN                                                                    \
-    do {                                                                                 \
-        int32_t four;                                                                    \
-        __m128i a, b = _mm_loadu_si128((const __m128i *)(const void *)w);                \
-        memcpy(&four, x, 4);                                                             \
-        a = _mm_unpacklo_epi8(_mm_shuffle_epi32(_mm_cvtsi32_si128(four), 0), zero);      \
-        s01 = _mm_add_epi32(s01, _mm_madd_epi16(a, _mm_unpacklo_epi8(b, zero)));         \
-        s23 = _mm_add_epi32(s23, _mm_madd_epi16(a, _mm_unpackhi_epi8(b, zero)));         \
-    } while (0)
-#define PLUSH_GIVE                                     \
-    do {                                               \
-        uint32_t halves[8];                            \
-        memcpy(halves, &s01, sizeof s01);              \
-        memcpy(halves + 4, &s23, sizeof s23);          \
-        for (taps = 0; taps < GROUP; taps++)           \
-            sum[taps] = halves[2 * taps] + halves[2 * taps + 1]; \
-    } while (0)
-
 #else
+PLUSH_CODE
+static uint32_t surplus(plush_layer *layer, uint32_t back)
+{
+    uint32_t phase = back <= layer->phase ? layer->phase - back : layer->dilation - 1u;
+    uint32_t sum = layer->tap_sums[phase] + row_sum(layer, newest_row(layer, layer->taps[back]));
 
-#if defined(__GNUC__) && !defined(__x86_64__) && !defined(__aarch64__)
-#define PLUSH_IN_ORDER __asm__ volatile("" ::: "memory")
-#else
-#define PLUSH_IN_ORDER
-#endif
-#define PLUSH_CHANNEL(i)      \
-    do {                      \
-        uint32_t a = x[i];    \
-        s0 += a * w[(i)];     \
-        PLUSH_IN_ORDER;       \
-        s1 += a * w[4 + (i)]; \
-        PLUSH_IN_ORDER;       \
-        s2 += a * w[8 + (i)]; \
-        PLUSH_IN_ORDER;       \
-        s3 += a * w[12 + (i)]; \
-        PLUSH_IN_ORDER;       \
-    } while (0)
-#define PLUSH_SUMS uint32_t s0 = 0, s1 = 0, s2 = 0, s3 = 0
-#define PLUSH_SIXTEEN     \
-    do {                  \
-        PLUSH_CHANNEL(0); \
-        PLUSH_CHANNEL(1); \
-        PLUSH_CHANNEL(2); \
-        PLUSH_CHANNEL(3); \
-    } while (0)
+    layer->tap_sums[phase] = sum - row_sum(layer, layer->taps[back]);
+    return sum * WEIGHT_ZERO;
+}
+#endif /* PLUSH_WINDOW */
 
-#endif
-
-#ifndef PLUSH_GIVE
-#define PLUSH_GIVE   \
-    do {             \
-        sum[0] = s0; \
-        sum[1] = s1; \
-        sum[2] = s2; \
-        sum[3] = s3; \
-    } while (0)
-#endif
-
-/* The sums of four filters at the newest position, of activations times (weight + 128), modulo 2^32; returns where the
- * next filters' weights begin. By itself, so that its loop has all registers. */
+/* The sums of four filters at one position, of activations times (weight + 128), modulo 2^32. By itself, so that its loop
+ * has all registers. */
 PLUSH_APART
 #ifdef PLUSH_WINDOW
-static const uint8_t *four_sums(const plush_layer *layer, taps_on on, const uint8_t *w, uint32_t sum[GROUP])
+static void four_sums(const plush_layer *layer, taps_on on, const uint8_t *w, uint32_t sum[GROUP])
 {
-    uint32_t row = layer->groups * GROUP, taps = layer->kernel;
+    uint32_t taps = layer->kernel;
     PLUSH_SUMS;
 
     do {
-        const uint8_t *x = layer->ring + row_under(layer, on.at, on.first) * row, *end = x + row;
+        const uint8_t *x = (const uint8_t *)row_under(layer, on.at, on.first), *end = x + layer->groups * GROUP;
 
-        do {
-            PLUSH_SIXTEEN;
-            w += 16;
-            x += 4;
-        } while (x != end);
+        do
+            PLUSH_ALONE;
+        while (x != end);
         go_on(&on);
     } while (--taps != 0);
     PLUSH_GIVE;
-    return w;
 }
 #else
-static const uint8_t *four_sums(const plush_layer *layer, const uint8_t *w, uint32_t sum[GROUP])
+static void four_sums(const uint8_t *x, const uint8_t *end, const uint8_t *w, uint32_t sum[GROUP])
 {
-    uint32_t row = layer->groups * GROUP, size = layer->rows * row, stride = layer->dilation * row;
-    uint32_t at = oldest(layer) * row, taps = layer->kernel;
     PLUSH_SUMS;
 
-    do {
-        const uint8_t *x = layer->ring + at, *end = x + row;
-
-        do {
-            PLUSH_SIXTEEN;
-            w += 16;
-            x += 4;
-        } while (x != end);
-        at += stride;
-        if (at >= size)
-            at -= size;
-    } while (--taps != 0);
+#ifdef PLUSH_DSP /* elsewhere a second copy takes more bytes than it is worth */
+    if (((end - x) & 4) != 0)
+        PLUSH_ALONE;
+    while (x != end) {
+        PLUSH_ALONE;
+        PLUSH_ALONE;
+    }
+#endif
+#ifndef PLUSH_DSP
+    do
+        PLUSH_ALONE;
+    while (x != end);
+#endif
     PLUSH_GIVE;
-    return w;
+}
+
+#ifdef PLUSH_PAIR
+/* The same of two filters at two positions: sum[0] and sum[1] at `x`, sum[4] and sum[5] at `y`. */
+PLUSH_APART
+static void two_sums(const uint8_t *x, const uint8_t *y, const uint8_t *end, const uint8_t *w, uint32_t *sum)
+{
+    uint32_t s0 = 0, s1 = 0, t0 = 0, t1 = 0;
+
+    if (((end - x) & 4) != 0)
+        PLUSH_PAIR;
+    while (x != end) {
+        PLUSH_PAIR;
+        PLUSH_PAIR;
+    }
+    sum[0] = s0;
+    sum[1] = s1;
+    sum[GROUP] = t0;
+    sum[GROUP + 1] = t1;
+}
+#endif
+
+/* The sums of four filters at two positions: sum[0] to sum[3] those at `x`, then those at `y`. */
+PLUSH_CODE
+static void pair_sums(const uint8_t *x, const uint8_t *y, uint32_t size, const uint8_t *w, uint32_t sum[2 * GROUP])
+{
+#ifdef PLUSH_PAIR
+    two_sums(x, y, x + size, w, sum);
+    two_sums(x, y, x + size, w + 2 * GROUP, sum + 2);
+#endif
+#ifndef PLUSH_PAIR
+    four_sums(x, x + size, w, sum);
+    four_sums(y, y + size, w, sum + GROUP);
+#endif
 }
 #endif /* PLUSH_WINDOW */
 
 /* ReLU, and a sum to 8 bits. */
-static uint32_t requantize(int32_t sum, const uint8_t *scale)
+PLUSH_CODE
+static uint32_t requantize(int32_t sum, uint32_t times, uint32_t before, uint32_t after)
 {
-    uint32_t t;
+    uint32_t t = (uint32_t)(sum > 0 ? sum : 0) >> before;
 
-    if (sum <= 0)
-        return 0;
-    t = (uint32_t)sum >> scale[6];
-    if (t > 65535u)
-        t = 65535u;
-    t = (t * le16(scale + 4) + half(scale[7])) >> scale[7];
-    return t < 255u ? t : 255u;
+    PLUSH_LIMIT(t, 16);
+    t = (t * times + half(after)) >> after;
+    PLUSH_LIMIT(t, 8);
+    return t;
 }
 
-/* One new position of a layer, (filters) activations. */
 #ifdef PLUSH_WINDOW
+/* One new position of a layer, (filters) activations. */
 PLUSH_CODE
 static void advance(plush_layer *layer, taps_on taps, uint8_t *out)
 {
     const uint8_t *weights = layer->weights, *scale = layer->scales;
-    uint32_t extra = surplus(layer, taps), sum[GROUP], f, i;
+    uint32_t size = (uint32_t)layer->kernel * layer->groups * GROUP * GROUP, extra = surplus(layer, taps), sum[GROUP], f, i;
 
     layer->done++;
-    for (f = 0; f < layer->filters; f += GROUP) {
-        weights = four_sums(layer, taps, weights, sum);
-#else
-static void advance(plush_layer *layer, uint8_t *out)
-{
-    const uint8_t *weights = layer->weights, *scale = layer->scales;
-    uint32_t extra = surplus(layer), sum[GROUP], f, i;
-
-    for (f = 0; f < layer->filters; f += GROUP) {
-        weights = four_sums(layer, weights, sum);
-#endif /* PLUSH_WINDOW */
+    for (f = 0; f < layer->filters; f += GROUP, weights += size) {
+        four_sums(layer, taps, weights, sum);
         for (i = 0; i < GROUP && f + i < layer->filters; i++, scale += SCALE_BYTES)
-            out[f + i] = (uint8_t)requantize(as_signed(sum[i] + le32(scale) - extra), scale);
+            out[f + i] = (uint8_t)requantize(as_signed(sum[i] + le32(scale) - extra), le16(scale + 4), scale[6], scale[7]);
     }
 }
+#else
+/* A new position of a layer, (filters) activations, or two: then `before` are those of the older one. */
+PLUSH_CODE
+static void advance(plush_layer *layer, int two, uint8_t *newest, uint8_t *before)
+{
+    const uint8_t *x = (const uint8_t *)layer->taps[0], *y = (const uint8_t *)layer->taps[1];
+    const uint8_t *weights = layer->weights, *scale = layer->scales;
+    uint32_t size = (uint32_t)layer->kernel * layer->groups * GROUP, sum[2 * GROUP], f, i;
+    uint32_t extra_before = two ? surplus(layer, 1) : 0, extra = surplus(layer, 0);
+
+    for (f = 0; f < layer->filters; f += GROUP, weights += size * GROUP) {
+        if (two)
+            pair_sums(x, y, size, weights, sum);
+        else
+            four_sums(x, x + size, weights, sum);
+        for (i = 0; i < GROUP && f + i < layer->filters; i++, scale += SCALE_BYTES) {
+            uint32_t bias = le32(scale), times = le16(scale + 4), down = scale[6], after = scale[7];
+
+            newest[f + i] = (uint8_t)requantize(as_signed(sum[i] + bias - extra), times, down, after);
+            if (two)
+                before[f + i] =
+                    (uint8_t)requantize(as_signed(sum[GROUP + i] + bias - extra_before), times, down, after);
+        }
+    }
+}
+#endif /* PLUSH_WINDOW */
 
 #ifdef PLUSH_WINDOW
 /* One new sample, whose quantized inputs are in the first ring. When a step is complete, all of the window goes through
@@ -1010,21 +1217,36 @@ static void network_sample(plush_toy *toy)
     }
 }
 #else
-/* One new sample, whose quantized inputs are in the first ring, through all layers into the pooling. */
+/* One new sample, whose quantized inputs are in the first ring. It waits for the next one, and both go through all layers
+ * into the pooling together; one alone only when the step ends with it. */
 PLUSH_APART
 static void network_sample(plush_toy *toy)
 {
-    uint32_t i, f;
-    uint16_t *sums = toy->sums + (uint32_t)toy->block * toy->features;
+    uint32_t features = toy->features, i, f;
+    int two = toy->waiting;
+    uint16_t *sums = toy->sums + (uint32_t)toy->block * features;
 
+    toy->waiting = !two && toy->filled + 1u < toy->step;
+    if (toy->waiting)
+        return;
     for (i = 0; i < toy->layers; i++) {
-        plush_layer *layer = &toy->layer[i];
+        plush_layer *layer = &toy->layer[i], *next = layer + 1;
+        uint8_t *newest = toy->top, *before = toy->top + features;
 
-        advance(layer, i + 1u < toy->layers ? next_row(layer + 1) : toy->top);
+        if (i + 1u < toy->layers) {
+            newest = next_row(next);
+            if (two) {
+                newest = next_row(next);
+                before = (uint8_t *)newest_row(next, next->taps[1]);
+            }
+        }
+        advance(layer, two, newest, before);
     }
-    for (f = 0; f < toy->features; f++) {
-        sums[f] = (uint16_t)(sums[f] + toy->top[f]);
-        toy->total[f] += toy->top[f];
+    for (f = 0; f < features; f++) {
+        uint32_t v = toy->top[f] + (two ? toy->top[features + f] : 0u);
+
+        sums[f] = (uint16_t)(sums[f] + v);
+        toy->total[f] += v;
     }
 }
 #endif /* PLUSH_WINDOW */
@@ -1890,6 +2112,9 @@ PLUSH_SMALL static void forget(plush_toy *toy)
     uint32_t phase;
 
     memset(toy->memory, 0, toy->memory_bytes);
+#ifndef PLUSH_WINDOW
+    toy->waiting = 0;
+#endif /* PLUSH_WINDOW */
     toy->heard = toy->running = 0;
     toy->block = toy->gate_deaf = 0;
     toy->gate_seen = toy->gate_newest = toy->gate_doubt = 0;
@@ -1903,11 +2128,6 @@ PLUSH_SMALL static void forget(plush_toy *toy)
 
 /* ---- What others call ------------------------------------------------------------------------------------------ */
 
-struct plush_aligned {
-    uint8_t byte;
-    uint32_t word;
-};
-
 /* A toy with this model and memory. Nothing is written to the memory; a toy of which this does not say PLUSH_OK is of no
  * use. */
 PLUSH_SMALL_APART
@@ -1919,10 +2139,11 @@ static plush_status prepare(plush_toy *toy, const uint8_t *model, uint32_t model
     memset(toy, 0, sizeof *toy);
     if (status != PLUSH_OK)
         return status;
+    if ((uintptr_t)model % GROUP != 0)
+        return PLUSH_NOT_ALIGNED;
     if (!read_model(toy, model))
         return PLUSH_DAMAGED;
-    if (memory == NULL || (uintptr_t)memory % offsetof(struct plush_aligned, word) != 0 ||
-        share_out(toy, NULL) > memory_bytes)
+    if (memory == NULL || !is_aligned(memory) || share_out(toy, NULL) > memory_bytes)
         return PLUSH_MEMORY_TOO_SMALL;
     toy->memory = memory;
     share_out(toy, (uint8_t *)memory);

@@ -35,9 +35,9 @@ extern "C" {
 #endif
 
 #ifdef PLUSH_WINDOW
-#define PLUSH_IMAGE_VERSION 5 /* of window networks, which compute the whole window again at every step */
+#define PLUSH_IMAGE_VERSION 7 /* of window networks, which compute the whole window again at every step */
 #else
-#define PLUSH_IMAGE_VERSION 4
+#define PLUSH_IMAGE_VERSION 6
 #endif /* PLUSH_WINDOW */
 #define PLUSH_MAX_LAYERS 4
 #define PLUSH_ONE 32768 /* a confidence or probability of 1 */
@@ -51,7 +51,8 @@ typedef enum {
     PLUSH_DAMAGED = 3,         /* cut off, its checksum does not match, or what stands in it does not hold together */
     PLUSH_MEMORY_TOO_SMALL = 4, /* give plush_memory_bytes() bytes, aligned for uint32_t */
     PLUSH_OTHER_LAYOUT = 5,     /* plush_swap: a model for other channels, or no model is running */
-    PLUSH_OTHER_MODEL = 6       /* plush_patch: a patch of another model, or no model is running */
+    PLUSH_OTHER_MODEL = 6,      /* plush_patch: a patch of another model, or no model is running */
+    PLUSH_NOT_ALIGNED = 7       /* the address of the model's first byte is no multiple of 4 */
 } plush_status;
 
 /* PLUSH_FAULT: the sensors cannot be believed; there are no answers until they have recovered. */
@@ -111,16 +112,21 @@ typedef struct {
     uint16_t kernel;
     uint16_t filters;
     uint16_t groups;        /* of 4 channels that it reads */
-    uint16_t rows;          /* samples that it remembers */
     uint16_t dilation;
-    uint16_t newest;        /* row of the newest sample */
-    uint16_t phase;         /* the next of tap_sums */
 #ifdef PLUSH_WINDOW
+    uint16_t phase;         /* the next of tap_sums */
+    uint16_t rows;          /* samples that it remembers */
+    uint16_t newest;        /* row of the newest sample */
     uint16_t done;          /* positions of the window that are computed */
+    uint32_t *ring;         /* rows x groups x 4 activations */
+#else
+    uint16_t phase;         /* of the newest sample: samples `dilation` apart have the same one */
+    uint32_t row;           /* of the newest sample in its phase */
+    uint32_t *ring;         /* dilation x rows x groups x 4 activations */
+    uint32_t *taps[2];      /* the oldest row under the taps of the newest sample, and of the one before */
 #endif /* PLUSH_WINDOW */
     const uint8_t *scales;  /* of each filter: bias, multiplier, shifts */
     const uint8_t *weights;
-    uint8_t *ring;          /* rows x groups x 4 activations */
     uint32_t *tap_sums;     /* for each of the next `dilation` samples: sum of the activations already under its taps */
 } plush_layer;
 
@@ -199,6 +205,9 @@ typedef struct plush_toy {
     uint32_t *total;         /* of each feature: its sum over all blocks */
     uint32_t warm;           /* samples, up to the span */
     uint8_t started;         /* the smoothing has begun */
+#ifndef PLUSH_WINDOW
+    uint8_t waiting;         /* the newest sample is computed together with the next one */
+#endif /* PLUSH_WINDOW */
     int32_t *logits;         /* of each class, in steps of 1/256 */
     int32_t *smooth;         /* of each class: probability in steps of 2^-27; after them the highest logit in 2^-20 */
 
@@ -212,8 +221,8 @@ typedef struct plush_toy {
 /* Bytes of memory that a toy with this model needs; 0 when these bytes are no usable model. */
 uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes);
 
-/* Makes a toy ready. The model's bytes and the memory must stay where they are, and only the toy may write to the
- * memory. Any bytes may be given as a model: they are looked through before anything is believed. Begin again at any
+/* Makes a toy ready. The model's bytes and the memory must stay where they are, both at a multiple of 4, and only the toy
+ * may write to the memory. Any bytes may be given as a model: they are looked through before anything is believed. Begin again at any
  * time, with the same model or another. Unless this says PLUSH_OK, the toy is all zeros: it takes readings, and never
  * has an answer, as a static plush_toy before its beginning. */
 plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,

@@ -36,9 +36,9 @@ class SourceMutant:
     name: str
     find: str
     replace: str
-    when: Literal["always", "dilated", "magnitude", "ranged", "reaching", "smoothed", "stepped", "ties", "vectors"] = (
-        "always"
-    )
+    when: Literal[
+        "always", "dilated", "magnitude", "paired", "ranged", "reaching", "smoothed", "stepped", "ties", "vectors"
+    ] = "always"
     library: Literal["both", "stream", "window"] = "both"
 
 
@@ -100,8 +100,9 @@ def mutants_of(image: bytes, source: str) -> list[Mutant]:
         "reaching": any(layer.index.shape[2] > 1 for layer in at.layers),
         "vectors": bool(at.vectors),
         "ranged": bool(ranged),
-        # With a step of one sample, every sample has an answer.
+        # With a step of one sample, every sample has an answer, and none waits for the next.
         "stepped": at.step > 1,
+        "paired": at.step > 1 and any(layer.dilation > 1 for layer in at.layers),
         # Without smoothing nothing is rounded.
         "smoothed": at.smoothing < 1 << PROBABILITY_BITS,
         # With smaller time units, ties are rare.
@@ -173,6 +174,7 @@ class _ImageOffsets:
         first = np.frombuffer(image, np.uint8, taps, at + 2).astype(np.int64) - 128
         self.vector_weight = at + 2 + int(np.abs(first).argmax()) if taps else 0
         at += self.vectors * (1 + kernels * (1 + taps))
+        at += -at % GROUP  # what fills up to a multiple of 4
         self.input_scales = at
         outputs = inputs - 3 * self.vectors - 3 + 3 * self.vectors * kernels if self.vectors else inputs
         at += _INPUT_BYTES * outputs
