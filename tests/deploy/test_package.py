@@ -183,10 +183,10 @@ def test_the_model_s_own_version_and_page_stand_in_every_manifest_and_in_c(tmp_p
     main.write_text(
         '#include <stdio.h>\n#include <string.h>\n#include "owl_plush_model.h"\n#include "owl_plushsense.h"\n'
         "static uint32_t memory[OWL_PLUSH_MODEL_MEMORY_WORDS];\nstatic owl_plush_toy toy;\n"
-        "int main(void)\n{\n    static uint8_t other[OWL_PLUSH_MODEL_BYTES + 1];\n"
-        "    memcpy(other + 1, owl_plush_model, OWL_PLUSH_MODEL_BYTES);\n"
+        "int main(void)\n{\n    static uint32_t other[OWL_PLUSH_MODEL_BYTES / 4u + 1u];\n"
+        "    memcpy(other, owl_plush_model, OWL_PLUSH_MODEL_BYTES);\n"
         '    printf("%lx", (unsigned long)owl_plush_model_id(&toy));\n'
-        "    owl_plush_begin(&toy, other + 1, OWL_PLUSH_MODEL_BYTES, memory, sizeof memory);\n"
+        "    owl_plush_begin(&toy, (const uint8_t *)other, OWL_PLUSH_MODEL_BYTES, memory, sizeof memory);\n"
         '    printf(" %lx %lx", (unsigned long)owl_plush_model_id(&toy), (unsigned long)OWL_PLUSH_MODEL_ID);\n'
         '    printf(" %s %s", OWL_PLUSH_MODEL_VERSION, OWL_PLUSH_MODEL_TRAINING);\n    return 0;\n}\n'
     )

@@ -50,16 +50,16 @@ def test_a_larger_network_costs_more_only_where_it_is_larger(small: Path, tmp_pa
     large = exported(tmp_path / "large", bundle_of("plush-15", filters="4,12"))
     one, two = (count(folder, target, read_facts(folder)).stages for folder in (small, large))
     assert abs(one["inputs"] - two["inputs"]) < 20
-    assert one["network"] * 1.2 < two["network"] < one["network"] * 2
+    assert one["network"] * 1.15 < two["network"] < one["network"] * 2
     assert one["dense"] * 1.5 < two["dense"] < one["dense"] * 2.5
 
 
 @pytest.mark.parametrize(
     ("symbol", "limits"),
     [
-        ("14d1_39d2_41d4", {"xtensa": (400_000, 27), "cortex-m4": (150_000, 25)}),
-        ("14d1_19d2_19d4", {"xtensa": (200_000, 24), "cortex-m4": (80_000, 24)}),
-        ("v14_17d2_19d4", {"xtensa": (205_000, 24), "cortex-m4": (105_000, 24)}),
+        ("14d1_39d2_41d4", {"xtensa": (225_000, 28), "cortex-m4": (95_000, 26)}),
+        ("14d1_19d2_19d4", {"xtensa": (125_000, 22), "cortex-m4": (52_000, 22), "riscv32": (125_000, 22)}),
+        ("v14_17d2_19d4", {"xtensa": (185_000, 25), "cortex-m4": (85_000, 24)}),
     ],
 )
 def test_the_networks_of_the_issue_stay_within_their_limits(
@@ -87,7 +87,7 @@ def test_a_window_network_costs_its_window_at_every_step(tmp_path: Path, target_
     assert arch.macs_per_step < cost.stages["network"] < 20 * arch.macs_per_step and cost.stages["pooling"] < 60
     # It needs more than the frames of the step that it completes.
     assert cost.stages["network"] < cost.gap < cost.step
-    assert cost.memory_bytes == read_facts(folder)["memory_bytes"] and 0 <= TOY_BYTES - cost.toy_bytes <= 24
+    assert cost.memory_bytes == read_facts(folder)["memory_bytes"] and 0 <= TOY_BYTES - cost.toy_bytes <= 32
     slow = found.estimates["esp32-c3"]
     assert slow.high_ms == pytest.approx(cost.step * 2.0 / 160e3 + 60 * cost.flash_bytes / 15e3)
     assert slow.largest_rate_hz == (1000 / slow.high_ms, 1000 / slow.low_ms)

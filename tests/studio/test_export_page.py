@@ -26,7 +26,7 @@ def only(page: Any, target: str) -> None:
     if not marked(page, f"target-{target}").is_visible():
         marked(page, "proof").get_by_text("More settings").click()
         marked(page, f"target-{target}").wait_for()
-    for name in {"host", "xtensa", "cortex-m4", "cortex-m0", "riscv32"} - {target}:
+    for name in {"host", "xtensa", "cortex-m4", "cortex-m0", "cortex-m33", "riscv32"} - {target}:
         if marked(page, f"target-{name}").count():
             marked(page, f"target-{name}").click()
 

@@ -228,7 +228,9 @@ def test_scenarios_have_sensors_that_are_stuck_where_they_may_be(small: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("target", "second"), list(zip(EMULATED, ("shift", "index", "rounding", "clamp"), strict=True)), ids=EMULATED
+    ("target", "second"),
+    list(zip(EMULATED, ("shift", "index", "rounding", "index", "clamp"), strict=True)),
+    ids=EMULATED,
 )
 def test_faults_are_caught_on_every_chip(emulators: None, small: Path, target: str, second: str) -> None:
     """A weight on each of them, and another kind of fault: on the host each kind is caught."""

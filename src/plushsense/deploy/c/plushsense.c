@@ -766,19 +766,18 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 #define PLUSH_PRODUCTS                                                   \
     "smlad %[s], %[a], %[c], %[s]\n\tsmlad %[t], %[a], %[e], %[t]\n\t"   \
     "smlad %[s], %[b], %[d], %[s]\n\tsmlad %[t], %[b], %[f], %[t]"
+#define PLUSH_TWO_FILTERS(first, second)                                                                   \
+    __asm__ volatile(PLUSH_WEIGHTS("8") PLUSH_PRODUCTS                                                     \
+                     : [w] "+&r"(w), [s] "+&r"(first), [t] "+&r"(second), [c] "=&r"(c), [d] "=&r"(d),        \
+                       [e] "=&r"(e), [f] "=&r"(f)                                                          \
+                     : [a] "r"(a), [b] "r"(b)                                                              \
+                     : "memory")
 #define PLUSH_ALONE                                                                                        \
     do {                                                                                                   \
         uint32_t a, b, c, d, e, f;                                                                         \
-        __asm__ volatile(PLUSH_ACTIVATIONS PLUSH_WEIGHTS("8") PLUSH_PRODUCTS                               \
-                         : [x] "+&r"(x), [w] "+&r"(w), [s] "+&r"(s0), [t] "+&r"(s1), [a] "=&r"(a),         \
-                           [b] "=&r"(b), [c] "=&r"(c), [d] "=&r"(d), [e] "=&r"(e), [f] "=&r"(f)            \
-                         :                                                                                 \
-                         : "memory");                                                                      \
-        __asm__ volatile(PLUSH_WEIGHTS("8") PLUSH_PRODUCTS                                                 \
-                         : [w] "+&r"(w), [s] "+&r"(s2), [t] "+&r"(s3), [c] "=&r"(c), [d] "=&r"(d),         \
-                           [e] "=&r"(e), [f] "=&r"(f)                                                      \
-                         : [a] "r"(a), [b] "r"(b)                                                          \
-                         : "memory");                                                                      \
+        __asm__ volatile(PLUSH_ACTIVATIONS : [x] "+&r"(x), [a] "=&r"(a), [b] "=&r"(b) : : "memory");       \
+        PLUSH_TWO_FILTERS(s0, s1);                                                                         \
+        PLUSH_TWO_FILTERS(s2, s3);                                                                         \
     } while (0)
 #ifndef PLUSH_WINDOW
 #define PLUSH_PAIR                                                                                         \

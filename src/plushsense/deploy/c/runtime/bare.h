@@ -17,6 +17,9 @@ uint32_t semihosting(uint32_t operation, const void *block);
 #if defined(__XTENSA__)
 #define TICKS_PER 32u       /* 25 ns each, an instruction takes 32 ns */
 #define INSTRUCTIONS_PER 25u
+#elif defined(__ARM_ARCH_8M_MAIN__)
+#define TICKS_PER 32u       /* 50 ns each, an instruction takes 64 ns */
+#define INSTRUCTIONS_PER 25u
 #elif defined(__arm__)
 #define TICKS_PER 8u        /* 40 ns each, an instruction takes 64 ns */
 #define INSTRUCTIONS_PER 5u

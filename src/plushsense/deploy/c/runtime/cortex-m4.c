@@ -1,8 +1,12 @@
-/* Cortex-M4 on QEMU's machine mps2-an386: the call of semihosting, time by its first timer. */
+/* Cortex-M on QEMU's machines mps2-an386 and, of Armv8-M, mps2-an505: the call of semihosting, time by their first timer. */
 #include "bare.h"
 
-/* A 32-bit timer that counts down at 25 MHz. SysTick would wrap after 24 bits. */
+/* A 32-bit timer that counts down at 25 MHz, on mps2-an505 at 20 MHz. SysTick would wrap after 24 bits. */
+#ifdef __ARM_ARCH_8M_MAIN__
+#define TIMER ((volatile uint32_t *)0x50000000) /* its secure address */
+#else
 #define TIMER ((volatile uint32_t *)0x40000000)
+#endif
 #define TIMER_CONTROL 0
 #define TIMER_VALUE 1
 #define TIMER_RELOAD 2
