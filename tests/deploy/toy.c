@@ -263,7 +263,13 @@ const char *seat_title(void *p)
     return plush_model_title(&((seat *)p)->toy);
 }
 
+uint32_t seat_reading(void *p)
+{
+    return ((seat *)p)->toy.reading;
+}
+
 /* The small functions. */
+uint32_t try_checksum(const uint8_t *bytes, uint32_t n) { return checksum(bytes, n); }
 int32_t try_shift_down(int32_t v, uint32_t n) { return shift_down(v, n); }
 int32_t try_as_signed(uint32_t v) { return as_signed(v); }
 uint32_t try_root(uint64_t v) { return square_root(v); }

@@ -64,6 +64,16 @@ typedef enum {
     PLUSH_AFFECT_NEGATIVE = 3
 } plush_affect;
 
+/* What became of the newest reading: why plush_push() returned what it did. Below PLUSH_READING_FIRST it was not used, and
+ * no answer fell due. */
+typedef enum {
+    PLUSH_READING_NONE = 0,     /* there was none yet; or no model is running, because plush_begin() has not said PLUSH_OK */
+    PLUSH_READING_WAITING = 1,  /* some channel has had no valid value yet since the start or the last restart */
+    PLUSH_READING_FAULT = 2,    /* passed over: the sensors cannot be believed */
+    PLUSH_READING_FIRST = 3,    /* used as the first of a stream: after the start, a gap, a clock that ran backwards, a fault */
+    PLUSH_READING_USED = 4      /* used to go on; 0 answers fell due unless it completed a step */
+} plush_reading;
+
 /* What an answer is worth. */
 typedef enum {
     PLUSH_IDLE = 0,    /* nobody does anything */
@@ -124,7 +134,7 @@ typedef struct {
     uint32_t *tap_sums;     /* for each of the next `dilation` samples: sum of the activations already under its taps */
 } plush_layer;
 
-/* A toy: everything about one stream. Fields from `answer` to `suspect` may be read, none may be written. */
+/* A toy: everything about one stream. Fields from `answer` to `reading` may be read, none may be written. */
 typedef struct plush_toy {
     plush_answer answer;     /* the newest one; its `state` is that of the toy at any time */
     plush_event event;       /* the newest thing that happened to an event */
@@ -133,6 +143,7 @@ typedef struct plush_toy {
     uint32_t invalid;        /* values out of their valid range, for which the last valid one stood in */
     uint32_t faults;         /* how often sensors could not be believed */
     uint8_t suspect;         /* the newest frame is in doubt: no event begins on it */
+    uint8_t reading;         /* what became of the newest one: a plush_reading */
 
     /* Called with every answer, and with everything that happens to an event, also when one frame completes several;
      * may be NULL. Set them after plush_begin(). They may read the toy, but call no function that changes it
@@ -234,7 +245,8 @@ plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32_t model_byt
 plush_status plush_patch(plush_toy *toy, const uint8_t *patch, uint32_t patch_bytes);
 
 /* Takes the readings of one moment in: `ms` is the toy's own clock, `values` the measured channels in the order of
- * the layout. Returns how many answers fell due, mostly 0 or 1; the newest is in toy->answer. */
+ * the layout. Returns how many answers fell due, mostly 0 or 1; the newest is in toy->answer. Where that is 0,
+ * toy->reading tells why. */
 uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values);
 
 /* No reading came for a while (your program knows best how long that is): what is going on ends. The next reading goes
