@@ -309,7 +309,7 @@ static plush_status check(const uint8_t *model, uint32_t bytes, const char *magi
 {
     if (model == NULL || bytes < HEAD_BYTES || memcmp(model, magic, 4) != 0)
         return PLUSH_NOT_A_MODEL;
-    if (le16(model + 4) != PLUSH_IMAGE_VERSION)
+    if (word_at(model + 4) != PLUSH_IMAGE_VERSION) /* 16 bits, and 16 zeros */
         return PLUSH_OTHER_VERSION;
     if (word_at(model + 8) > bytes || word_at(model + 8) <= HEAD_BYTES ||
         checksum(model + HEAD_BYTES, word_at(model + 8) - HEAD_BYTES) != word_at(model + 12))
