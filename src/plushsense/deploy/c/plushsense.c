@@ -1946,17 +1946,12 @@ struct plush_aligned {
     uint32_t word;
 };
 
-/* A toy with this model and memory. Nothing is written to the memory; a toy of which this does not say PLUSH_OK is of no
- * use. */
+/* A toy with this model, which check() found good, and memory. Nothing is written to the memory; a toy of which this does
+ * not say PLUSH_OK is of no use. */
 PLUSH_SMALL PLUSH_APART
-static plush_status prepare(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
-                            uint32_t memory_bytes)
+static plush_status prepare(plush_toy *toy, const uint8_t *model, void *memory, uint32_t memory_bytes)
 {
-    plush_status status = check(model, model_bytes, "PLSH");
-
     memset(toy, 0, sizeof *toy);
-    if (status != PLUSH_OK)
-        return status;
     if (!read_model(toy, model))
         return PLUSH_DAMAGED;
     if (memory == NULL || (uintptr_t)memory % offsetof(struct plush_aligned, word) != 0 ||
@@ -1967,12 +1962,19 @@ static plush_status prepare(plush_toy *toy, const uint8_t *model, uint32_t model
     return PLUSH_OK;
 }
 
-PLUSH_SMALL uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes)
+/* By itself, as take_over() below, so that the stack never holds a toy and the words of checksum() together. */
+PLUSH_SMALL PLUSH_APART
+static uint32_t bytes_needed(const uint8_t *model)
 {
     plush_toy toy;
 
     /* Without memory, only that can be wrong with a good model. */
-    return prepare(&toy, model, model_bytes, NULL, 0) == PLUSH_MEMORY_TOO_SMALL ? share_out(&toy, NULL) : 0;
+    return prepare(&toy, model, NULL, 0) == PLUSH_MEMORY_TOO_SMALL ? share_out(&toy, NULL) : 0;
+}
+
+PLUSH_SMALL uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes)
+{
+    return check(model, model_bytes, "PLSH") == PLUSH_OK ? bytes_needed(model) : 0;
 }
 
 PLUSH_APART
@@ -1988,19 +1990,21 @@ void plush_restart(plush_toy *toy)
 PLUSH_SMALL plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                          uint32_t memory_bytes)
 {
-    plush_status status = prepare(toy, model, model_bytes, memory, memory_bytes);
+    plush_status status = check(model, model_bytes, "PLSH");
 
+    if (status == PLUSH_OK)
+        status = prepare(toy, model, memory, memory_bytes);
     if (status != PLUSH_OK)
         memset(toy, 0, sizeof *toy);
     plush_restart(toy);
     return status;
 }
 
-PLUSH_SMALL plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
-                        uint32_t memory_bytes)
+PLUSH_SMALL PLUSH_APART
+static plush_status take_over(plush_toy *toy, const uint8_t *model, void *memory, uint32_t memory_bytes)
 {
     plush_toy next;
-    plush_status status = prepare(&next, model, model_bytes, memory, memory_bytes);
+    plush_status status = prepare(&next, model, memory, memory_bytes);
 
     if (status != PLUSH_OK)
         return status;
@@ -2011,6 +2015,14 @@ PLUSH_SMALL plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32
     *toy = next;
     plush_restart(toy);
     return PLUSH_OK;
+}
+
+PLUSH_SMALL plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
+                        uint32_t memory_bytes)
+{
+    plush_status status = check(model, model_bytes, "PLSH");
+
+    return status == PLUSH_OK ? take_over(toy, model, memory, memory_bytes) : status;
 }
 
 PLUSH_SMALL uint32_t plush_model_id(const plush_toy *toy)

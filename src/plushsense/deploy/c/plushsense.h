@@ -234,7 +234,8 @@ plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_by
  * this says PLUSH_OK, neither the toy nor any memory has changed, and the old model goes on. Then what is going on ends,
  * which on_event is told as ever, by the old model; callbacks and counts stay; the toy is warming, as after
  * plush_begin(). `memory` may be that of the old model. Until PLUSH_OK the old model's bytes must stay where they are:
- * receive the new ones somewhere else. Needs a plush_toy on the stack. A checksum finds damage, not forgery. */
+ * receive the new ones somewhere else. Needs a kilobyte of stack, as plush_begin() does. A checksum finds damage, not
+ * forgery. */
 plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                         uint32_t memory_bytes);
 
