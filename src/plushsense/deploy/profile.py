@@ -332,7 +332,8 @@ def _bound(most: Ints, least: Ints, step: int) -> int:
     as many samples as the longest gap of the model asks for, with the answers that fall due: these numbers follow from
     the image. ``most`` and ``least`` (8,) are the counts of each part over forced states (`count_parts` in profile.c),
     of the network for several samples together; the last columns are the samples of the gap, and how many were counted
-    together. Each part is taken as its most and, as no forced state need be the worst, once more what it varies by.
+    together. Each part is taken as its most and, as no forced state need be the worst, once more what it varies by; the
+    network also with what rounding and the turns of its rings may add.
     """
     frame, forget, *sample, network, answer = (2 * most[:-1] - least[:-1]).tolist()
     samples, together = int(most[-1]), int(least[-1])

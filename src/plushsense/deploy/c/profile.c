@@ -253,6 +253,23 @@ static void draw_event(void)
     toy.away = toy.lasted = toy.wanted_for = toy.named_for = (uint16_t)(draw(2) * 1000u);
 }
 
+/* How much longer than another a sample may take in the network by what no state that is tried need show: for each filter
+ * all that rounding takes, and at each tap the turn of a ring. */
+#define ROUNDING 32u
+#define TURN 4u
+
+static uint32_t slack_of_sample(void)
+{
+    uint32_t slack = 0, i;
+
+    for (i = 0; i < toy.layers; i++) {
+        const plush_layer *layer = &toy.layer[i];
+
+        slack += ROUNDING * layer->filters + TURN * ((layer->filters + GROUP - 1) / GROUP) * layer->kernel;
+    }
+    return slack;
+}
+
 /* Two rows: the most and the least instructions of each part over many states, the network's for as many samples
  * together as the longest gap asks for, or MOST_AT_ONCE; then how many the gap asks for, and how many were counted. */
 static void count_parts(void)
@@ -307,6 +324,9 @@ static void count_parts(void)
         answer(&toy, toy.seen_ms);
         note(ANSWER, since(then));
     }
+    i = slack_of_sample() * (toy.blocks == 0 ? toy.span * ((together + toy.step - 1) / toy.step) : together);
+    most[NETWORK] += i; /* in both, so that it counts once */
+    least[NETWORK] += i;
     then = target_instructions();
     plush_restart(&toy);
     note(FORGET, since(then));
