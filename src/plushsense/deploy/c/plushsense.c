@@ -2087,8 +2087,8 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
     toy->reading = PLUSH_READING_FAULT;
     if (toy->faulty)
         return 0;
-    toy->reading = PLUSH_READING_WAITING;
     toy->heard = 1;
+    toy->reading = PLUSH_READING_WAITING;
     if (toy->running)
         memcpy(toy->before, toy->held, 4u * toy->channels);
     if (!hold(toy, values))
