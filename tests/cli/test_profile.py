@@ -44,10 +44,12 @@ def test_json_and_text(export: Path, capsys: pytest.CaptureFixture[str], target_
     assert {"instructions_per_step", "macs_per_step", "flash_bytes", "ram_bytes", "estimated_ms"} <= set(told)
     assert set(told["instructions_per_step"]) == {"xtensa", "cortex-m4"} == set(told["flash_bytes"])
     assert told["macs_per_step"] == sum(v for k, v in told["macs_by_layer"].items() if k != "dense")
-    assert set(told["estimated_ms"]) == {"esp32", "esp32-s2", "esp32-s3", "nrf52"}
+    assert set(told["estimated_ms"]) == {"esp8266", "esp32", "esp32-s2", "esp32-s3", "nrf52"}
+    assert all(c["instructions_call_most"] <= c["instructions_call_bound"] for c in told["targets"].values())
     esp32 = told["estimated_ms"]["esp32"]
     assert esp32["estimate"] and 0 < esp32["low"] < esp32["high"] < 50 and esp32["why"]
     assert esp32["verdict"].startswith("fits 20 Hz: yes")
+    assert 0 < esp32["energy_uj"][0] < esp32["energy_uj"][1] and esp32["current_source"]
     assert "nothing ran on a real chip" in told["said"]
 
     assert main(["profile", str(export), "--target", "xtensa"]) == 0
@@ -58,6 +60,9 @@ def test_json_and_text(export: Path, capsys: pytest.CaptureFixture[str], target_
         "ESTIMATED",
         "nothing ran on a real chip",
         "Heap: none",
+        "Interrupts switched off: never",
+        "longest call, bound",
+        "uJ a step",
         "whole step",
         "stack: plush_push",
         "fits 20 Hz",

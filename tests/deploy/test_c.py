@@ -6,6 +6,7 @@ import ctypes
 import math
 import struct
 import zlib
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from plushsense.runtime.fixed import exponentials
 from plushsense.runtime.gate import DOUBT, JERK, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel, memory_bytes
+from plushsense.runtime.machine import Sample, ToyMachine
 from support.c_toy import answers, seat
 from support.integers import INT32, any_frames, edged_model, models, plain_model, ruled_model
 
@@ -145,6 +147,29 @@ def test_a_gap_is_a_fresh_toy(c_library: Any) -> None:
     assert np.array_equal(later[:, 1:7], alone[:, 1:7])
     assert np.array_equal(later[:, 9:], alone[:, 9:])
     assert later[0, 7] == together[together[:, 0] < 400][-1, 7] + 1
+
+
+def test_what_became_of_a_reading(c_library: Any) -> None:
+    """By what Python's machine knows after each frame: gaps, resets, values never valid, faults and recoveries."""
+    found: Counter[int] = Counter()
+    for seed in range(6):
+        model = replace(ruled_model(seed), rules=Rules(health=HealthSettings(fault_ms=60 * (seed % 2), recover_ms=90)))
+        frames = any_frames(model, seed, 400)
+        frames[:9, 2] = frames[150:170, 2] = 1 << 30  # out of its range
+        machine = ToyMachine(model.network.stepper(), model.layout, model.gestures, model.rules, model.smoothing)
+        toy = seat(c_library, model)
+        assert c_library.seat_reading(toy.toy) == 0
+        for frame in frames:
+            items = list(machine.frames.push(int(frame[0]), frame[1:].tolist()))
+            steps = [m for m in machine.samples.read(items) if m.cause == "step"]
+            waiting = machine.frames.clock.now_us is None
+            first = machine.samples.samples == 1 and any(isinstance(item, Sample) for item in items)
+            expected = 2 if machine.frames.health.fault else 1 if waiting else 3 if first else 4
+            rows = toy.push(frame[None])
+            assert c_library.seat_reading(toy.toy) == expected, (seed, frame[0])
+            assert len(answers(rows)) == len(steps) and (expected > 2 or not steps)
+            found[expected] += 1
+    assert min(found[kind] for kind in (1, 2, 3, 4)) > 12, found
 
 
 def test_toys_side_by_side(c_library: Any) -> None:
@@ -281,5 +306,12 @@ def test_exponentials(c_library: Any) -> None:
 
 
 def test_the_checksum_is_the_one_of_zip(c_library: Any) -> None:
+    """Of every length around those at which words are taken out, at any address."""
     image = plain_model().to_bytes()
     assert struct.unpack_from("<I", image, 12)[0] == zlib.crc32(image[16:])
+    data = np.random.default_rng(3).integers(0, 256, 9000, dtype=np.uint8).tobytes()
+    held = ctypes.create_string_buffer(data)
+    for n, length in enumerate([*range(800), 1500, 8233, 8990]):
+        start = n % 7
+        found = c_library.try_checksum(ctypes.c_void_p(ctypes.addressof(held) + start), length)
+        assert found == zlib.crc32(data[start : start + length]), (start, length)

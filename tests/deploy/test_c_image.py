@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import re
 import struct
 import subprocess
@@ -22,7 +23,7 @@ from plushsense.runtime.events import ENDED
 from plushsense.runtime.gate import JERK, LEVEL, MOST_SIZE, GateSettings, Rule, Signal, Term
 from plushsense.runtime.image import IntegerModel, image_head
 from support.c_toy import Seat, seat
-from support.integers import any_frames, models, plain_model, ruled_model, vector_model, window_model
+from support.integers import any_frames, edged_model, models, plain_model, ruled_model, vector_model, window_model
 
 OK, NOT_A_MODEL, OTHER_VERSION, DAMAGED, TOO_SMALL, OTHER_LAYOUT = range(6)
 
@@ -464,3 +465,30 @@ def test_sanitizers_find_nothing_in_swaps(sanitized: list[Path], tmp_path: Path)
     assert at == len(out)
     assert all(status == OK for status, fine in zip(statuses, good, strict=True) if fine)
     assert sum(status != OK for status in statuses) > 100
+
+
+def test_a_drill_of_bad_updates(sanitized: list[Path], tmp_path: Path) -> None:
+    """Damaged, truncated, foreign, older and newer images at random moments of a stream with events, and now and then a
+    sound one: see ``drill`` in toy.c. ``PLUSHSENSE_FUZZ=100`` offers a million to each program.
+    """
+    offers = 10_000 * int(os.environ.get("PLUSHSENSE_FUZZ", "1"))
+    models = [ruled_model(seed, classes=3 + seed % 4, step=1 + seed % 5, pool=60) for seed in (5, 8, 14, 21)]
+    body = models[1].to_bytes()[16:]
+    other_layout = sealed(body[:26] + bytes([body[26] ^ 1]) + body[27:])
+    foreign = [(other_layout, OTHER_LAYOUT), (edged_model().to_bytes(), OTHER_LAYOUT)]
+    foreign.append((window_model(window=12).to_bytes(), OTHER_VERSION))
+    sound = [*models[1:], vector_model()]
+    offered = [*((model.to_bytes(), OK) for model in sound), *2 * foreign]
+    (tmp_path / "cases").write_bytes(
+        cases(
+            (models[0].to_bytes(), any_frames(models[0], 5, 4000)),
+            *((image, np.zeros((status, 0), dtype=np.int64)) for image, status in offered),
+        )
+    )
+    output = {run(program, tmp_path / "cases", "drill", f"{offers}") for program in sanitized}
+    assert len(output) == 1
+    read, events, ended, *by_status = struct.unpack("<10I", output.pop())
+    assert sum(by_status) >= offers and read > offers / 4 and events > offers / 200
+    assert ended > 0 and by_status[OK] > offers / 1000
+    assert min(by_status[status] for status in (NOT_A_MODEL, OTHER_VERSION, DAMAGED, TOO_SMALL)) > offers / 40
+    assert by_status[OTHER_LAYOUT] > offers / 1000 and by_status[6] == 0

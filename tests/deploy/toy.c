@@ -263,7 +263,13 @@ const char *seat_title(void *p)
     return plush_model_title(&((seat *)p)->toy);
 }
 
+uint32_t seat_reading(void *p)
+{
+    return ((seat *)p)->toy.reading;
+}
+
 /* The small functions. */
+uint32_t try_checksum(const uint8_t *bytes, uint32_t n) { return checksum(bytes, n); }
 int32_t try_shift_down(int32_t v, uint32_t n) { return shift_down(v, n); }
 int32_t try_as_signed(uint32_t v) { return as_signed(v); }
 uint32_t try_root(uint64_t v) { return square_root(v); }
@@ -289,15 +295,164 @@ static uint32_t word(FILE *f)
     return le32(b);
 }
 
+#define OFFERED 16u
+#define MOST_BYTES 65536u
+#define MOST_ROWS_ONCE 256u
+
+static uint32_t drawn = 2463534242u;
+
+/* A random number below `n`. */
+static uint32_t draw(uint32_t n)
+{
+    drawn ^= drawn << 13;
+    drawn ^= drawn >> 17;
+    drawn ^= drawn << 5;
+    return drawn % n;
+}
+
+/* An image as a bad transfer, another toy or another version leaves it, in `out`; returns its bytes. `whole` is the image
+ * that it was made of, and stays it (but for the memory that `too_few` keeps back) only if this sets `sound`. */
+static uint32_t spoil(uint8_t *out, const uint8_t *whole, uint32_t bytes, uint32_t *too_few, int *sound)
+{
+    uint32_t i, at, n;
+
+    memcpy(out, whole, bytes);
+    *too_few = 0;
+    *sound = 0;
+    switch (draw(8)) {
+    case 0: /* an image for other channels or of another version; but seldom one that may take over */
+        *sound = 1;
+        *too_few = draw(16) == 0 ? 0 : 1 + draw(9);
+        return bytes;
+    case 1: /* bits that are wrong */
+        for (i = draw(3) + 1, at = draw(8 * bytes); i > 0; i--, at = (at + 1 + draw(bytes)) % (8 * bytes))
+            out[at / 8] = (uint8_t)(out[at / 8] ^ (1u << at % 8));
+        return bytes;
+    case 2: /* what has not come yet, as erased flash or not at all */
+        at = draw(bytes);
+        memset(out + at, 0xff, bytes - at);
+        return draw(2) == 0 && memcmp(out, whole, bytes) != 0 ? bytes : at;
+    case 3: /* older and newer ones */
+        out[4] = (uint8_t)(PLUSH_IMAGE_VERSION + (draw(2) == 0 ? 1 + draw(99) : 256 - 1 - draw(PLUSH_IMAGE_VERSION)));
+        return bytes;
+    case 4: /* a piece that comes twice, or not, and all after it in the wrong place */
+        at = HEAD_BYTES + draw(bytes - HEAD_BYTES - 8);
+        n = 1 + draw(bytes - at - 2);
+        memmove(out + at, out + at + 1, n);
+        out[at + n] = (uint8_t)(whole[at + n] ^ (1u + draw(255)));
+        return bytes;
+    case 5: /* something else */
+        for (i = 0; i < bytes; i++)
+            out[i] = (uint8_t)draw(256);
+        if (draw(2) == 0)
+            memcpy(out, whole, draw(13));
+        return bytes;
+    case 6: /* another length or checksum in its head */
+        out[8 + draw(8)] ^= (uint8_t)(1u + draw(255));
+        return bytes;
+    default: /* nothing, or less than a head */
+        return draw(HEAD_BYTES);
+    }
+}
+
+/* `offers` images, most of them spoilt, between the frames of one toy; another toy reads the same frames and is offered
+ * only what takes over. The first case is the model with its frames; the others are images, with as many frames of no
+ * column as is the status that they deserve. Ends with status 3 when a refusal changes a byte, 4 when a wrong image is
+ * taken or a sound one has another status, 5 when a swap does not end the open event once, or ends one where none is open,
+ * 6 when the two say something else, 7 when an event begins in another, ends without one or has not the next number. Writes
+ * how many frames, events, ends by a swap, and offers by status there were. */
+static int drill(FILE *f, uint32_t offers)
+{
+    static uint8_t images[OFFERED][MOST_BYTES], image[MOST_BYTES];
+    static int32_t rows[2][MOST_ROWS_ONCE * (HEAD + 2u * 255u)], swapped[2][4u * (HEAD + 2u * 255u)];
+    uint32_t sizes[OFFERED], deserved[OFFERED], n = 0, frames = 0, columns = 0, i, k, told[3 + 7] = {0}, open = 0, at = 0, offered = 0;
+    static int32_t *stream; /* reachable after an early end, for the sanitizer of leaks */
+    static seat *toys[2];
+    int status;
+
+    for (; n < OFFERED && fread(&sizes[n], 4, 1, f) == 1; n++) {
+        uint32_t shape[2];
+        int32_t *read;
+
+        if (sizes[n] > MOST_BYTES || fread(images[n], 1, sizes[n], f) != sizes[n] || fread(shape, 4, 2, f) != 2)
+            return 2;
+        read = (int32_t *)malloc((size_t)4 * shape[0] * shape[1] + 4);
+        if (fread(read, 4, (size_t)shape[0] * shape[1], f) != (size_t)shape[0] * shape[1])
+            return 2;
+        deserved[n] = n > 0 ? shape[0] : PLUSH_OK;
+        if (n > 0) {
+            free(read);
+            continue;
+        }
+        stream = read;
+        frames = shape[0];
+        columns = shape[1];
+    }
+    for (i = 0; i < 2; i++)
+        toys[i] = (seat *)seat_new(images[0], sizes[0], &status, 0, 0);
+    for (; offered < offers; at = (at + 1) % frames) {
+        for (k = draw(5) == 0 ? draw(24) : 0; k > 0; k--) {
+            uint32_t of = draw(n), too_few, made[2];
+            int sound, other;
+            uint32_t bytes = spoil(image, images[of], sizes[of], &too_few, &sound);
+
+            made[0] = seat_swap(toys[0], image, bytes, too_few, &status, swapped[0], 4);
+            offered++;
+            told[3 + status]++;
+            if (made[0] == UINT32_MAX)
+                return 3;
+            if (sound ? too_few == 0 && (uint32_t)status != deserved[of] : status == PLUSH_OK)
+                return 4;
+            if (status != PLUSH_OK)
+                continue;
+            if (made[0] != open || (open && (swapped[0][4] != PLUSH_ENDED || (uint32_t)swapped[0][3] != told[1])))
+                return 5;
+            told[2] += open;
+            open = 0;
+            made[1] = seat_swap(toys[1], image, bytes, too_few, &other, swapped[1], 4);
+            if (made[1] != made[0] || memcmp(swapped[0], swapped[1], 4u * made[0] * HEAD) != 0)
+                return 6;
+        }
+        for (i = 0; i < 2; i++)
+            seat_push(toys[i], stream + (size_t)at * columns, 1, columns - 1, rows[i], MOST_ROWS_ONCE, NULL, 0);
+        told[0]++;
+        k = HEAD + 2u * toys[0]->toy.classes;
+        if (toys[0]->made != toys[1]->made || memcmp(rows[0], rows[1], (size_t)4 * k * toys[0]->made) != 0)
+            return 6;
+        for (i = 0; i < toys[0]->made; i++) {
+            const int32_t *row = rows[0] + (size_t)k * i;
+
+            if (row[0] != 1)
+                continue;
+            told[1] += row[4] == PLUSH_BEGUN;
+            if (open != (row[4] != PLUSH_BEGUN) || (uint32_t)row[3] != told[1])
+                return 7;
+            open = row[4] != PLUSH_ENDED;
+        }
+    }
+    for (i = 0; i < 2; i++)
+        seat_free(toys[i]);
+    free(stream);
+    fwrite(told, 4, sizeof told / 4, stdout);
+    return 0;
+}
+
 /* Cases, one after the other: bytes of the model, the model, frames, columns, the frames. Writes of each: status,
  * answers, and the answers' rows. With a second argument the first toy whose model is good goes on with all further
- * cases, and is offered their models, or with `patch` as the second argument their patches. */
+ * cases, and is offered their models, or with `patch` as the second argument their patches. With `drill` and a number
+ * see drill(). */
 int main(int argc, char **argv)
 {
     FILE *f = argc > 1 ? fopen(argv[1], "rb") : NULL;
 
     if (f == NULL)
         return 2;
+    if (argc > 3 && strcmp(argv[2], "drill") == 0) {
+        int found = drill(f, (uint32_t)strtoul(argv[3], NULL, 10));
+
+        fclose(f);
+        return found;
+    }
     for (;;) {
         uint32_t bytes = word(f), n, columns, told = 0, fit, width;
         uint8_t *model = (uint8_t *)malloc(bytes ? bytes : 1);

@@ -242,6 +242,8 @@ def _counts(profile: Profile) -> list[str]:
         ["whole step", *(f"{c.step:,}" for c in costs)],
         ["dearest step", *(f"{c.step_most:,}" for c in costs)],
         [f"longest gap ({profile.facts['gap_ms']} ms), one call", *(f"{c.gap:,}" for c in costs)],
+        ["longest call seen", *(f"{c.call_most:,}" for c in costs)],
+        ["longest call, bound", *(f"{c.call_bound:,}" for c in costs)],
         ["plush_begin, once", *(f"{c.begin:,}" for c in costs)],
         ["network, for each MAC", *(f"{c.stages['network'] / profile.arch.macs_per_step:.2f}" for c in costs)],
     ]
@@ -285,8 +287,10 @@ def _bytes(costs: list[Cost]) -> list[str]:
     needs = "; ".join(f"{c.target}: {', '.join(c.needs) or 'nothing'}" for c in costs)
     heap = sorted({s for c in costs for s in c.heap})
     floats = sorted({s for c in costs for s in c.floats})
+    masking = sorted({s for c in costs for s in c.masking})
     proof = (
-        f"Heap: {', '.join(heap) or 'none'}. Floating point: {', '.join(floats) or 'none'}. All that plushsense.o "
+        f"Heap: {', '.join(heap) or 'none'}. Floating point: {', '.join(floats) or 'none'}. "
+        f"Interrupts switched off: {', '.join(masking) or 'never'}. All that plushsense.o "
         f"needs from outside, on {needs}."
     )
     frames = "; ".join(
@@ -300,7 +304,7 @@ def _bytes(costs: list[Cost]) -> list[str]:
 
 
 def _times(profile: Profile) -> list[str]:
-    from plushsense.deploy.profile import SUMMARY
+    from plushsense.deploy.profile import FETCHING, SUMMARY
 
     if not profile.estimates:
         return []
@@ -310,13 +314,16 @@ def _times(profile: Profile) -> list[str]:
             e.core.mhz,
             e.core.target,
             f"{e.core.cycles_low:g} to {e.core.cycles_high:g}",
-            f"{_two_digits(e.low_ms)} to {_two_digits(e.high_ms)}",
+            f"{_two_digits(e.low_ms)} to {_two_digits(e.core_ms)}",
+            _two_digits(e.flash_ms) if e.flash_ms else "-",
+            _two_digits(e.call_ms),
             e.answer,
             " to ".join(map(_two_digits, e.largest_rate_hz)),
         ]
         for e in profile.estimates.values()
     ]
-    head = ["chip", "MHz", "counted on", "cycles an instruction", "ms a step", f"fits {1000 / profile.step_ms:g} Hz"]
+    head = ["chip", "MHz", "counted on", "cycles", "ms a step", "flash, up to", "longest call"]
+    head += [f"fits {1000 / profile.step_ms:g} Hz"]
     notes: list[str] = []
     if profile.arch.padding == "stream":
         rows = [row[:-1] for row in rows]
@@ -329,14 +336,44 @@ def _times(profile: Profile) -> list[str]:
         )
     why: dict[str, list[str]] = {}
     for e in profile.estimates.values():
-        why.setdefault(e.core.reasons, []).append(e.core.title.partition(" (")[0])
+        core = e.core
+        flash = "" if core.flash_mb_s is None else f"; flash at {core.flash_mb_s:g} MB/s"
+        why.setdefault(f"{core.why}{flash}; current: {core.power}", []).append(core.title.partition(" (")[0])
     return [
         "",
         *textwrap.wrap(f"Time of a step, ESTIMATED. {SUMMARY}", 118),
         table(head, rows),
+        *textwrap.wrap(
+            "cycles: of an instruction. longest call: ms at most, by the bound above and with fetching; so long the "
+            "caller of plush_push is busy, while interrupts are served. " + FETCHING,
+            118,
+        ),
         *notes,
+        *_energy(profile),
         "Where the bounds come from:",
         *(line for words, names in why.items() for line in _wrapped(f"{', '.join(names)}: {words}.")),
+    ]
+
+
+def _energy(profile: Profile) -> list[str]:
+    rows = [
+        [
+            e.core.title,
+            f"{e.core.volts:g}",
+            " to ".join(f"{ma:g}" for ma in dict.fromkeys(e.core.ma)),
+            " to ".join(map(_two_digits, e.energy_uj)),
+            " to ".join(_two_digits(uj / profile.step_ms) for uj in e.energy_uj),
+        ]
+        for e in profile.estimates.values()
+    ]
+    return [
+        "",
+        *textwrap.wrap(
+            "Energy of a step, ESTIMATED: time x voltage x the datasheet's current of the whole chip while its core "
+            "runs, radio off. What it needs between two steps, and sensors, radio and regulator, come on top.",
+            118,
+        ),
+        table(["chip", "V", "mA", "uJ a step", "mW on average"], rows),
     ]
 
 

@@ -157,6 +157,7 @@ def handbook(bundle: Bundle, facts: Mapping[str, Any]) -> str:
     """Render the README in Markdown from the ``facts`` (of ``export.json``) and the bundle, not yet `prefixed`."""
     layout = bundle.layout
     ranges = layout.valid_min_int.tolist(), layout.valid_max_int.tolist()
+    samples_of_gap = -(-layout.gap_ms * 1000 // layout.period_us)
     return _fill(
         "templates/README.md",
         facts=facts,
@@ -165,6 +166,8 @@ def handbook(bundle: Bundle, facts: Mapping[str, Any]) -> str:
         provenance=bundle.provenance,
         personal=bundle.personal,
         toy_bytes=TOY_BYTES,
+        samples_of_gap=samples_of_gap,
+        answers_of_gap=-(-samples_of_gap // int(facts["step"])),
         bundle=BUNDLE,
         image=IMAGE,
         facts_file=FACTS,

@@ -34,7 +34,9 @@ from plushsense.runtime.fixed import Ints
 
 @dataclass(frozen=True)
 class Core:
-    """Core of a chip, described in ``cores.toml``; ``cycles_low`` and ``cycles_high`` are per instruction."""
+    """Core of a chip, described in ``cores.toml``; ``cycles_low`` and ``cycles_high`` are per instruction, ``ma`` the
+    lowest and highest current in mA while it runs, by ``power``.
+    """
 
     name: str
     title: str
@@ -43,17 +45,12 @@ class Core:
     cycles_low: float
     cycles_high: float
     why: str
+    volts: float
+    ma: tuple[float, float]
+    power: str
     flash_mb_s: float | None = None
-
-    @property
-    def reasons(self) -> str:
-        """Explanation of the two bounds as text."""
-        if self.flash_mb_s is None:
-            return self.why
-        return (
-            f"{self.why}; high also fetches code and model from the serial flash again for every computed sample, at "
-            f"{self.flash_mb_s:g} MB/s, as if its cache had kept nothing (in RAM they never are)"
-        )
+    cache_kb: int = 0
+    model_in_flash: bool = True
 
 
 @cache
@@ -65,13 +62,30 @@ def cores() -> tuple[Core, ...]:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimated time of one step on a core in ms, as a lower and an upper bound; ``step_ms`` is the time available."""
+    """Estimated time and energy of one step on a core; ``step_ms`` is the time available.
+
+    The core alone needs between ``low_ms`` and ``core_ms``; fetching code and model from the flash adds up to
+    ``flash_ms``. ``call_ms`` is what the longest call of ``plush_push`` takes at most, with its share of fetching.
+    """
 
     core: Core
     instructions: int
     step_ms: float
     low_ms: float
-    high_ms: float
+    core_ms: float
+    flash_ms: float
+    call_ms: float
+
+    @property
+    def high_ms(self) -> float:
+        """Upper bound of the time in ms, with fetching."""
+        return self.core_ms + self.flash_ms
+
+    @property
+    def energy_uj(self) -> tuple[float, float]:
+        """Lower and upper bound of the energy of a step in microjoules: time x voltage x current of the datasheet."""
+        low, high = (self.core.volts * ma for ma in self.core.ma)
+        return self.low_ms * low, self.high_ms * high
 
     @property
     def fits(self) -> str:
@@ -111,30 +125,50 @@ class Estimate:
             "flash_mb_s": core.flash_mb_s,
             "low": round(self.low_ms, 3),
             "high": round(self.high_ms, 3),
+            "of_it_flash": round(self.flash_ms, 3),
+            "longest_call": round(self.call_ms, 3),
+            "energy_uj": [round(uj, 1) for uj in self.energy_uj],
+            "volts": core.volts,
+            "current_ma": list(core.ma),
+            "current_source": core.power,
             "fits": self.fits,
             "verdict": self.verdict,
-            "why": core.reasons,
+            "why": core.why,
         }
 
 
-def estimate(core: Core, instructions: int, flash_bytes: int, samples: int, step_ms: float) -> Estimate:
-    """Estimate the time of a step that computes ``samples``; a serial flash adds reading ``flash_bytes`` per sample to
-    the upper bound.
+def estimate(core: Core, cost: Cost, arch: Arch, step_ms: float) -> Estimate | None:
+    """Estimate the time of a step on a core from its counts; None if there are none.
+
+    A serial flash adds fetching what runs and is read (`Cost.running_bytes`): once for each frame of a step, as other
+    code may run between two of them. A window network computes its window in one call, which fetches everything once if
+    the cache is large enough, else for each sample of the window.
     """
-    low = instructions * core.cycles_low / core.mhz / 1000
-    high = instructions * core.cycles_high / core.mhz / 1000
+    if cost.step is None or cost.call_bound is None:
+        return None
+    low, high = (cost.step * cycles / core.mhz / 1000 for cycles in (core.cycles_low, core.cycles_high))
+    once = flash = 0.0
     if core.flash_mb_s is not None:
-        high += samples * flash_bytes / core.flash_mb_s / 1000
-    return Estimate(core, instructions, step_ms, low, high)
+        running = cost.running_bytes(with_model=core.model_in_flash)
+        once = running / core.flash_mb_s / 1000
+        if arch.padding != "stream" and running > core.cache_kb * 1024:
+            once *= arch.span
+        flash = once if arch.padding != "stream" else once * arch.step
+    call = cost.call_bound * core.cycles_high / core.mhz / 1000 + once
+    return Estimate(core, cost.step, step_ms, low, high, flash, call)
 
 
 STEPS, WINDOW_STEPS = 50, 5  # number of decisions whose instructions are counted; of window networks
+_STRESS = 100  # frames
 STAGES = ("health", "inputs", "gate", "network", "dense", "decision", "events", "pooling")
 _HEAP = ("malloc", "calloc", "realloc", "free", "reallocarray", "aligned_alloc", "sbrk", "_sbrk", "_Znw", "_Zna")
 # Helper functions of compilers for floating point: __addsf3, __mulsf3, __floatsidf, __aeabi_fadd, __aeabi_i2d …
 _FLOAT = re.compile(r"^__(\w*[sdt]f\d?$|float|fix|aeabi_[fd](?!iv)|aeabi_u?[il]2[fd])")
+# Instructions of Arm, Xtensa, RISC-V and x86 that change the state of interrupts or wait.
+_MASKING = re.compile(r"\t(cpsi[de]|msr|rsil|[wx]sr(?:\.\w+)?|waiti|csr[rwsc]\w*|wfi|wfe|cli|hlt)\b")
 _SECTIONS = {"text": (".text", ".literal"), "rodata": (".rodata", ".srodata"), "data": (".data", ".sdata")}
 _SECTIONS["bss"] = (".bss", ".sbss")
+_SECTIONS["cold"] = (".text.unlikely", ".literal.unlikely")  # part of text: where gcc puts what it compiles for size
 
 
 @dataclass(frozen=True)
@@ -142,10 +176,12 @@ class Cost:
     """Cost on one target in instructions and bytes; counts are None if the target does not count (the host).
 
     ``step`` is the mean over `steps_of` decisions with frames up to a fifth of a period early or late, ``step_most``
-    their maximum, ``even`` the mean with even time stamps; ``gap`` is a call that bridges the longest gap. ``stages``
-    add up to ``step``: ``clock`` (with the check of values) is the remainder, ``gate`` is 0 for a model without one.
-    ``stack_push``, ``stack_begin`` and ``stack_memory_bytes`` are the stack depths of these functions, without a
-    callback; ``stack_functions`` is the stack frame of each function as the compiler reports it.
+    their maximum, ``even`` the mean with even time stamps; ``gap`` is a call that bridges the longest gap.
+    ``call_most`` is the longest call of ``plush_push`` that was seen, also with readings at the ends of their ranges,
+    ``call_bound`` a bound of it (`_bound`). ``stages`` add up to ``step``: ``clock`` (with the check of values) is the
+    remainder, ``gate`` is 0 for a model without one. ``stack_push``, ``stack_begin`` and ``stack_memory_bytes`` are the
+    stack depths of these functions, without a callback; ``stack_functions`` is the stack frame of each function as the
+    compiler reports it. ``masking`` are the instructions that switch interrupts off or wait for one.
     """
 
     target: str
@@ -153,6 +189,8 @@ class Cost:
     step_most: int | None
     even: int | None
     gap: int | None
+    call_most: int | None
+    call_bound: int | None
     begin: int | None
     stages: Mapping[str, int]
     sections: Mapping[str, Mapping[str, int]]
@@ -163,11 +201,18 @@ class Cost:
     stack_memory_bytes: int | None
     stack_functions: Mapping[str, int]
     needs: tuple[str, ...]
+    masking: tuple[str, ...]
 
     @property
     def flash_bytes(self) -> int:
         """Bytes of code, tables and model."""
         return sum(part[name] for part in self.sections.values() for name in ("text", "rodata", "data"))
+
+    def running_bytes(self, *, with_model: bool = True) -> int:
+        """Return the bytes that ``plush_push`` may run and read: all but the code of ``plush_begin`` and its like."""
+        code, model = (self.sections[name] for name in ("plushsense", "plush_model"))
+        own = code["text"] - code["cold"] + code["rodata"] + code["data"]
+        return own + (model["rodata"] + model["data"] if with_model else 0)
 
     @property
     def ram_bytes(self) -> int:
@@ -193,6 +238,8 @@ class Cost:
             "instructions_per_step_most": self.step_most,
             "instructions_per_step_even": self.even,
             "instructions_longest_call": self.gap,
+            "instructions_call_most": self.call_most,
+            "instructions_call_bound": self.call_bound,
             "instructions_begin": self.begin,
             "stages": dict(self.stages),
             "sections": {name: dict(part) for name, part in self.sections.items()},
@@ -205,6 +252,7 @@ class Cost:
             "stack_memory_bytes_call": self.stack_memory_bytes,
             "stack_functions": dict(self.stack_functions),
             "needs": list(self.needs),
+            "interrupts_off": list(self.masking),
             "heap": list(self.heap),
             "floating_point": list(self.floats),
         }
@@ -222,11 +270,11 @@ def count(
         BadInput: if there are too few golden frames.
     """
     code = code or folder
-    even, jittered = _streams(folder, facts)
+    even, jittered, stress = _streams(folder, facts)
     with tempfile.TemporaryDirectory(prefix="plushsense-profile-") as temporary:
         work = Path(temporary)
-        blobs = {"EVEN": work / "even", "JITTERED": work / "jittered"}
-        for frames, file in zip((even, jittered), blobs.values(), strict=True):
+        blobs = {name: work / name.lower() for name in ("EVEN", "JITTERED", "STRESS")}
+        for frames, file in zip((even, jittered, stress), blobs.values(), strict=True):
             file.write_bytes(frames.astype("<i4").tobytes())
         sources = [C_FOLDER / "profile.c", code / MODEL[1]]
         same = partial(build, target, include=[code], optimise=optimise, blobs=blobs)
@@ -234,9 +282,11 @@ def count(
         head, rows_even, rows_jittered = _whole(whole, facts)
         counts = TARGETS[target].counts
         stages: dict[str, int] = {}
+        bound = None
         if counts:
             staged = same(sources, work / "stages", defines={"PLUSH_STAGES": 1})
             rows = np.frombuffer(staged.run(), dtype="<i4").astype(np.int64).reshape(-1, len(STAGES))
+            bound, rows = _bound(rows[-2], rows[-1], int(facts["step"])), rows[:-2]
             stages = {name: _mean(rows[:, i]) for i, name in enumerate(STAGES)}
             stages = {"clock": _mean(rows_jittered[:-1, 0]) - sum(stages.values()), **stages}
         objects = {"plushsense": whole.objects[2], "plush_model": whole.objects[1]}
@@ -246,6 +296,8 @@ def count(
             "step_most": int(steps.max()),
             "even": _mean(rows_even[:, 0]),
             "gap": int(rows_jittered[-1, 1]),
+            "call_most": max(head[6], int(rows_jittered[:, 1].max())),
+            "call_bound": bound,
             "begin": head[2],
             "stack_memory_bytes": head[3],
             "stack_begin": head[4],
@@ -260,6 +312,7 @@ def count(
             memory_bytes=head[1],
             stack_functions=_stack_usage(objects["plushsense"].with_suffix(".su")),
             needs=_needs(target, objects["plushsense"]),
+            masking=_masking(target, objects["plushsense"]),
         )
 
 
@@ -272,11 +325,28 @@ def _mean(counts: Ints) -> int:
     return round(float(counts.mean()))
 
 
-def _streams(folder: Path, facts: Mapping[str, Any]) -> tuple[Ints, Ints]:
-    """Return frames at even times, and the same readings with jitter and the longest bridged gap at the end.
+def _bound(most: Ints, least: Ints, step: int) -> int:
+    """Return a bound of the instructions of one call of ``plush_push``, without callbacks, from those of its parts.
 
-    The readings are touches near the beginning of the golden frames, which have no faults. The counted part begins and
-    ends with a frame without jitter, so that it contains a whole number of samples. The gap completes a step.
+    The call reads one frame, forgets the past at most once, and interpolates, reads and passes through gate and network
+    as many samples as the longest gap of the model asks for, with the answers that fall due: these numbers follow from
+    the image. ``most`` and ``least`` (8,) are the counts of each part over forced states (`count_parts` in profile.c),
+    of the network for several samples together; the last columns are the samples of the gap, and how many were counted
+    together. Each part is taken as its most and, as no forced state need be the worst, once more what it varies by; the
+    network also with what rounding and the turns of its rings may add.
+    """
+    frame, forget, *sample, network, answer = (2 * most[:-1] - least[:-1]).tolist()
+    samples, together = int(most[-1]), int(least[-1])
+    answers = -(-samples // step)
+    return int(frame + forget + samples * sum(sample) + -(-samples // together) * network + answers * answer)
+
+
+def _streams(folder: Path, facts: Mapping[str, Any]) -> tuple[Ints, Ints, Ints]:
+    """Return frames at even times, the same readings with jitter and the longest bridged gap at the end, and stress.
+
+    The latter are readings at the ends of all golden frames, valid or not, mostly after gaps. The other readings are
+    touches near the beginning of the golden frames, which have no faults. Their counted part begins and ends with a
+    frame without jitter, so that it contains a whole number of samples. The gap completes a step.
     """
     span, step, period_us = int(facts["span"]), int(facts["step"]), int(facts["period_us"])
     gap_ms = int(facts["gap_ms"])
@@ -292,11 +362,16 @@ def _streams(folder: Path, facts: Mapping[str, Any]) -> tuple[Ints, Ints]:
     even = np.column_stack([at_us // 1000, values])
     jittered = np.column_stack([(at_us + jitter) // 1000, values])
     last = np.concatenate([[jittered[-1, 0] + gap_ms], values[0]])
-    return even, np.vstack([jittered, last])
+    rng = np.random.default_rng(6)
+    ends = np.stack([clean.min(axis=0), clean.max(axis=0), frames[:, 1:].min(axis=0), frames[:, 1:].max(axis=0)])
+    which = rng.choice(4, (_STRESS, clean.shape[1]), p=[0.49, 0.49, 0.01, 0.01])
+    waits = rng.choice([0, period_us // 1000, gap_ms - 1, gap_ms, gap_ms + 1], _STRESS, p=[0.05, 0.2, 0.2, 0.54, 0.01])
+    stress = np.column_stack([1000 + np.cumsum(waits), np.take_along_axis(ends, which, axis=0)])
+    return even, np.vstack([jittered, last]), stress
 
 
 def _whole(program: Program, facts: Mapping[str, Any]) -> tuple[list[int], Ints, Ints]:
-    """Run the program; return its six numbers about the toy, and a table of the steps of each stream.
+    """Run the program; return its seven numbers about the toy, and a table of the steps of each stream.
 
     The tables, even (n, 3) and jittered (n + 1, 3), omit the first decision; the latter ends with the gap.
     """
@@ -305,7 +380,7 @@ def _whole(program: Program, facts: Mapping[str, Any]) -> tuple[list[int], Ints,
         raise ProgramError(
             f"The C in the export refuses its own model on {program.target.name}: export the model again."
         )
-    table = numbers[6:].reshape(-1, 3)
+    table = numbers[7:].reshape(-1, 3)
     first = int(np.flatnonzero(table[:, 2] == 2)[0])
     even, jittered = (part[part[:, 2] == 1][1:] for part in (table[:first], table[first + 1 : -1]))
     n = steps_of(facts)
@@ -314,7 +389,7 @@ def _whole(program: Program, facts: Mapping[str, Any]) -> tuple[list[int], Ints,
             f"The C in the export gave {len(even)} answers on {program.target.name} where {n} steps of {facts['step']} "
             "samples should: plushsense verify shows where it goes wrong."
         )
-    return numbers[:6].tolist(), even, jittered
+    return numbers[:7].tolist(), even, jittered
 
 
 def _sections(target: str, file: Path) -> dict[str, int]:
@@ -334,6 +409,12 @@ def _needs(target: str, file: Path) -> tuple[str, ...]:
     return tuple(sorted(words[-1] for line in lines if (words := line.split())))
 
 
+def _masking(target: str, file: Path) -> tuple[str, ...]:
+    """Return the instructions of an object file that switch interrupts off, or wait for one."""
+    listing = tool_output([tool(target, "objdump"), "-d", str(file)])
+    return tuple(sorted({match[1] for match in _MASKING.finditer(listing)}))
+
+
 def _stack_usage(file: Path) -> dict[str, int]:
     """Read each function's stack frame from the compiler's report, largest first; raise BadInput for a dynamic one."""
     frames: dict[str, int] = {}
@@ -345,6 +426,10 @@ def _stack_usage(file: Path) -> dict[str, int]:
     return dict(sorted(frames.items(), key=lambda item: -item[1]))
 
 
+FETCHING = (
+    "flash: what runs and is read is fetched again for every frame, as if other code had emptied the cache since the "
+    "frame before; in RAM (IRAM_ATTR, or a section that your linker copies) nothing is fetched."
+)
 SUMMARY = (
     "Instructions are counted on emulators and exact. Times are estimates from them, between two bounds: nothing ran "
     "on a real chip."
@@ -462,10 +547,9 @@ def profile(
             progress(done, len(installed))
             costs[name] = count(folder, name, facts, optimise, code=code)
     progress(len(installed), len(installed))
-    samples = arch.step if arch.padding == "stream" else arch.span
     estimates = {
-        core.name: estimate(core, cost.step, cost.flash_bytes, samples, float(facts["step_ms"]))
+        core.name: found
         for core in cores()
-        if (cost := costs.get(core.target)) is not None and cost.step is not None
+        if core.target in costs and (found := estimate(core, costs[core.target], arch, float(facts["step_ms"])))
     }
     return Profile(facts, arch, optimise, costs, estimates, missing)

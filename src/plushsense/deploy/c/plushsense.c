@@ -20,17 +20,22 @@
 #define INPUT_BYTES 12u     /* offset, bias, multiplier and two shifts of one channel of the network */
 #define LOGIT_LIMIT 16384
 #define SPARE 4u            /* rows for new samples, before those under the taps move */
+#define RING 92u            /* words: see checksum() */
 #define WEIGHT_ZERO 128u    /* weights are stored with this added: some cores cannot load a signed byte */
 
-/* Not copied to where it is called: for the registers of a loop, or for the flash. */
+/* Not copied to where it is called: for the registers of a loop, or for the flash; or copied, for the same registers. */
 #if defined(__GNUC__)
 #define PLUSH_APART __attribute__((noinline)) PLUSH_CODE
 #define PLUSH_SMALL_APART __attribute__((noinline, cold))
+#define PLUSH_COPIED __inline__ __attribute__((always_inline))
 #define PLUSH_SMALL __attribute__((cold)) /* compiled for size */
+#define PLUSH_ALIGNED(p) (const uint8_t *)__builtin_assume_aligned(p, 4)
 #else
 #define PLUSH_APART PLUSH_CODE
 #define PLUSH_SMALL_APART
+#define PLUSH_COPIED
 #define PLUSH_SMALL
+#define PLUSH_ALIGNED(p) (p)
 #endif
 
 /* Where the code of a step, and its tables, are placed: nothing, or an attribute such as IRAM_ATTR and DRAM_ATTR. */
@@ -253,15 +258,71 @@ static uint32_t word_at(const uint8_t *p)
 
 /* ---- The model ------------------------------------------------------------------------------------------------- */
 
-PLUSH_SMALL static uint32_t checksum(const uint8_t *bytes, uint32_t n) /* CRC-32, as zip and Ethernet have it */
+/* CRC-32 of four bytes more, or of the lowest one of them. */
+PLUSH_COPIED
+static uint32_t checksum_of(uint32_t sum, uint32_t bytes)
 {
-    uint32_t sum = UINT32_MAX, bit;
+    static const uint32_t table[16] = {
+        UINT32_C(0x00000000), UINT32_C(0x1db71064), UINT32_C(0x3b6e20c8), UINT32_C(0x26d930ac),
+        UINT32_C(0x76dc4190), UINT32_C(0x6b6b51f4), UINT32_C(0x4db26158), UINT32_C(0x5005713c),
+        UINT32_C(0xedb88320), UINT32_C(0xf00f9344), UINT32_C(0xd6d6a3e8), UINT32_C(0xcb61b38c),
+        UINT32_C(0x9b64c2b0), UINT32_C(0x86d3d2d4), UINT32_C(0xa00ae278), UINT32_C(0xbdbdf21c)
+    };
 
-    for (; n > 0; n--) {
-        sum ^= *bytes++;
-        for (bit = 0; bit < 8; bit++)
-            sum = (sum >> 1) ^ ((sum & 1u) != 0 ? UINT32_C(0xedb88320) : 0u);
+    for (; bytes > 0; bytes--) {
+        sum = (sum >> 4) ^ table[sum & 15u];
+        sum = (sum >> 4) ^ table[sum & 15u];
     }
+    return sum;
+}
+
+/* CRC-32, as zip and Ethernet have it. Its polynomial P divides y^89 + y^88 + y^41 + y^36 + y^16 + y^13 + y^5 + 1, for y = x
+ * and so for y = x^32, because P(y)^32 = P(y^32) where 1 + 1 = 0. So a word can be taken out of the bytes if it is added to
+ * the words 1, 48, 53, 73, 76, 84 and 89 places after it: 17 instructions, where division takes 160 and a table of a
+ * kilobyte 24. `past` holds the words that were taken out last, each twice, so that the 89 before any word stand in a row. */
+PLUSH_SMALL_APART
+static uint32_t checksum(const uint8_t *bytes, uint32_t n)
+{
+    const uint8_t *words;
+    uint32_t past[2 * RING], *at = past, sum = UINT32_MAX, word = 0, left;
+
+#define PLUSH_WORD(i)                                                                                           \
+    (word ^ le32(words + 4 * (i)) ^ at[(i) + RING - 48] ^ at[(i) + RING - 53] ^ at[(i) + RING - 73] ^           \
+     at[(i) + RING - 76] ^ at[(i) + RING - 84] ^ at[(i) + RING - 89])
+#define PLUSH_TAKE_OUT(i) at[i] = at[(i) + RING] = word = PLUSH_WORD(i)
+    memset(past, 0, sizeof past);
+    for (; n > 0 && (uintptr_t)bytes % 4u != 0; n--)
+        sum = checksum_of(sum ^ *bytes++, 1);
+    words = PLUSH_ALIGNED(bytes);
+    left = n / 4u;
+    if (left > 89u) {
+        word = sum;
+        sum = 0;
+    }
+    while (left >= 89u + 4u) {
+        const uint32_t *end = past + (left < 89u + RING ? (left - 89u) / 4u * 4u : RING);
+
+        left -= (uint32_t)(end - past);
+        for (at = past; at != end; at += 4, words += 16) {
+            PLUSH_TAKE_OUT(0);
+            PLUSH_TAKE_OUT(1);
+            PLUSH_TAKE_OUT(2);
+            PLUSH_TAKE_OUT(3);
+        }
+    }
+    for (; left > 0; left--, at++, words += 4) {
+        if (at == past + RING)
+            at = past;
+        PLUSH_TAKE_OUT(0);
+        if (left <= 89u) { /* it stays in */
+            sum = checksum_of(sum ^ word, 4);
+            at[0] = at[RING] = word = 0;
+        }
+    }
+#undef PLUSH_TAKE_OUT
+#undef PLUSH_WORD
+    for (n %= 4u; n > 0; n--)
+        sum = checksum_of(sum ^ *words++, 1);
     return ~sum;
 }
 
@@ -271,7 +332,7 @@ static plush_status check(const uint8_t *model, uint32_t bytes, const char *magi
 {
     if (model == NULL || bytes < HEAD_BYTES || memcmp(model, magic, 4) != 0)
         return PLUSH_NOT_A_MODEL;
-    if (le16(model + 4) != PLUSH_IMAGE_VERSION)
+    if (word_at(model + 4) != PLUSH_IMAGE_VERSION) /* 16 bits, and 16 zeros */
         return PLUSH_OTHER_VERSION;
     if (word_at(model + 8) > bytes || word_at(model + 8) <= HEAD_BYTES ||
         checksum(model + HEAD_BYTES, word_at(model + 8) - HEAD_BYTES) != word_at(model + 12))
@@ -2127,17 +2188,12 @@ PLUSH_SMALL static void forget(plush_toy *toy)
 
 /* ---- What others call ------------------------------------------------------------------------------------------ */
 
-/* A toy with this model and memory. Nothing is written to the memory; a toy of which this does not say PLUSH_OK is of no
- * use. */
+/* A toy with this model, which check() found good, and memory. Nothing is written to the memory; a toy of which this does
+ * not say PLUSH_OK is of no use. */
 PLUSH_SMALL_APART
-static plush_status prepare(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
-                            uint32_t memory_bytes)
+static plush_status prepare(plush_toy *toy, const uint8_t *model, void *memory, uint32_t memory_bytes)
 {
-    plush_status status = check(model, model_bytes, "PLSH");
-
     memset(toy, 0, sizeof *toy);
-    if (status != PLUSH_OK)
-        return status;
     if ((uintptr_t)model % GROUP != 0)
         return PLUSH_NOT_ALIGNED;
     if (!read_model(toy, model))
@@ -2149,12 +2205,19 @@ static plush_status prepare(plush_toy *toy, const uint8_t *model, uint32_t model
     return PLUSH_OK;
 }
 
-PLUSH_SMALL uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes)
+/* By itself, as take_over() below, so that the stack never holds a toy and the words of checksum() together. */
+PLUSH_SMALL_APART
+static uint32_t bytes_needed(const uint8_t *model)
 {
     plush_toy toy;
 
     /* Without memory, only that can be wrong with a good model. */
-    return prepare(&toy, model, model_bytes, NULL, 0) == PLUSH_MEMORY_TOO_SMALL ? share_out(&toy, NULL) : 0;
+    return prepare(&toy, model, NULL, 0) == PLUSH_MEMORY_TOO_SMALL ? share_out(&toy, NULL) : 0;
+}
+
+PLUSH_SMALL uint32_t plush_memory_bytes(const uint8_t *model, uint32_t model_bytes)
+{
+    return check(model, model_bytes, "PLSH") == PLUSH_OK ? bytes_needed(model) : 0;
 }
 
 PLUSH_APART
@@ -2170,19 +2233,21 @@ void plush_restart(plush_toy *toy)
 PLUSH_SMALL plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                          uint32_t memory_bytes)
 {
-    plush_status status = prepare(toy, model, model_bytes, memory, memory_bytes);
+    plush_status status = check(model, model_bytes, "PLSH");
 
+    if (status == PLUSH_OK)
+        status = prepare(toy, model, memory, memory_bytes);
     if (status != PLUSH_OK)
         memset(toy, 0, sizeof *toy);
     plush_restart(toy);
     return status;
 }
 
-PLUSH_SMALL plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
-                        uint32_t memory_bytes)
+PLUSH_SMALL_APART
+static plush_status take_over(plush_toy *toy, const uint8_t *model, void *memory, uint32_t memory_bytes)
 {
     plush_toy next;
-    plush_status status = prepare(&next, model, model_bytes, memory, memory_bytes);
+    plush_status status = prepare(&next, model, memory, memory_bytes);
 
     if (status != PLUSH_OK)
         return status;
@@ -2193,6 +2258,14 @@ PLUSH_SMALL plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32
     *toy = next;
     plush_restart(toy);
     return PLUSH_OK;
+}
+
+PLUSH_SMALL plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
+                        uint32_t memory_bytes)
+{
+    plush_status status = check(model, model_bytes, "PLSH");
+
+    return status == PLUSH_OK ? take_over(toy, model, memory, memory_bytes) : status;
 }
 
 PLUSH_SMALL uint32_t plush_model_id(const plush_toy *toy)
@@ -2255,14 +2328,18 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
             lose(toy, ms);
         forget(toy);
     }
+    toy->reading = PLUSH_READING_FAULT;
     if (toy->faulty)
         return 0;
     toy->heard = 1;
+    toy->reading = PLUSH_READING_WAITING;
     if (toy->running)
         memcpy(toy->before, toy->held, 4u * toy->channels);
     if (!hold(toy, values))
         return 0;
+    toy->reading = PLUSH_READING_USED;
     if (!toy->running) {
+        toy->reading = PLUSH_READING_FIRST;
         toy->running = 1;
         toy->last_ms = ms;
         toy->due = toy->period;

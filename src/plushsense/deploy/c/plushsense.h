@@ -22,6 +22,13 @@
  * runs backwards (also when it wraps after 2^32 ms), everything remembered is dropped: the toy is warming again. What
  * was going on ends then, with the next reading; if none may ever come, call plush_silence() when you miss it.
  *
+ * Time has steps of 1 ms. A reading is taken to be up to 1 ms older than it is; of readings every 10 ms with stamps that are
+ * cut to whole ms, a movement of 3 Hz differs by 0.5 % of its size (rms), one of 10 Hz by 1.6 %, and stamps of a timer that
+ * ticks in whole ms by nothing. Recordings have the same steps, so the network has learned from such data.
+ *
+ * plush_push() takes its time where it is called: mostly that of one sample, after a gap that of all samples of the gap.
+ * `plushsense profile` says how much at most. It switches no interrupt off and waits for nothing.
+ *
  * Sensors that cannot be believed (values out of range, stuck at an end, all frozen) are a fault: the event that is
  * going on ends, readings are passed over (PLUSH_FAULT), and after a while of good ones everything begins again.
  */
@@ -64,6 +71,16 @@ typedef enum {
     PLUSH_AFFECT_NEUTRAL = 2,
     PLUSH_AFFECT_NEGATIVE = 3
 } plush_affect;
+
+/* What became of the newest reading: why plush_push() returned what it did. Below PLUSH_READING_FIRST it was not used, and
+ * no answer fell due. */
+typedef enum {
+    PLUSH_READING_NONE = 0,     /* there was none yet; or no model is running, because plush_begin() has not said PLUSH_OK */
+    PLUSH_READING_WAITING = 1,  /* some channel has had no valid value yet since the start or the last restart */
+    PLUSH_READING_FAULT = 2,    /* passed over: the sensors cannot be believed */
+    PLUSH_READING_FIRST = 3,    /* used as the first of a stream: after the start, a gap, a clock that ran backwards, a fault */
+    PLUSH_READING_USED = 4      /* used to go on; 0 answers fell due unless it completed a step */
+} plush_reading;
 
 /* What an answer is worth. */
 typedef enum {
@@ -130,7 +147,7 @@ typedef struct {
     uint32_t *tap_sums;     /* for each of the next `dilation` samples: sum of the activations already under its taps */
 } plush_layer;
 
-/* A toy: everything about one stream. Fields from `answer` to `suspect` may be read, none may be written. */
+/* A toy: everything about one stream. Fields from `answer` to `reading` may be read, none may be written. */
 typedef struct plush_toy {
     plush_answer answer;     /* the newest one; its `state` is that of the toy at any time */
     plush_event event;       /* the newest thing that happened to an event */
@@ -139,6 +156,7 @@ typedef struct plush_toy {
     uint32_t invalid;        /* values out of their valid range, for which the last valid one stood in */
     uint32_t faults;         /* how often sensors could not be believed */
     uint8_t suspect;         /* the newest frame is in doubt: no event begins on it */
+    uint8_t reading;         /* what became of the newest one: a plush_reading */
 
     /* Called with every answer, and with everything that happens to an event, also when one frame completes several;
      * may be NULL. Set them after plush_begin(). They may read the toy, but call no function that changes it
@@ -232,7 +250,8 @@ plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_by
  * this says PLUSH_OK, neither the toy nor any memory has changed, and the old model goes on. Then what is going on ends,
  * which on_event is told as ever, by the old model; callbacks and counts stay; the toy is warming, as after
  * plush_begin(). `memory` may be that of the old model. Until PLUSH_OK the old model's bytes must stay where they are:
- * receive the new ones somewhere else. Needs a plush_toy on the stack. A checksum finds damage, not forgery. */
+ * receive the new ones somewhere else. Needs a kilobyte of stack, as plush_begin() does. A checksum finds damage, not
+ * forgery. */
 plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
                         uint32_t memory_bytes);
 
@@ -243,7 +262,8 @@ plush_status plush_swap(plush_toy *toy, const uint8_t *model, uint32_t model_byt
 plush_status plush_patch(plush_toy *toy, const uint8_t *patch, uint32_t patch_bytes);
 
 /* Takes the readings of one moment in: `ms` is the toy's own clock, `values` the measured channels in the order of
- * the layout. Returns how many answers fell due, mostly 0 or 1; the newest is in toy->answer. */
+ * the layout. Returns how many answers fell due, mostly 0 or 1; the newest is in toy->answer. Where that is 0,
+ * toy->reading tells why. */
 uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values);
 
 /* No reading came for a while (your program knows best how long that is): what is going on ends. The next reading goes
