@@ -25,8 +25,11 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import urlsplit
 
+from plushsense.deploy import profile
+from plushsense.deploy.proof import verify
 from plushsense.studio.app import jobs
 from plushsense.studio.app.shell import PAGES
+from support.kept_objects import keeping
 
 if TYPE_CHECKING:
     from playwright.sync_api import BrowserContext, Page, Request
@@ -60,6 +63,7 @@ _FORKING.set_forkserver_preload(
         *(f"plushsense.studio.pages.{name}.page" for name in PAGES),
         *("plushsense.studio.tasks", "plushsense.training.fit", "plushsense.experiments.search.run"),
         *("plushsense.trials.budget", "plushsense.trials.estimate", "plushsense.reports.figures"),
+        *("mlcroissant", "frictionless", "rocrate.rocrate", "datacite", "sklearn.ensemble"),
     ]
 )
 
@@ -69,6 +73,8 @@ class ForkedTask:
 
     requests: socket.socket
     """To the process that forks tasks."""
+    objects: Path | None = None
+    """A folder for object files of C, which tests share."""
 
     def __init__(self, words: list[str], **how: object) -> None:
         assert words[1:] == ["-m", "plushsense.studio.tasks"]
@@ -124,6 +130,9 @@ def _run_task(words: int, messages: int, ended: int) -> None:
         open(n, mode, encoding="utf-8", closefd=False) for n, mode in enumerate(("r", "w", "w"))
     )
     setattr(os, "cpu_count", lambda: 1)  # noqa: B010
+    if ForkedTask.objects is not None:
+        for module in (profile, verify):
+            setattr(module, "build", keeping(ForkedTask.objects))  # noqa: B010
     try:
         main()
         sys.stdout.flush()
@@ -132,7 +141,13 @@ def _run_task(words: int, messages: int, ended: int) -> None:
 
 
 def _run_studio(
-    words: list[str], folder: str, out: Connection, errors: Connection, open_files: int, without: tuple[str, ...]
+    words: list[str],
+    folder: str,
+    out: Connection,
+    errors: Connection,
+    open_files: int,
+    without: tuple[str, ...],
+    objects: Path | None,
 ) -> None:
     """Run ``plushsense studio`` in this process, with its output to two pipes."""
     import resource
@@ -143,6 +158,7 @@ def _run_studio(
     for name in [k for k in os.environ if k.startswith(("NICEGUI_", "PYTEST_"))]:
         del os.environ[name]
     os.chdir(folder)
+    ForkedTask.objects = objects
     ForkedTask.prepare()
     # NiceGUI does not serve from what it takes for the process of a pool.
     multiprocessing.current_process().name = "MainProcess"
@@ -184,6 +200,8 @@ class Studio:
     """The limit on its open files; 0: the tests' own."""
     without: tuple[str, ...] = ()
     """Modules that it shall not find."""
+    objects: Path | None = None
+    """Where its tasks find and keep object files of C."""
     _pipes: list[Connection] = field(default_factory=list)
 
     def start(self) -> Studio:
@@ -193,7 +211,7 @@ class Studio:
         out, its_out = _FORKING.Pipe(duplex=False)
         errors, its_errors = _FORKING.Pipe(duplex=False)
         self._pipes = [out, errors]
-        arguments = (words, str(self.home.parent), its_out, its_errors, self.open_files, self.without)
+        arguments = (words, str(self.home.parent), its_out, its_errors, self.open_files, self.without, self.objects)
         self.process = _FORKING.Process(target=_run_studio, args=arguments)
         self.process.start()
         its_out.close()
