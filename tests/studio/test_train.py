@@ -101,6 +101,8 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     here.kill()
     assert not (home / "bundles" / "by page.plush").exists()
     other.close()
+    # A page that finds the studio again loads itself, which would cancel the loading below.
+    page.goto("about:blank")
     here.start()
     page.goto(f"{here.url}/train")
     state(page, "stopped")

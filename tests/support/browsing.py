@@ -47,7 +47,7 @@ CHROMIUM = [
     "--disable-sync",
 ]
 _PROGRAMS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-_START_S = 60.0
+_START_S = 120.0
 _WAIT_MS = 60_000
 _SETTLE_MS = 200
 _POLL_MS = 25
