@@ -33,6 +33,7 @@ def dotted(module: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+@cache
 def definitions() -> list[tuple[Path, Definition]]:
     kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
     return [(module, node) for module in MODULES for node in ast.walk(tree(module)) if isinstance(node, kinds)]

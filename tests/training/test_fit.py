@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +14,11 @@ from plushsense.core.errors import TrainingError
 from plushsense.jobs.journal import Journal
 from plushsense.models.arch import Arch
 from plushsense.models.reference import Network
-from plushsense.training.engine import FitState
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 
 torch = pytest.importorskip("torch", reason="PyTorch is not installed (extra train)")
+from plushsense.training.engine import Adam, FitState
 from plushsense.training.fit import fit, predict, with_hard_negatives
 
 Make = Callable[..., WindowSet]
@@ -53,6 +54,35 @@ def test_the_same_seed_gives_the_same_weights_and_leaves_the_global_seed_alone(m
     assert all(np.array_equal(first.weights[name], again.weights[name]) for name in first.weights)
     assert first.history == again.history
     assert not np.array_equal(first.weights["dense.weight"], other.weights["dense.weight"])
+
+
+@pytest.mark.parametrize("fused", [True, None])
+def test_adam_follows_its_formula(fused: bool | None) -> None:
+    parameter = torch.arange(6.0).reshape(2, 3)
+    adam, expected = Adam([parameter], fused=fused), parameter.numpy().astype(float)
+    mean, square = np.zeros((2, 3)), np.zeros((2, 3))
+    for t in range(1, 21):
+        gradient = np.random.default_rng(t).normal(size=(2, 3)).astype(np.float32)
+        parameter.grad = torch.from_numpy(gradient)
+        rate = 0.1 / t
+        adam.step(rate)
+        mean, square = 0.9 * mean + 0.1 * gradient, 0.999 * square + 0.001 * gradient**2
+        expected -= rate * (mean / (1 - 0.9**t)) / (np.sqrt(square / (1 - 0.999**t)) + 1e-8)
+        assert adam.steps == t
+        assert parameter.numpy() == pytest.approx(expected, abs=1e-5)
+        assert adam.means[0].numpy() == pytest.approx(mean, abs=1e-5)
+        assert adam.squares[0].numpy() == pytest.approx(square, abs=1e-5)
+    adam.zero_grad()
+    assert parameter.grad is None
+
+
+@pytest.mark.parametrize("norm", ["batch", "layer"])
+def test_training_does_not_import_the_compiler_of_pytorch(
+    made: Make, norm: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would take more than a second, and 100 MB."""
+    monkeypatch.setitem(sys.modules, "torch._dynamo", None)
+    assert len(fit(made(60), None, arch(norm=norm), replace(SPEC, epochs=1)).history) == 1
 
 
 @pytest.mark.parametrize("stop_on", ["loss", "accuracy"])

@@ -8,10 +8,10 @@ PyTorch's layers and gradients for everything else: layer normalisation, ``causa
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from plushsense.training.spec import TrainSpec
 import torch  # isort: skip - after models.net, which says how to install it
 from torch import Tensor
 from torch.nn import functional as F
+from torch.optim.adam import adam
 
 _WEIGHT, _MEAN, _SQUARE, _KEPT, _BEST = "weight:", "mean:", "square:", "kept:", "best:"
 
@@ -232,6 +233,58 @@ def engine(arch: Arch, net: Net, device: torch.device, batch: int, threads: int)
         threads: number of threads on the CPU.
     """
     return Fast(net, batch, threads) if is_fast(arch, device) else Plain(net, device)
+
+
+class Adam:
+    """Update parameters by Adam (Kingma & Ba 2015) with PyTorch's own step, as `torch.optim.Adam` does.
+
+    That class first imports PyTorch's compiler, which takes more than a second and 100 MB. ``means`` and ``squares``
+    are the moments of each parameter; both are empty before the first step.
+    """
+
+    def __init__(self, parameters: Iterable[Tensor], *, fused: bool | None = None) -> None:
+        self._parameters, self._fused = list(parameters), fused
+        self.means: list[Tensor] = []
+        self.squares: list[Tensor] = []
+        self._counts: list[Tensor] = []
+
+    @property
+    def steps(self) -> int:
+        """Number of steps so far."""
+        return int(self._counts[0]) if self._counts else 0
+
+    def restore(self, steps: int, means: Iterable[Tensor], squares: Iterable[Tensor]) -> None:
+        """Continue after ``steps`` steps, which left these moments."""
+        self.means = [mean.to(p.device) for p, mean in zip(self._parameters, means, strict=True)]
+        self.squares = [square.to(p.device) for p, square in zip(self._parameters, squares, strict=True)]
+        self._counts = [torch.tensor(float(steps), device=p.device) for p in self._parameters]
+
+    def zero_grad(self) -> None:
+        """Remove the gradients."""
+        for p in self._parameters:
+            p.grad = None
+
+    @torch.no_grad()
+    def step(self, learning_rate: float) -> None:
+        """Update all parameters by their gradients."""
+        if not self._counts:
+            self.restore(0, map(torch.zeros_like, self._parameters), map(torch.zeros_like, self._parameters))
+        adam(
+            self._parameters,
+            cast("list[Tensor]", [p.grad for p in self._parameters]),
+            self.means,
+            self.squares,
+            [],
+            self._counts,
+            fused=self._fused,
+            amsgrad=False,
+            beta1=0.9,
+            beta2=0.999,
+            lr=learning_rate,
+            weight_decay=0.0,
+            eps=1e-8,
+            maximize=False,
+        )
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from plushsense.models.arch import Arch
 from plushsense.models.net import Net
 from plushsense.scoring.metrics import accuracy_over_people
 from plushsense.training.augment import Channels, Transform, augmentations
-from plushsense.training.engine import Engine, FitState, Windows, engine, is_fast, slices, torch_threads
+from plushsense.training.engine import Adam, Engine, FitState, Windows, engine, is_fast, slices, torch_threads
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler
@@ -114,9 +114,11 @@ def fit(
         net = engine(arch, initial, device, min(spec.batch, most), spec.threads)
         order = torch.Generator().manual_seed(spec.seed)
         augment = augmentations(spec.augment, Channels(train.vectors, scaler, device, arch.vector is not None))
-        adam = torch.optim.Adam(net.parameters, lr=spec.learning_rate, fused=True)
+        adam = Adam(net.parameters, fused=True)
         if start is not None:
-            _restore(adam, net, start)
+            adam.restore(
+                start.steps, *([torch.from_numpy(m.copy()) for m in ms] for ms in (start.means, start.squares))
+            )
             order.set_state(torch.from_numpy(start.random.copy()))
         with closing(net):
             history: list[dict[str, Any]] = [] if start is None else [dict(row) for row in start.history]
@@ -127,11 +129,10 @@ def fit(
                 best_epoch, best_score, best = *_best(history, spec), dict(start.best)
             for epoch in range(len(history) + 1, spec.epochs + 1):
                 row: dict[str, Any] = {"epoch": epoch}
-                for group in adam.param_groups:
-                    group["lr"] = spec.learning_rate_at(epoch)
-                row["train_loss"], row["train_accuracy"] = _train(net, adam, x, y, spec, order, augment, weights)
+                rate = spec.learning_rate_at(epoch)
+                row["train_loss"], row["train_accuracy"] = _train(net, adam, rate, x, y, spec, order, augment, weights)
                 row |= _measure(net, val_data, validation)
-                row["learning_rate"] = spec.learning_rate_at(epoch)
+                row["learning_rate"] = rate
                 _refuse_not_finite(row, spec)
                 history.append(row)
                 if epoch in keep:
@@ -162,20 +163,19 @@ def repeated(weights: NDArray[np.float64], offset: float = 0.5) -> NDArray[np.in
 
 
 def _state(
-    adam: torch.optim.Adam,
+    adam: Adam,
     net: Engine,
     order: torch.Generator,
     history: list[dict[str, Any]],
     kept: Mapping[int, dict[str, NDArray[np.float32]]],
     best: dict[str, NDArray[np.float32]] | None = None,
 ) -> FitState:
-    moments = [adam.state[p] for p in net.parameters if p in adam.state]
     return FitState(
         epoch=len(history),
-        steps=int(moments[0]["step"]) if moments else 0,
+        steps=adam.steps,
         weights=net.export_weights(),
-        means=[one["exp_avg"].cpu().numpy().copy() for one in moments],
-        squares=[one["exp_avg_sq"].cpu().numpy().copy() for one in moments],
+        means=[mean.cpu().numpy().copy() for mean in adam.means],
+        squares=[square.cpu().numpy().copy() for square in adam.squares],
         random=order.get_state().numpy().copy(),
         history=[dict(row) for row in history],
         kept=dict(kept),
@@ -192,15 +192,6 @@ def _best(history: list[dict[str, Any]], spec: TrainSpec) -> tuple[int, float]:
     """Return the first epoch with the best score, and the score."""
     scores = [_score(row, spec) for row in history]
     return int(np.argmax(scores)) + 1, max(scores)
-
-
-def _restore(adam: torch.optim.Adam, net: Engine, start: FitState) -> None:
-    for p, mean, square in zip(net.parameters, start.means, start.squares, strict=True):
-        adam.state[p] = {
-            "step": torch.tensor(float(start.steps), device=p.device),
-            "exp_avg": torch.from_numpy(mean.copy()).to(p.device),
-            "exp_avg_sq": torch.from_numpy(square.copy()).to(p.device),
-        }
 
 
 def predict(
@@ -254,7 +245,8 @@ def with_hard_negatives(
 
 def _train(
     net: Engine,
-    adam: torch.optim.Adam,
+    adam: Adam,
+    rate: float,
     x: Windows,
     y: Tensor,
     spec: TrainSpec,
@@ -262,7 +254,7 @@ def _train(
     augment: Transform | None,
     weights: NDArray[np.float64] | None,
 ) -> tuple[float, float]:
-    """Train one epoch; return mean loss and accuracy over its batches."""
+    """Train one epoch at a learning rate; return mean loss and accuracy over its batches."""
     # Sum on the device: reading a number from a GPU in every batch would make the CPU wait.
     sums, n_windows = torch.zeros(2, device=y.device), 0
     if weights is None:
@@ -280,7 +272,7 @@ def _train(
             continue
         truth = y[batch]
         loss, logits = net.step(x, batch, truth, augment, order)
-        adam.step()
+        adam.step(rate)
         sums[0] += loss * len(batch)
         sums[1] += (logits.argmax(dim=1) == truth).sum()
         n_windows += len(batch)

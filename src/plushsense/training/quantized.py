@@ -20,7 +20,7 @@ from plushsense.core.errors import TrainingError
 from plushsense.models.arch import NORM_EPSILON, Arch, reflected
 from plushsense.models.net import Net, VectorNet
 from plushsense.runtime.integer import deployable, rounded_weights
-from plushsense.training.engine import slices, torch_threads
+from plushsense.training.engine import Adam, slices, torch_threads
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler
@@ -80,20 +80,18 @@ def fine_tune(
         teacher.eval()
         network = Rounded(arch, weights, calibration)
         random = torch.Generator().manual_seed(spec.seed)
-        adam = torch.optim.Adam(network.parameters, lr=highest)
+        adam = Adam(network.parameters)
         for epoch in range(1, epochs + 1):
             rate = highest * (1.0 - (epoch - 1) / epochs)
-            for group in adam.param_groups:
-                group["lr"] = rate
             order, total = torch.randperm(len(x), generator=random), 0.0
             for at in slices(len(x), spec.batch):
                 batch = x[order[at]]
                 with torch.no_grad():
                     target = F.log_softmax(teacher(batch), dim=1)
                 loss = F.kl_div(F.log_softmax(network(batch), dim=1), target, reduction="batchmean", log_target=True)
-                adam.zero_grad(set_to_none=True)
+                adam.zero_grad()
                 torch.autograd.backward(loss)
-                adam.step()
+                adam.step(rate)
                 total += float(loss.detach()) * len(batch)
             history.append({"epoch": epoch, "train_loss": total / len(x), "learning_rate": rate})
             if progress is not None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from safetensors.numpy import save
 
 from plushsense.core.errors import TrainingError
 from plushsense.training.augment import Channels, Transform, augmentations
-from plushsense.training.engine import slices, torch_threads
+from plushsense.training.engine import Adam, slices, torch_threads
 from plushsense.training.fit import resolve_device
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
@@ -111,17 +111,16 @@ def fit_recurrent(
         net = Recurrent(x.shape[1], len(train.labels), both_ways, units, layers, dropout).to(device)
         order = torch.Generator().manual_seed(spec.seed)
         augment = augmentations(spec.augment, Channels(train.vectors, scaler, device))
-        adam = torch.optim.Adam(net.parameters(), lr=spec.learning_rate)
+        adam = Adam(net.parameters())
         for epoch in range(1, spec.epochs + 1):
-            for group in adam.param_groups:
-                group["lr"] = spec.learning_rate_at(epoch)
-            _epoch(net, adam, x, y, spec.batch, order, augment, epoch)
+            _epoch(net, adam, spec.learning_rate_at(epoch), x, y, spec.batch, order, augment, epoch)
     return RecurrentReader(net.eval(), scaler, samples, time.perf_counter() - began)
 
 
 def _epoch(
     net: Recurrent,
-    adam: Any,
+    adam: Adam,
+    rate: float,
     x: Tensor,
     y: Tensor,
     size: int,
@@ -137,11 +136,11 @@ def _epoch(
             continue
         windows = x[batch] if augment is None else augment(x[batch], order)
         loss = F.cross_entropy(net(windows), y[batch])
-        adam.zero_grad(set_to_none=True)
+        adam.zero_grad()
         torch.autograd.backward(loss)
         # Gradients of an LSTM can explode; without clipping, a single window could ruin the weights.
         nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-        adam.step()
+        adam.step(rate)
         total += loss.detach()
     if not torch.isfinite(total):
         raise TrainingError(
