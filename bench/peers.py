@@ -1,23 +1,25 @@
 """Measure the cost of one decision every 50 ms: our C against the same network in other runtimes.
 
     THERE/bin/pip install tflite-micro ai-edge-litert ai-edge-quantizer torch==2.13.0 executorch onnxruntime onnx
-    python bench/peers.py --python THERE/bin/python [--onnx2c PATH] [--json]
+    python bench/peers.py --python THERE/bin/python --onnx2c PATH --cmsis-nn DIR [--save]
 
 Install the other runtimes in an environment of their own (they install PyTorch and other large packages); `--python`
-names its interpreter (default: the one that runs this program). Runtimes that are not installed are listed as "not
-here". gcc is required, and valgrind with its headers to count instructions; onnx2c is built from
-github.com/kraiskil/onnx2c.
+names its interpreter (default: the one that runs this program). `--onnx2c` is the program built from
+github.com/kraiskil/onnx2c, `--cmsis-nn` a copy of github.com/ARM-software/CMSIS-NN. What is missing is listed with how
+to get it, and the rest is measured. gcc is required, valgrind with its headers to count instructions, and
+gcc-arm-none-eabi, libnewlib-arm-none-eabi and qemu-system-arm for the Cortex-M4. `--save` measures the two networks of
+docs/peers.md, and writes bench/peers.json and from it the tables of the page.
 
-Every runtime gets the same weights, with the normalisation folded in, quantized by its own tool on the same windows. It
-runs on one thread, warm, with the input already in place; only its own call is timed and counted. The other runtimes
-get the windowed network, which computes its window again at each decision. They could stream too, with the state as
-variables or as inputs and outputs, in another graph; that is not measured. They read the window in the form that takes
-fewer multiply-accumulates (`--form`): `window`, 250 samples with zeros before the first, or `span`, exactly the samples
-that our streaming decision reads. Where the two differ, each answer is checked against the float answer of its own
-form. Our C reads five frames (validity, clock, magnitude, scaling), runs the network, smooths and decides. The runtimes
-are timed in turn, and ratios are taken within a round. Instructions are counted by callgrind for 2N decisions less
-those for N; callgrind's processor has AVX2 at most. All frames and (without `--bundle`) all weights are generated:
-costs hardly depend on them.
+Every runtime gets the same weights, with the normalisation folded in, quantized by its own tool on the same decisions,
+and two graphs. That of the `stream` is our algorithm: it computes the 5 new samples of a step, and has each layer's
+history and the means of earlier steps as further inputs and outputs. That of the `window` computes everything again, in
+the form that takes fewer multiply-accumulates (`--form`): `window`, 250 samples with zeros before the first, or `span`,
+exactly the samples that a decision of the stream reads. Where the two differ, each answer is checked against the float
+answer of its own form. It runs on one thread, warm, with the input already in place; only its own call is timed and
+counted. Our C also has a row with all that a toy does: five frames (validity, clock, magnitude, scaling), network,
+smoothing and decision. The runtimes are timed in turn, and ratios are taken within a round. Instructions are counted
+by callgrind for 2N decisions less those for N (its processor has AVX2 at most), and on the Cortex-M4 by QEMU: they are
+not cycles. All frames and (without `--bundle`) all weights are generated: costs hardly depend on them.
 """
 
 from __future__ import annotations
@@ -31,11 +33,12 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import plushsense
 from plushsense.core.errors import PlushSenseError
@@ -44,88 +47,104 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from opponents import programs
 from opponents.case import FORMS, Case, make_case
-from opponents.programs import CannotBuild, Entry, Workshop
+from opponents.programs import CannotBuild, ChipRow, Entry, Workshop
 from opponents.running import Died, Running, instructions
+from opponents.tables import OUR_ROW, lines, page_of
 
 WORKER = Path(__file__).resolve().parent / "opponents" / "worker.py"
+RESULTS = Path(__file__).resolve().with_suffix(".json")
+PAGE = RESULTS.parents[1] / "docs" / "peers.md"
 LITERT = "ai-edge-litert ai-edge-quantizer"
-# name: title, family, packages
-PEERS: dict[str, tuple[str, str, str]] = {
-    "tflite-micro": ("TensorFlow Lite Micro, int8, reference kernels", "portable C", f"tflite-micro {LITERT}"),
-    "litert": ("LiteRT, int8, XNNPACK", "xnnpack", LITERT),
-    "executorch": ("ExecuTorch, int8, XNNPACK", "xnnpack", "executorch"),
-    "onnxruntime": ("onnxruntime, float", "mlas", "onnxruntime onnx"),
-    "onnxruntime-int8": ("onnxruntime, int8 (QDQ)", "mlas", "onnxruntime onnx"),
+# name: title, packages
+PEERS: dict[str, tuple[str, str]] = {
+    "tflite-micro": ("TensorFlow Lite Micro, int8, reference kernels", f"tflite-micro {LITERT}"),
+    "litert": ("LiteRT, int8, XNNPACK", LITERT),
+    "executorch": ("ExecuTorch, int8, XNNPACK", "executorch"),
+    "onnxruntime": ("onnxruntime, float", "onnxruntime onnx"),
+    "onnxruntime-int8": ("onnxruntime, int8 (QDQ)", "onnxruntime onnx"),
 }
-OUR_ROW = "PlushSense C -O2, frames to answer"
-PLAIN_ROW = f"{OUR_ROW}, plain C"
-# family, target ratio of instructions, what is compared, which of our programs: plain C against plain C
-TARGETS = (
-    ("portable C", 20.0, "the best portable C of a peer (onnx2c, TensorFlow Lite Micro)", PLAIN_ROW),
-    ("xnnpack", 5.0, "XNNPACK's hand-vectorised window (LiteRT, ExecuTorch)", OUR_ROW),
-    ("xnnpack", 5.0, "XNNPACK's hand-vectorised window, by our plain C", PLAIN_ROW),
-)
-FAITHFUL = 0.8  # share of decisions that equal the float ones, below which a runtime is reported as broken
+C_PEERS = ("onnx2c", "plain", "cmsis-nn")
+ALGORITHMS = ("stream", "window")
+NETWORKS = {"paper": "14d1_39d2_41d4", "default": "14d1_19d2_19d4"}
 
 
 def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def python_entry(peer: str, python: str, shop: Workshop) -> Entry:
-    """Return the entry of a Python runtime that builds its own model."""
-    title, family, packages = PEERS[peer]
-    command = [python, str(WORKER)]
+def made(peer: str, packages: str, algorithm: str, python: str, shop: Workshop) -> dict[str, Any]:
+    """Let a Python runtime build its own model; return its facts."""
+    command = [python, str(WORKER), "make", peer, algorithm, str(shop.folder)]
     try:
-        made = subprocess.run([*command, "make", peer, str(shop.folder)], capture_output=True, text=True)
+        done = subprocess.run(command, capture_output=True, text=True)
     except OSError as cause:
         raise CannotBuild(f"the interpreter {python} cannot be run ({cause.strerror}): give --python PATH") from None
-    if made.returncode != 0:
-        last = (made.stderr.strip().splitlines() or [f"ended with {made.returncode}"])[-1]
+    if done.returncode != 0:
+        last = (done.stderr.strip().splitlines() or [f"ended with {done.returncode}"])[-1]
         if last.startswith(("ModuleNotFoundError", "ImportError")):
             raise CannotBuild(f"not here: pip install {packages}")
         raise CannotBuild(f"could not be built: {last[:200]}")
-    facts = json.loads(made.stdout)
+    return dict(json.loads(done.stdout))
+
+
+def python_entry(peer: str, algorithm: str, python: str, shop: Workshop) -> Entry:
+    """Return the entry of a Python runtime."""
+    title, packages = PEERS[peer]
+    facts = made(peer, packages, algorithm, python, shop)
     if facts.get("outside_xnnpack"):
         title += f", {len(facts['outside_xnnpack'])} operators outside"
     return Entry(
-        title, family, "window", [*command, "run", peer, str(shop.folder)], facts["model_bytes"],
+        title, algorithm, [python, str(WORKER), "run", peer, algorithm, str(shop.folder)], facts["model_bytes"],
         memory_bytes=facts.get("memory_bytes"), versions=facts["versions"],
     )  # fmt: skip
 
 
-def entries(args: argparse.Namespace, case: Case, shop: Workshop) -> tuple[list[Entry], dict[str, str]]:
-    """Return the entries that can run on this machine, and for each other one the reason."""
-    peers = args.only.split(",") if args.only else [*PEERS, "onnx2c", "plain"]
-    found, absent = programs.ours(case, shop), {}
-    for peer in (p for p in PEERS if p in peers):
-        say(f"{PEERS[peer][0]} …")
+def entries(args: argparse.Namespace, case: Case, shop: Workshop) -> tuple[list[Entry], list[ChipRow], dict[str, str]]:
+    """Return what can run on this machine and on the emulated chip, and for each other one the reason."""
+    peers = args.only.split(",") if args.only else [*PEERS, *C_PEERS]
+    found, chip, absent = programs.ours(case, shop), list[Any](), dict[str, str]()
+
+    def attempt(into: list[Any], name: str, algorithm: str, build: Callable[..., Any], *given: Any) -> None:
+        say(f"{name}, {algorithm} …")
         try:
-            found.append(python_entry(peer, args.python, shop))
-        except CannotBuild as reason:
-            absent[PEERS[peer][0]] = str(reason)
-    if "plain" in peers:
-        found += programs.plain_window(case, shop)
-    if "onnx2c" in peers:
-        model = shop.folder / "float.onnx"
-        try:
-            if not model.exists():
-                python_entry("onnxruntime", args.python, shop)
-            found += programs.onnx2c(case, shop, args.onnx2c, model)
-        except CannotBuild as reason:
-            absent["onnx2c, float C"] = str(reason)
-    return found, absent
+            into.append(build(*given))
+        except (CannotBuild, PlushSenseError) as reason:
+            absent[f"{name}, {algorithm}"] = str(reason)
+
+    def onnx2c(algorithm: str) -> Entry:
+        model = shop.folder / f"onnxruntime-{algorithm}.model"
+        if not model.exists():
+            made("onnxruntime", "onnx", algorithm, args.python, shop)
+        return programs.onnx2c(case, shop, algorithm, args.onnx2c, model)
+
+    def cmsis_nn(algorithm: str) -> ChipRow:
+        root = programs.require_cmsis_nn(Path(args.cmsis_nn) if args.cmsis_nn else None)
+        facts = made("cmsis-nn", LITERT, algorithm, args.python, shop)
+        header = shop.folder / f"cmsis-nn-{algorithm}.model"
+        return programs.cmsis_nn(case, shop, algorithm, root, header, tuple(facts["logits"]))
+
+    if "cmsis-nn" in peers:
+        attempt(chip, "PlushSense C on the Cortex-M4", "stream", programs.ours_on_chip, case, shop)
+    for algorithm in ALGORITHMS:
+        for peer in (p for p in PEERS if p in peers):
+            attempt(found, PEERS[peer][0], algorithm, python_entry, peer, algorithm, args.python, shop)
+        if "plain" in peers:
+            attempt(found, "plain float C", algorithm, programs.plain_loops, case, shop, algorithm)
+        if "onnx2c" in peers:
+            attempt(found, "onnx2c float C", algorithm, onnx2c, algorithm)
+        if chip:
+            attempt(chip, "CMSIS-NN int8", algorithm, cmsis_nn, algorithm)
+        if chip and (shop.folder / f"onnx2c-{algorithm}.c").exists():
+            attempt(chip, "onnx2c on the Cortex-M4", algorithm, programs.onnx2c_on_chip, case, shop, algorithm)
+    return found, [row for part in chip for row in (part if isinstance(part, list) else [part])], absent
 
 
-def checked(entry: Entry, process: Running, case: Case) -> dict[str, float] | None:
-    """Compare the logits of an entry with the float ones; None for the network alone, which reads random inputs."""
-    if entry.reads == "stream":
-        return None
-    logits = process.check(Path(entry.command[-1]), case.arch.classes)
-    if entry.reads == "frames":
-        expected, logits = case.stream_logits, logits[case.ours]
+def compared(reads: str, logits: NDArray[np.float64], case: Case) -> dict[str, float]:
+    """Compare logits with the float ones of the same decisions."""
+    if reads == "window":
+        expected = case.window_logits[: len(logits)]
     else:
-        expected = case.window_logits
+        expected, logits = case.stream_logits, logits[case.compared]
     return {
         "decisions": len(expected),
         "agreement": float((logits.argmax(axis=1) == expected.argmax(axis=1)).mean()),
@@ -133,11 +152,18 @@ def checked(entry: Entry, process: Running, case: Case) -> dict[str, float] | No
     }
 
 
+def checked(entry: Entry, process: Running, case: Case) -> dict[str, float] | None:
+    """Check a program's answers; None for our network alone, which reads random inputs."""
+    if entry.reads == "inputs":
+        return None
+    return compared(entry.reads, process.check(Path(entry.command[-1]), case.arch.classes), case)
+
+
 def measure(found: list[Entry], absent: dict[str, str], args: argparse.Namespace, case: Case) -> list[dict[str, Any]]:
     """Check, time and count every entry; return one row for each."""
     rows: list[dict[str, Any]] = []
+    running: list[tuple[Entry, Running, int, list[float]]] = []
     with contextlib.ExitStack() as open_:
-        running: list[tuple[dict[str, Any], Running, int]] = []
         for entry in found:
             process = open_.enter_context(Running(entry.command, Path(entry.command[-1])))
             try:
@@ -145,67 +171,29 @@ def measure(found: list[Entry], absent: dict[str, str], args: argparse.Namespace
                 process.run(3)
                 each = max(process.run(3), 1e-7)
             except Died as reason:
-                absent[entry.name] = f"ended while it ran: {reason}"
+                absent[f"{entry.name}, {entry.reads}"] = f"ended while it ran: {reason}"
                 continue
-            row: dict[str, Any] = {
-                "name": entry.name, "family": entry.family, "reads": entry.reads, "check": near,
-                "model_bytes": entry.model_bytes, "code_bytes": entry.code_bytes, "memory_bytes": entry.memory_bytes,
-                "seconds": [],
-            }  # fmt: skip
-            rows.append(row)
-            running.append((row, process, max(1, round(args.slice_ms / 1000 / each))))
+            rows.append({
+                "name": entry.name, "reads": entry.reads, "check": near, "model_bytes": entry.model_bytes,
+                "code_bytes": entry.code_bytes, "memory_bytes": entry.memory_bytes, "instructions": None,
+            })  # fmt: skip
+            running.append((entry, process, max(1, round(args.slice_ms / 1000 / each)), []))
         say(f"{args.rounds} rounds of {len(running)} …")
         for _ in range(args.rounds):
-            for row, process, decisions in running:
-                row["seconds"].append(process.run(decisions))
-    for row in rows:
-        row["instructions"], entry = None, next(e for e in found if e.name == row["name"])
+            for _, process, decisions, seconds in running:
+                seconds.append(process.run(decisions))
+    ours = next(seconds for entry, _, _, seconds in running if entry.name == OUR_ROW)
+    for row, (entry, _, _, seconds) in zip(rows, running, strict=True):
+        low, middle, high = (float(v) for v in np.quantile(1e6 * np.array(seconds), (0.1, 0.5, 0.9)))
+        row["us"] = {"median": middle, "p10": low, "p90": high}
+        row["times_slower"] = statistics.median(theirs / mine for theirs, mine in zip(seconds, ours, strict=True))
         if args.decisions:
-            say(f"callgrind: {entry.name} …")
+            say(f"callgrind: {entry.name}, {entry.reads} …")
             try:
                 row["instructions"] = instructions(entry.command, Path(entry.command[-1]), args.decisions)
             except Died as reason:
-                absent[f"instructions of {entry.name}"] = str(reason)
-    compare(rows)
+                absent[f"instructions of {entry.name}, {entry.reads}"] = str(reason)
     return rows
-
-
-def compare(rows: list[dict[str, Any]]) -> None:
-    """Return medians, spreads, and ratios to our C."""
-    ours = next(row for row in rows if row["name"] == OUR_ROW)
-    for row in rows:
-        us = 1e6 * np.array(row["seconds"])
-        row["us"] = {
-            "median": float(np.median(us)),
-            "p10": float(np.quantile(us, 0.1)),
-            "p90": float(np.quantile(us, 0.9)),
-        }
-        pairs = zip(row["seconds"], ours["seconds"], strict=True)
-        row["times_slower"] = statistics.median(theirs / mine for theirs, mine in pairs)
-        counts = row["instructions"], ours["instructions"]
-        row["times_instructions"] = None if None in counts else counts[0] / counts[1]
-
-
-def verdicts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Compare with the targets of our C, by the runtime of each family that takes the fewest instructions."""
-    results = []
-    for family, least, who, ours in TARGETS:
-        mine = next(row for row in rows if row["name"] == ours)["instructions"]
-        them = [row for row in rows if row["family"] == family and row["instructions"] is not None]
-        nearest = min(them, key=lambda row: row["instructions"], default=None)
-        known = nearest is not None and mine is not None
-        ratio = nearest["instructions"] / mine if known else None
-        results.append(
-            {
-                "who": who,
-                "at_least": least,
-                "ratio": ratio,
-                "ours": ours,
-                "against": nearest["name"] if known else None,
-                "reached": ratio >= least if known else None,
-            }
-        )
-    return results
 
 
 def machine() -> dict[str, Any]:
@@ -218,78 +206,17 @@ def machine() -> dict[str, Any]:
     return {"cpu": cpu, "cores": os.cpu_count(), "system": platform.platform(), "load": load}
 
 
-def _whole(value: int | None) -> str:
-    return "–" if value is None else f"{value:,}"
-
-
-def table(report: dict[str, Any]) -> Iterable[str]:
-    """Yield the lines of the table and its notes."""
-    case = report["case"]
-    yield (
-        f"{case['title']}, {case['channels']} channels, {case['classes']} classes: one decision every "
-        f"{case['step_ms']:g} ms, one thread"
-    )
-    yield (
-        f"ours: {case['macs_ours']:,} multiply-accumulates per decision; others recompute {case['samples']} samples "
-        f"({case['form']}): {case['macs']:,}"
-    )
-    yield ""
-    yield (
-        f"{'':<47}{'µs (p10–p90)':>26}{'×':>7}{'instructions':>14}{'×':>8}{'model B':>9}{'code B':>9}{'memory B':>10}"
-        f"{'as float':>10}{'error':>8}"
-    )
-    for row in report["rows"]:
-        us, near = row["us"], row["check"]
-        times = f"{us['median']:.1f} ({us['p10']:.1f}–{us['p90']:.1f})"
-        count = "–" if row["instructions"] is None else f"{row['instructions']:,.0f}"
-        ratio = "–" if row["times_instructions"] is None else f"{row['times_instructions']:.2f}"
-        agree = "–" if near is None else f"{100 * near['agreement']:.1f} %"
-        error = "–" if near is None else f"{100 * near['logit_error']:.1f} %"
-        yield (
-            f"{row['name']:<47}{times:>26}{row['times_slower']:>7.2f}{count:>14}{ratio:>8}{_whole(row['model_bytes']):>9}"
-            f"{_whole(row['code_bytes']):>9}{_whole(row['memory_bytes']):>10}{agree:>10}{error:>8}"
-        )
-    for name, reason in report["absent"].items():
-        yield f"{name:<47}  {reason}"
-    yield ""
-    yield (
-        f"×: ratio to '{OUR_ROW}'. as float: decisions equal to the float network's, of {case['checked']}; error: of "
-        "the logits, divided by their spread."
-    )
-    yield (
-        "code B of C without a model file includes the weights; a runtime's own library is not counted, nor memory "
-        "that it does not report."
-    )
-    yield "The others run the windowed network: each decision computes its whole window; streaming was not tried."
-    for row in report["rows"]:
-        if row["check"] is not None and row["check"]["agreement"] < FAITHFUL:
-            yield f"BROKEN: {row['name']} agrees with the floats in {100 * row['check']['agreement']:.0f} % only."
-    for target in report["targets"]:
-        if target["ratio"] is None:
-            yield f"Target, {target['at_least']:g}× fewer instructions than {target['who']}: not measured."
-        else:
-            word = "reached" if target["reached"] else "MISSED"
-            yield (
-                f"Target, {target['at_least']:g}× fewer instructions than {target['who']}: {word}, "
-                f"{target['ratio']:.2f}× ({target['against']})."
-            )
-    computer = report["machine"]
-    load = "" if computer["load"] is None else f", load {computer['load'][0]:.1f} before"
-    yield f"{computer['cpu']}, {computer['cores']} cores{load}; {computer['system']}; {report['compiler']}"
-    yield "; ".join(f"{name} {version}" for name, version in report["versions"].items())
-
-
-def bench(args: argparse.Namespace) -> dict[str, Any]:
+def bench(args: argparse.Namespace, symbol: str) -> dict[str, Any]:
     """Run everything and return plain values."""
     case = make_case(
-        args.arch, args.filters, layout=args.layout, gestures=args.gestures, window=args.window, form=args.form,
+        symbol, args.filters, layout=args.layout, gestures=args.gestures, window=args.window, form=args.form,
         bundle=args.bundle,
     )  # fmt: skip
     before = machine()
     with tempfile.TemporaryDirectory(prefix="peers-") as folder:
         case.save(Path(folder))
         shop = Workshop(Path(folder), args.cc)
-        found, absent = entries(args, case, shop)
+        found, chip, absent = entries(args, case, shop)
         rows = measure(found, absent, args, case)
         versions = {"plushsense": plushsense.__version__}
         for entry in found:
@@ -297,45 +224,60 @@ def bench(args: argparse.Namespace) -> dict[str, Any]:
         arch = case.arch
         return {
             "case": {
-                "title": arch.title, "channels": arch.channels, "classes": arch.classes, "form": case.form,
-                "samples": case.length, "macs": case.macs, "macs_ours": arch.macs_per_step, "span": arch.span,
-                "step_ms": arch.step * case.model.layout.period_us / 1000, "checked": len(case.windows),
-                "weights": "random" if args.bundle is None else Path(args.bundle).name,
+                "symbol": arch.symbol, "channels": arch.channels, "classes": arch.classes, "form": case.form,
+                "samples": case.length, "macs": case.macs, "macs_ours": arch.macs_per_step,
+                "step_ms": arch.step * case.model.layout.period_us / 1000,
             },
-            "rows": rows, "absent": absent, "targets": verdicts(rows), "versions": versions,
-            "compiler": shop.version(), "machine": before,
+            "rows": rows, "absent": absent, "versions": versions, "compiler": shop.version(), "machine": before,
+            "chip": [
+                {
+                    "name": row.name, "reads": row.reads, "instructions": row.instructions,
+                    "check": None if row.logits is None else compared(row.reads, row.logits, case),
+                } for row in chip
+            ],
         }  # fmt: skip
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arch", default="14d1_39d2_41d4")
+    parser.add_argument("--arch", default=NETWORKS["paper"])
     parser.add_argument("--filters", default="8,12,16")
     parser.add_argument("--layout", default="plush-15")
     parser.add_argument("--gestures", default="plush-18")
     parser.add_argument("--window", type=int, default=250)
     parser.add_argument("--bundle", help="a trained network in place of random weights")
-    parser.add_argument("--form", choices=FORMS, default="cheapest", help="what the others read")
+    parser.add_argument("--form", choices=FORMS, default="cheapest", help="what the graph of the window reads")
     parser.add_argument("--python", default=sys.executable, help="interpreter that has the other runtimes")
     parser.add_argument("--onnx2c", default="onnx2c", help="the program onnx2c")
+    parser.add_argument("--cmsis-nn", help="folder of CMSIS-NN's sources")
     parser.add_argument("--cc", default="gcc")
-    parser.add_argument("--only", help=f"of {','.join(PEERS)},onnx2c,plain; 'none': ours alone")
-    parser.add_argument("--rounds", type=int, default=60)
+    parser.add_argument("--only", help=f"of {','.join((*PEERS, *C_PEERS))}; 'none': ours alone")
+    parser.add_argument("--rounds", type=int, default=40)
     parser.add_argument("--slice-ms", type=float, default=10.0, help="how long each runs in a round")
-    parser.add_argument("--decisions", type=int, default=20, help="to count instructions of; 0: do not count")
+    parser.add_argument("--decisions", type=int, default=10, help="to count instructions of; 0: do not count")
     parser.add_argument("--json", action="store_true")
+    parser.add_argument(
+        "--save", action="store_true", help="measure both networks, write bench/peers.json and the page"
+    )
     args = parser.parse_args()
     if args.rounds < 1 or args.decisions < 0 or args.slice_ms <= 0:
         parser.error("--rounds is at least 1, --decisions at least 0, --slice-ms above 0")
     for name in (args.only or "none").split(","):
-        if name not in (*PEERS, "onnx2c", "plain", "none"):
-            parser.error(f"--only names '{name}': known are {', '.join(PEERS)}, onnx2c, plain and none")
+        if name not in (*PEERS, *C_PEERS, "none"):
+            parser.error(f"--only names '{name}': known are {', '.join((*PEERS, *C_PEERS))} and none")
     try:
-        report = bench(args)
+        if args.save:
+            results = json.loads(RESULTS.read_text("utf-8")) if RESULTS.exists() else {}
+            for name, symbol in NETWORKS.items():
+                results[name] = bench(args, symbol)
+                RESULTS.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n", "utf-8")
+                PAGE.write_text(page_of(PAGE.read_text("utf-8"), {name: results[name]}), "utf-8")
+            return 0
+        report = bench(args, args.arch)
     except (PlushSenseError, CannotBuild, Died) as refusal:
         say(f"bench/peers.py: {refusal}")
         return 2
-    print(json.dumps(report) if args.json else "\n".join(table(report)))
+    print(json.dumps(report) if args.json else "\n".join(lines(report)))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""The test case of all opponents: one network with its normalisation folded, and the windows to check it on."""
+"""The test case of all opponents: one network with its normalisation folded, and what it reads, to check it on."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from plushsense.core.errors import ArchError
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import Layout, load_layout
-from plushsense.deploy.quantize import calibrate, folded, quantize, refuse_undeployable
+from plushsense.deploy.quantize import calibrated, folded, integer_model, refuse_undeployable
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import Network, random_weights
-from plushsense.runtime import fixed
 from plushsense.runtime.image import IntegerModel
 from plushsense.windows.features import Scaler, network_inputs
 
@@ -28,45 +27,47 @@ FORMS = ("cheapest", "window", "span")
 class Case:
     """A network, and the windows to run through it.
 
-    ``frames`` (n, 1 + C) int32 are readings of the toy: ms and raw values. Our C reads them as a stream. The others
-    read ``windows`` (N, F, T) float32, each of which ends at a decision of the stream; ``ours`` (N,) are their indices.
-    ``stream_logits`` and ``window_logits`` (N, K) are the float answers to each.
+    ``frames`` (n, 1 + C) int32 are readings of the toy: ms and raw values. Our C reads them as a stream; ``steps``
+    (n / step, C, step) float32 are the same as scaled inputs. ``windows`` (N, C, T) float32 each end at a decision of
+    the stream; ``compared`` (N,) are the indices of these decisions, counted from the last one (-1).
+    ``stream_logits`` and ``window_logits`` (N, K) are the float answers to each. ``calibration`` has what each input of
+    the graph of an algorithm, "window" or "stream", reads in other decisions.
     """
 
     arch: Arch
+    bundle: Bundle
     model: IntegerModel
     form: str
     weights: dict[str, NDArray[np.float32]]
     frames: NDArray[np.int32]
-    calibration: NDArray[np.float32]
+    calibration: dict[str, dict[str, NDArray[np.float32]]]
     windows: NDArray[np.float32]
-    ours: NDArray[np.int64]
+    steps: NDArray[np.float32]
+    compared: NDArray[np.int64]
     stream_logits: Floats
     window_logits: Floats
 
     @property
     def length(self) -> int:
-        """Number of samples that an opponent reads for one decision."""
+        """Number of samples of a window."""
         return int(self.windows.shape[2])
 
     @property
     def macs(self) -> int:
-        """Number of multiply-accumulates of one decision of an opponent."""
+        """Number of multiply-accumulates of one decision from a window."""
         return macs_of(self.arch, self.form)
 
     def save(self, folder: Path) -> None:
         """Save everything that an opponent needs, so that it can run without PlushSense."""
         facts = {f"dilation{i}": np.int64(layer.dilation) for i, layer in enumerate(self.arch.layers)}
-        np.savez(
-            folder / "case.npz",
-            **self.weights,
-            **facts,
-            layers=np.int64(len(self.arch.layers)),
-            padded=np.int64(self.form == "window"),
-            calibration=self.calibration,
-            windows=self.windows,
-        )
-        (folder / "windows.bin").write_bytes(self.windows.tobytes())
+        for algorithm, reads in (("window", self.windows), ("stream", self.steps)):
+            given = {f"calibration.{name}": values for name, values in self.calibration[algorithm].items()}
+            padded = np.int64(algorithm == "window" and self.form == "window")
+            layers = np.int64(len(self.arch.layers))
+            np.savez(
+                folder / f"{algorithm}.npz", **self.weights, **facts, **given, layers=layers, padded=padded, x=reads
+            )
+            (folder / f"{algorithm}.bin").write_bytes(reads.tobytes())
         (folder / "frames.bin").write_bytes(self.frames.tobytes())
 
 
@@ -89,21 +90,19 @@ def make_case(
     seed: int = 1,
 ) -> Case:
     """Return a network with random weights, or that of a bundle, and random frames for it."""
-    laid, named = load_layout(layout), load_gestures(gestures)
+    laid, named, scaler = load_layout(layout), load_gestures(gestures), None
     if bundle is None:
         arch = Arch.parse(symbol, filters, channels=laid.n_inputs, classes=len(named), window=window)
-        refuse_undeployable(arch)
-        weights, scaler, smoothing = random_weights(arch, seed), None, fixed.smoothing_weight(0.3, 0.05)
+        weights = random_weights(arch, seed)
     else:
         found = Bundle.load(bundle)
         arch, weights, laid, named, scaler = found.arch, dict(found.weights), found.layout, found.gestures, found.scaler
-        refuse_undeployable(arch)
-        if arch.padding != "stream":
-            raise ArchError(f"{arch.title} has the padding '{arch.padding}': the comparison needs 'stream'.")
-        smoothing = fixed.smoothing_weight(0.3, arch.step / laid.rate_hz)
+    refuse_undeployable(arch)
+    if arch.padding != "stream":
+        raise ArchError(f"{arch.title} has the padding '{arch.padding}': the comparison needs 'stream'.")
     if form == "cheapest":
         form = min(("window", "span"), key=lambda f: macs_of(arch, f))
-    return _filled(arch, weights, laid, named, scaler, smoothing, form, seed)
+    return _filled(arch, weights, laid, named, scaler, form, seed)
 
 
 def _filled(
@@ -112,7 +111,6 @@ def _filled(
     layout: Layout,
     gestures: GestureSet,
     scaler: Scaler | None,
-    smoothing: int,
     form: str,
     seed: int,
 ) -> Case:
@@ -123,19 +121,24 @@ def _filled(
     x = network_inputs(frames[:, 1:].astype(np.int64), layout)
     at = first + APART * np.arange(CALIBRATED + CHECKED)
     ends = arch.span + arch.step * at
-    spans = np.stack([x[end - arch.span : end].T for end in ends])
-    scaler = scaler or Scaler.fit(spans[:CALIBRATED])
-    ranges = calibrate(Network(arch, weights), scaler.apply(spans[:CALIBRATED]))
-    model = IntegerModel(quantize(arch, weights, scaler, ranges), layout, gestures, smoothing)
-    windows = scaler.apply(np.stack([x[end - length : end].T for end in ends]))
-    stream = Network(arch, weights).forward(scaler.apply(spans[CALIBRATED:]))
+    raw = np.stack([x[end - arch.span : end].T for end in ends])
+    bundle = Bundle(arch, weights, layout, scaler or Scaler.fit(raw[:CALIBRATED]), gestures)
+    bundle = calibrated(bundle, raw[:CALIBRATED])
+    spans = bundle.scaler.apply(raw)
+    windows = bundle.scaler.apply(np.stack([x[end - length : end].T for end in ends]))
+    stream = Network(arch, weights).forward(spans[CALIBRATED:])
     plain = fold(arch, weights)
-    apart = np.abs(forward(arch, plain, scaler.apply(spans[CALIBRATED:][:4]), padded=False) - stream[:4]).max()
+    apart = np.abs(forward(arch, plain, spans[CALIBRATED:][:4], padded=False) - stream[:4]).max()
     if apart > 1e-3 * np.abs(stream).max():
         raise ArchError(f"Folding the normalisation of {arch.title} changed its answers by {apart:.2g}: a bug here.")
     answers = forward(arch, plain, windows[CALIBRATED:], padded=form == "window")
+    # The stream's blocks of `step` samples end where its decisions do.
+    steps = bundle.scaler.apply(x[arch.span % arch.step :].T[None])[0]
+    steps = np.ascontiguousarray(steps.reshape(len(steps), -1, arch.step).transpose(1, 0, 2))
+    given = {"window": {"x": windows[:CALIBRATED]}, "stream": stream_inputs(arch, plain, spans[:CALIBRATED])}
     return Case(
-        arch, model, form, plain, frames, windows[:CALIBRATED], windows[CALIBRATED:], at[CALIBRATED:], stream, answers
+        arch, bundle, integer_model(bundle), form, plain, frames, given, windows[CALIBRATED:], steps,
+        at[CALIBRATED:] - decisions - 1, stream, answers,
     )  # fmt: skip
 
 
@@ -172,14 +175,43 @@ def fold(arch: Arch, weights: dict[str, NDArray[np.float32]]) -> dict[str, NDArr
     return {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in found.items()}
 
 
-def forward(arch: Arch, plain: dict[str, NDArray[np.float32]], x: NDArray[np.float32], *, padded: bool) -> Floats:
-    """Return the float logits (N, K) of windows (N, C, T); ``padded`` puts zeros before each layer's first sample."""
-    z = x.astype(np.float64)
+def layer_inputs(
+    arch: Arch, plain: dict[str, NDArray[np.float32]], x: NDArray[np.float32], *, padded: bool
+) -> list[Floats]:
+    """Return what each layer reads (N, C, T) from windows (N, C, T), and last what the pooling reads.
+
+    ``padded`` puts zeros before each layer's first sample.
+    """
+    read, z = [], x.astype(np.float64)
     for i, layer in enumerate(arch.layers):
         if padded:
             z = np.pad(z, ((0, 0), (0, 0), (layer.reach, 0)))
+        read.append(z)
         length = z.shape[2] - layer.reach
         taps = [z[:, :, k * layer.dilation : k * layer.dilation + length] for k in range(layer.kernel)]
-        z = sum(np.einsum("fc,nct->nft", plain[f"w{i}"][:, :, k], tap) for k, tap in enumerate(taps))
+        z = sum(plain[f"w{i}"][:, :, k].astype(np.float64) @ tap for k, tap in enumerate(taps))
         z = np.maximum(z + plain[f"b{i}"][:, None], 0.0)
+    return [*read, z]
+
+
+def forward(arch: Arch, plain: dict[str, NDArray[np.float32]], x: NDArray[np.float32], *, padded: bool) -> Floats:
+    """Return the float logits (N, K) of windows (N, C, T)."""
+    z = layer_inputs(arch, plain, x, padded=padded)[-1]
     return z.mean(axis=2) @ plain["dense_w"].T + plain["dense_b"]
+
+
+def stream_inputs(
+    arch: Arch, plain: dict[str, NDArray[np.float32]], spans: NDArray[np.float32]
+) -> dict[str, NDArray[np.float32]]:
+    """Return what the graph of a step reads at the end of each span (N, C, span).
+
+    ``x`` are the new samples, ``history`` the inputs that a layer still needs, ``blocks`` the means of the last layer
+    over each earlier step of the pooling.
+    """
+    *read, last = layer_inputs(arch, plain, spans, padded=False)
+    given = {"x": read[0][:, :, -arch.step :]}
+    for i, (layer, z) in enumerate(zip(arch.layers, read, strict=True)):
+        if layer.reach:
+            given[f"history{i}"] = z[:, :, -arch.step - layer.reach : -arch.step]
+    given["blocks"] = last.reshape(*last.shape[:2], -1, arch.step).mean(axis=3)[:, :, :-1]
+    return {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in given.items()}

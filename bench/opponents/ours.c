@@ -70,6 +70,7 @@ void bench_run(long decisions)
         for (s = 0; s < toy.step; s++) {
             row[s] = (uint8_t)(row[s] + 37u * (s + 1u));
             memcpy(next_row(&toy.layer[0]), row, toy.inputs);
+            toy.filled = (uint16_t)s; /* where in the step it is */
             network_sample(&toy);
         }
         dense(&toy);

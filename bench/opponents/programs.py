@@ -1,9 +1,10 @@
-"""Programs in C to compare: PlushSense, the plain window, and the output of onnx2c; `running` runs them."""
+"""Programs in C to compare: PlushSense, plain loops, the output of onnx2c, CMSIS-NN."""
 
 from __future__ import annotations
 
 import shutil
 import subprocess
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -11,6 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from opponents.case import Case
+from opponents.tables import LOOPS_ROW, ONNX2C_ROW, OUR_ROW, PLAIN_ROW, WHOLE_ROW
+
+from plushsense.deploy import profile
+from plushsense.deploy.emit import emit, read_facts
+from plushsense.deploy.targets import build
 
 HERE = Path(__file__).resolve().parent
 STRICT = ("-std=gnu99", "-Wall", "-Wextra", "-Werror")
@@ -22,14 +28,13 @@ class CannotBuild(Exception):
 
 @dataclass(frozen=True)
 class Entry:
-    """A row of the table.
+    """A program that decides on this computer.
 
-    ``reads`` is the input of a decision: ``frames``, ``stream`` (network only) or ``window``. Sizes are in bytes, None
-    where they are not known.
+    ``reads`` is the input of a decision: ``frames``, ``inputs`` (our network only), or that of an algorithm: ``window``
+    or ``stream``. Sizes are in bytes, None where they are not known.
     """
 
     name: str
-    family: str
     reads: str
     command: list[str]
     model_bytes: int | None = None
@@ -93,18 +98,16 @@ def ours(case: Case, shop: Workshop) -> list[Entry]:
     entries = []
     with as_file(files("plushsense.deploy") / "c") as sources:
         memory = int(_call(_asking(shop, sources), shop.folder))
-        include = f"-I{sources}"
-        for level in ("-O2", "-O3"):
-            for what, reads, extra in (
-                ("frames to answer", "frames", ()),
-                ("network only", "stream", ("-DNETWORK_ONLY",)),
-                ("frames to answer, plain C", "frames", ("-DPLUSH_PLAIN",)),
-            ):
-                unit = f"ours{len(entries)}"
-                library = shop.compiled(sources / "plushsense.c", f"library-{unit}", "-std=c99", level, *extra)
-                built = shop.compiled(HERE / "ours.c", unit, "-std=gnu99", level, include, *extra)
-                command, code = shop.program(f"run-{unit}", [built]), _sizes(library)[0]
-                entries.append(Entry(f"PlushSense C {level}, {what}", "ours", reads, command, model, code, memory))
+        for name, reads, extra in (
+            (OUR_ROW, "inputs", ("-DNETWORK_ONLY",)),
+            (WHOLE_ROW, "frames", ()),
+            (PLAIN_ROW, "frames", ("-DPLUSH_PLAIN",)),
+        ):
+            unit = f"ours{len(entries)}"
+            library = shop.compiled(sources / "plushsense.c", f"library-{unit}", "-std=c99", "-O2", *extra)
+            built = shop.compiled(HERE / "ours.c", unit, "-std=gnu99", "-O2", f"-I{sources}", *extra)
+            command, code = shop.program(f"run-{unit}", [built]), _sizes(library)[0]
+            entries.append(Entry(name, reads, command, model, code, memory))
     return entries
 
 
@@ -129,53 +132,137 @@ def _table(name: str, values: NDArray[np.float32]) -> str:
     return f"static const float {name}[{values.size}] = {{{numbers}}};\n"
 
 
-def _header(case: Case) -> str:
-    arch, w = case.arch, case.weights
-    padded = case.form == "window"
-    text, calls, length, room = "", [], case.length, case.length * arch.channels
+def _header(case: Case, algorithm: str) -> str:
+    arch, w, stream = case.arch, case.weights, algorithm == "stream"
+    length = arch.step if stream else case.length
+    numbers = {"STREAM": int(stream), "CHANNELS": arch.channels, "WINDOW": length}
+    text, calls, room = "", [], length * arch.channels
     for i, (layer, read) in enumerate(zip(arch.layers, arch.inputs, strict=True)):
         text += _table(f"w{i}", np.ascontiguousarray(w[f"w{i}"].transpose(2, 1, 0))) + _table(f"b{i}", w[f"b{i}"])
-        rows = layer.reach if padded else 0
+        rows = layer.reach if stream or case.form == "window" else 0
+        text += f"static float kept{i}[{max(1, rows * read)}];\n"
+        calls += [f"before({rows}, {length}, {read}, kept{i});"]
         room = max(room, (rows + length) * read)
-        calls.append(f"pad({rows}, {length}, {read});")
-        length = length if padded else length - layer.reach
+        length += rows - layer.reach
         room = max(room, length * layer.filters)
-        calls.append(f"layer({length}, {read}, {layer.filters}, {layer.kernel}, {layer.dilation}, w{i}, b{i});")
+        calls += [f"layer({length}, {read}, {layer.filters}, {layer.kernel}, {layer.dilation}, w{i}, b{i});"]
     text += _table("dense_w", w["dense_w"]) + _table("dense_b", w["dense_b"])
-    numbers = {
-        "CHANNELS": arch.channels, "WINDOW": case.length, "CLASSES": arch.classes, "FEATURES": arch.filters[-1],
-        "POSITIONS": length, "ROOM": room, "MOST_FILTERS": max(arch.filters), "LAYERS": " ".join(calls),
+    # onnx2c's function takes all inputs and then all outputs of the graph.
+    sizes = [values[0].size for name, values in case.calibration[algorithm].items() if name != "x"]
+    at = np.cumsum([0, *sizes]).tolist()
+    before, after = ([f"{name} + {n}" for n in at[:-1]] for name in ("before", "after"))
+    numbers |= {
+        "CLASSES": arch.classes, "FEATURES": arch.filters[-1], "POSITIONS": length,
+        "BLOCKS": arch.pooled // arch.step if stream else 1, "ROOM": room, "MOST_FILTERS": max(arch.filters),
+        "STATES": max(1, at[-1]),
     }  # fmt: skip
-    return "".join(f"#define {name} {value}\n" for name, value in numbers.items()) + text
+    words = {
+        "LAYERS": " ".join(calls), "CALL": ", ".join(["x", *before, "logits", *after]),
+        "ENTRY": ", ".join([*["const void *"] * (1 + len(sizes)), *["void *"] * (1 + len(sizes))]),
+    }  # fmt: skip
+    return "".join(f"#define {name} {value}\n" for name, value in (numbers | words).items()) + text
 
 
-def plain_window(case: Case, shop: Workshop) -> list[Entry]:
-    """Build the float C of this bench: simple loops over the whole window."""
-    (shop.folder / "network.h").write_text(_header(case))
-    entries = []
-    for level in ("-O2", "-O3"):
-        built = shop.compiled(HERE / "window.c", f"window{level}", level, *STRICT, "-Wno-unused-variable")
-        flash, memory = _sizes(built)
-        name = f"plain float C of this bench {level}"
-        entries.append(
-            Entry(name, "plain C", "window", shop.program(f"run-window{level}", [built]), None, flash, memory)
-        )
-    return entries
+def plain_loops(case: Case, shop: Workshop, algorithm: str) -> Entry:
+    """Build the float C of this bench: simple loops."""
+    (shop.folder / "network.h").write_text(_header(case, algorithm))
+    built = shop.compiled(HERE / "floats.c", f"plain-{algorithm}", "-O2", *STRICT, "-Wno-unused-variable")
+    command = shop.program(f"run-plain-{algorithm}", [built])
+    return Entry(LOOPS_ROW, algorithm, command, None, *_sizes(built))
 
 
-def onnx2c(case: Case, shop: Workshop, tool: str, model: Path) -> list[Entry]:
+def onnx2c(case: Case, shop: Workshop, algorithm: str, tool: str, model: Path) -> Entry:
     """Build what onnx2c generates from ``model``."""
     found = shutil.which(tool)
     if found is None:
         raise CannotBuild("onnx2c was not found: build github.com/kraiskil/onnx2c and give --onnx2c PATH")
-    source = shop.folder / "onnx2c.c"
+    source = shop.folder / f"onnx2c-{algorithm}.c"
     source.write_text(_call([found, str(model)], shop.folder))
-    (shop.folder / "network.h").write_text(_header(case))
-    entries = []
-    for level in ("-O2", "-O3"):
-        network = shop.compiled(source, f"onnx2c{level}", level)
-        caller = shop.compiled(HERE / "window.c", f"call-onnx2c{level}", level, "-DONNX2C")
-        flash, memory = _sizes(network)
-        command = shop.program(f"run-onnx2c{level}", [network, caller])
-        entries.append(Entry(f"onnx2c float C {level}", "portable C", "window", command, None, flash, memory))
-    return entries
+    (shop.folder / "network.h").write_text(_header(case, algorithm))
+    network = shop.compiled(source, f"onnx2c-{algorithm}", "-O3")
+    caller = shop.compiled(HERE / "floats.c", f"call-onnx2c-{algorithm}", "-O3", "-DONNX2C")
+    command = shop.program(f"run-onnx2c-{algorithm}", [network, caller])
+    return Entry(ONNX2C_ROW, algorithm, command, None, *_sizes(network))
+
+
+# ---- An emulated Cortex-M4 --------------------------------------------------------------------------------------
+
+CHIP = "cortex-m4"
+CHIP_WINDOWS = 20  # windows to decide on there: each takes millions of instructions
+# What arm_convolve_wrapper_s8 and arm_fully_connected_wrapper_s8 may call.
+CMSIS_NN = {
+    "Convolution": (
+        "arm_convolve_wrapper_s8", "arm_convolve_s8", "arm_convolve_1_x_n_s8", "arm_convolve_1x1_s8",
+        "arm_convolve_1x1_s8_fast", "arm_nn_mat_mult_kernel_s8_s16", "arm_nn_mat_mult_kernel_row_offset_s8_s16",
+    ),
+    "FullyConnected": (
+        "arm_fully_connected_wrapper_s8", "arm_fully_connected_s8", "arm_fully_connected_per_channel_s8",
+    ),
+    "NNSupport": (
+        "arm_nn_mat_mult_nt_t_s8", "arm_nn_vec_mat_mult_t_s8", "arm_nn_vec_mat_mult_t_per_ch_s8",
+        "arm_q7_to_q15_with_offset", "arm_s8_to_s16_unordered_with_offset",
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ChipRow:
+    """Instructions of a decision on the emulated chip, and the logits (N, K), None where they are those of the host."""
+
+    name: str
+    reads: str
+    instructions: float
+    logits: NDArray[np.float64] | None = None
+
+
+def ours_on_chip(case: Case, shop: Workshop) -> list[ChipRow]:
+    """Count our C on the chip, as ``plushsense profile`` does."""
+    folder = shop.folder / "export"
+    emit(case.model, case.bundle, folder)
+    cost = profile.count(folder, CHIP, read_facts(folder))
+    network = sum(cost.stages[name] for name in ("network", "dense", "pooling"))
+    assert cost.step is not None
+    return [ChipRow(OUR_ROW, "inputs", network), ChipRow(WHOLE_ROW, "frames", cost.step)]
+
+
+def require_cmsis_nn(root: Path | None) -> Path:
+    """Return the folder of CMSIS-NN if that is what it is."""
+    if root is None or not (root / "Include" / "arm_nnfunctions.h").is_file():
+        raise CannotBuild("CMSIS-NN was not found: get github.com/ARM-software/CMSIS-NN and give --cmsis-nn DIR")
+    return root
+
+
+def cmsis_nn(
+    case: Case, shop: Workshop, algorithm: str, root: Path, header: Path, logits: tuple[float, int]
+) -> ChipRow:
+    """Count CMSIS-NN with the integers in ``header``; ``logits`` are their scale and zero."""
+    (shop.folder / "integers.h").write_bytes(header.read_bytes())
+    parts = [(root / "Source" / f"{kind}Functions", names) for kind, names in CMSIS_NN.items()]
+    sources = [HERE / "cmsis.c", *(folder / f"{name}.c" for folder, names in parts for name in names)]
+    row = _on_chip(case, shop, sources, header.with_suffix(".bin"), algorithm, 1, include=[root / "Include"])
+    return ChipRow("CMSIS-NN int8 -O3", algorithm, row[0], (row[1].view(np.int8) - float(logits[1])) * logits[0])
+
+
+def onnx2c_on_chip(case: Case, shop: Workshop, algorithm: str) -> ChipRow:
+    """Count the C that `onnx2c` wrote, with the floating-point unit."""
+    (shop.folder / "network.h").write_text(_header(case, algorithm))
+    sources = [shop.folder / f"onnx2c-{algorithm}.c", HERE / "floats.c"]
+    flags = ["-DONNX2C", "-mfpu=fpv4-sp-d16", "-mfloat-abi=softfp"]
+    row = _on_chip(case, shop, sources, shop.folder / f"{algorithm}.bin", algorithm, 4, flags=flags)
+    return ChipRow(ONNX2C_ROW, algorithm, row[0], row[1].view("<f4").astype(np.float64))
+
+
+def _on_chip(
+    case: Case, shop: Workshop, sources: Sequence[Path], inputs: Path, algorithm: str, size: int,
+    *, include: Sequence[Path] = (), flags: Sequence[str] = (),
+) -> tuple[float, NDArray[np.uint8]]:  # fmt: skip
+    """Run `chip.c`; return the mean of instructions, and the bytes of the logits, ``size`` each."""
+    each = size * case.arch.channels * (case.arch.step if algorithm == "stream" else case.length)
+    held, logits = shop.folder / "inputs.bin", size * case.arch.classes
+    held.write_bytes(inputs.read_bytes()[: None if algorithm == "stream" else CHIP_WINDOWS * each])
+    program = build(
+        CHIP, [HERE / "chip.c", *sources], shop.folder / "chip", include=[shop.folder, *include], optimise="-O3",
+        defines={"INPUT_BYTES": each, "LOGIT_BYTES": logits}, blobs={"INPUTS": held}, flags=flags,
+    )  # fmt: skip
+    rows = np.frombuffer(program.run(timeout_s=600), dtype=np.uint8).reshape(-1, 4 + logits)
+    return float(rows[:, :4].copy().view("<u4").mean()), rows[:, 4:].copy()

@@ -2,10 +2,12 @@
 
 This needs NumPy and the runtime, but not PlushSense.
 
-    python worker.py make PEER FOLDER     writes the runtime's model from FOLDER/case.npz; prints facts as JSON
-    python worker.py run PEER FOLDER      decides on request, with the requests of loop.c
+    python worker.py make PEER ALGORITHM FOLDER   writes the runtime's model from FOLDER/ALGORITHM.npz; prints facts
+    python worker.py run PEER ALGORITHM FOLDER    decides on request, with the requests of loop.c
 
-The model's input is set once, so that only the runtime's own call is timed and counted.
+ALGORITHM is "window" or "stream". The graph of the stream reads the samples of one step and, as further inputs, each
+layer's history and the means of earlier steps; it returns the new ones beside the logits. Inputs are set once, so that
+only the runtime's own call is timed and counted: not handing the state back, which only a check does.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ import re
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,22 +32,34 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 Case = Mapping[str, NDArray[Any]]
 Facts = dict[str, Any]
-# Set a window (C, T); decide; return the logits (K,).
-Answer = Callable[[NDArray[np.float32]], NDArray[np.float64]]
 
 
-def int8_of(details: Mapping[str, Any], x: NDArray[Any]) -> NDArray[Any]:
-    """Return floats as the codes of a quantized tensor, or unchanged."""
-    if details["dtype"] == np.float32:
-        return x.astype(np.float32)
+@dataclass
+class Model:
+    """A loaded network: ``put`` sets samples (C, T), ``decide`` is the runtime's own call, ``logits`` reads (K,), and
+    ``carry`` gives the new states back as inputs.
+    """
+
+    put: Callable[[NDArray[np.float32]], object]
+    decide: Callable[[], Any]
+    logits: Callable[[], NDArray[np.float64]]
+    carry: Callable[[], None]
+
+
+def states_of(case: Case) -> dict[str, tuple[int, int]]:
+    """Return the shapes (C, T) of the states, in the order of the inputs; empty for a window."""
+    names = [name.removeprefix("calibration.") for name in case if name.startswith("calibration.")]
+    return {name: case[f"calibration.{name}"].shape[1:] for name in names if name != "x"}
+
+
+def int8_of(details: Mapping[str, Any], x: NDArray[Any]) -> NDArray[np.int8]:
+    """Return floats as the codes of a quantized tensor."""
     scale, zero = _scale(details)
     return np.clip(np.rint(x / scale) + zero, -128, 127).astype(np.int8)
 
 
 def floats_of(details: Mapping[str, Any], x: NDArray[Any]) -> NDArray[np.float64]:
     """Return the codes of a quantized tensor as floats."""
-    if details["dtype"] == np.float32:
-        return x.astype(np.float64)
     scale, zero = _scale(details)
     return (x.astype(np.float64) - zero) * scale
 
@@ -58,151 +73,201 @@ def _scale(details: Mapping[str, Any]) -> tuple[float, int]:
 
 
 def onnx_float(case: Case, path: Path) -> None:
-    """Build ``window`` (1, C, T) → ``logits`` (1, K), with the padding in the convolutions."""
+    """Build ``x`` (1, C, T) → ``logits`` (1, K), for a window with the padding in the convolutions."""
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
-    nodes, held, z = [], [], "window"
+    nodes, held, states, z = [], [], states_of(case), "x"
+
+    def constant(name: str, values: NDArray[Any]) -> str:
+        held.append(numpy_helper.from_array(values, name))
+        return name
+
+    def with_state(name: str, z: str, new: int) -> str:
+        """Put a state before new samples, and let the newest ones be the next state."""
+        nodes.append(helper.make_node("Concat", [name, z], [f"{name}_whole"], name=f"{name}_whole", axis=2))
+        bounds = (("from", new), ("to", new + states[name][1]), ("axis", 2))
+        read = [constant(f"{name}_{what}", np.array([value], dtype=np.int64)) for what, value in bounds]
+        nodes.append(helper.make_node("Slice", [f"{name}_whole", *read], [f"{name}_next"], name=f"{name}_next"))
+        return f"{name}_whole"
+
+    def pooled(name: str, z: str) -> str:
+        nodes.append(helper.make_node("GlobalAveragePool", [z], [name], name=name))
+        return name
+
+    _, channels, length = case["x"].shape
     for i in range(int(case["layers"])):
         w, dilation = case[f"w{i}"], int(case[f"dilation{i}"])
+        if f"history{i}" in states:
+            z = with_state(f"history{i}", z, length)
         pads = [(w.shape[2] - 1) * dilation if case["padded"] else 0, 0]
-        held += [numpy_helper.from_array(case[f"{n}{i}"], f"{n}{i}") for n in ("w", "b")]
         shape = {"kernel_shape": [w.shape[2]], "dilations": [dilation], "pads": pads}
-        nodes.append(helper.make_node("Conv", [z, f"w{i}", f"b{i}"], [f"conv{i}"], name=f"conv{i}", **shape))
+        read = [z, *(constant(f"{n}{i}", case[f"{n}{i}"]) for n in ("w", "b"))]
+        nodes.append(helper.make_node("Conv", read, [f"conv{i}"], name=f"conv{i}", **shape))
         nodes.append(helper.make_node("Relu", [f"conv{i}"], [f"relu{i}"], name=f"relu{i}"))
         z = f"relu{i}"
-    held += [numpy_helper.from_array(case[n], n) for n in ("dense_w", "dense_b")]
-    nodes.append(helper.make_node("GlobalAveragePool", [z], ["pooled"], name="pool"))
-    nodes.append(helper.make_node("Flatten", ["pooled"], ["mean"], name="flat"))
-    nodes.append(helper.make_node("Gemm", ["mean", "dense_w", "dense_b"], ["logits"], name="dense", transB=1))
-    _, channels, length = case["windows"].shape
-    graph = helper.make_graph(
-        nodes,
-        "bench",
-        [helper.make_tensor_value_info("window", TensorProto.FLOAT, [1, channels, length])],
-        [helper.make_tensor_value_info("logits", TensorProto.FLOAT, [1, len(case["dense_b"])])],
-        held,
-    )
+    if "blocks" in states:
+        z = with_state("blocks", pooled("block", z), 1)
+    nodes.append(helper.make_node("Flatten", [pooled("pooled", z)], ["mean"], name="flat"))
+    dense = [constant(n, case[n]) for n in ("dense_w", "dense_b")]
+    nodes.append(helper.make_node("Gemm", ["mean", *dense], ["logits"], name="dense", transB=1))
+
+    def port(name: str, *shape: int) -> Any:
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, *shape])
+
+    starts = [port("x", channels, length), *(port(name, *shape) for name, shape in states.items())]
+    ends = [port("logits", len(case["dense_b"])), *(port(f"{name}_next", *shape) for name, shape in states.items())]
+    graph = helper.make_graph(nodes, "bench", starts, ends, held)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
     onnx.checker.check_model(model)
     onnx.save(model, str(path))
 
 
-def make_onnx(case: Case, folder: Path) -> Facts:
-    onnx_float(case, folder / "float.onnx")
-    return {"model": "float.onnx"}
+def make_onnx(case: Case, path: Path) -> Facts:
+    onnx_float(case, path)
+    return {}
 
 
-def make_onnx_int8(case: Case, folder: Path) -> Facts:
+def make_onnx_int8(case: Case, path: Path) -> Facts:
     from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+
+    names = ["x", *states_of(case)]
 
     class Windows(CalibrationDataReader):  # type: ignore[misc]
         def __init__(self) -> None:
-            self._rows = iter(case["calibration"])
+            self._rows = zip(*(case[f"calibration.{name}"] for name in names), strict=True)
 
         def get_next(self) -> dict[str, NDArray[np.float32]] | None:
             row = next(self._rows, None)
-            return None if row is None else {"window": row[None]}
+            return None if row is None else {name: values[None] for name, values in zip(names, row, strict=True)}
 
-    onnx_float(case, folder / "before.onnx")
+    before = path.with_suffix(".before")
+    onnx_float(case, before)
     quantize_static(
-        str(folder / "before.onnx"), str(folder / "int8.onnx"), Windows(), quant_format=QuantFormat.QDQ,
+        str(before), str(path), Windows(), quant_format=QuantFormat.QDQ,
         per_channel=True, activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8,
     )  # fmt: skip
-    return {"model": "int8.onnx"}
+    return {}
 
 
-def run_onnx(folder: Path, facts: Facts) -> tuple[Callable[[], Any], Answer]:
+def run_onnx(case: Case, path: Path) -> Model:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-    path = str(folder / facts["model"])
-    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     binding = session.io_binding()
-    shape = session.get_inputs()[0].shape
-    x = onnxruntime.OrtValue.ortvalue_from_numpy(np.zeros(shape, dtype=np.float32))
-    binding.bind_ortvalue_input("window", x)
-    classes = session.get_outputs()[0].shape
-    out = onnxruntime.OrtValue.ortvalue_from_numpy(np.zeros(classes, dtype=np.float32))
-    binding.bind_ortvalue_output("logits", out)
-    inner, bound = session._sess.run_with_iobinding, binding._iobinding
 
-    def decide() -> None:
-        inner(bound, None)
+    def bound(bind: Callable[[str, Any], None], port: Any) -> Any:
+        values = onnxruntime.OrtValue.ortvalue_from_numpy(np.zeros(port.shape, dtype=np.float32))
+        bind(port.name, values)
+        return values
 
-    def answer(window: NDArray[np.float32]) -> NDArray[np.float64]:
-        x.update_inplace(np.ascontiguousarray(window[None]))
-        decide()
-        return np.asarray(out.numpy()[0], dtype=np.float64)
+    x, *states = (bound(binding.bind_ortvalue_input, port) for port in session.get_inputs())
+    out, *after = (bound(binding.bind_ortvalue_output, port) for port in session.get_outputs())
+    inner, io = session._sess.run_with_iobinding, binding._iobinding
 
-    return decide, answer
+    def carry() -> None:
+        for state, values in zip(states, after, strict=True):
+            state.update_inplace(values.numpy())
+
+    return Model(
+        lambda samples: x.update_inplace(np.ascontiguousarray(samples[None])), lambda: inner(io, None),
+        lambda: np.asarray(out.numpy()[0], dtype=np.float64), carry,
+    )  # fmt: skip
 
 
 # ---- LiteRT and TensorFlow Lite Micro ---------------------------------------------------------------------------
 
 
-def make_tflite(case: Case, folder: Path) -> Facts:
+def make_tflite(case: Case, path: Path) -> Facts:
     from opponents.tflite import float_model, quantized
 
-    (folder / "int8.tflite").write_bytes(quantized(float_model(case), case))
-    return {"model": "int8.tflite"}
+    path.write_bytes(quantized(float_model(case), case))
+    return {}
 
 
-def make_tflite_micro(case: Case, folder: Path) -> Facts:
+def make_cmsis_nn(case: Case, path: Path) -> Facts:
+    from opponents.tflite import float_model, integers, quantized
+
+    header, scales = integers(quantized(float_model(case), case), case)
+    path.write_text(header)
+    (scale, zero), x = scales["input"], case["x"].transpose(0, 2, 1)
+    path.with_suffix(".bin").write_bytes(np.clip(np.rint(x / scale) + zero, -128, 127).astype(np.int8).tobytes())
+    return {"logits": scales["logits"]}
+
+
+def make_tflite_micro(case: Case, path: Path) -> Facts:
     from tflite_micro.python.tflite_micro import runtime
 
-    facts = make_tflite(case, folder)
+    make_tflite(case, path)
     with tempfile.TemporaryFile() as said:
         before = os.dup(2)
         os.dup2(said.fileno(), 2)
         try:
-            interpreter = runtime.Interpreter.from_file(str(folder / facts["model"]), arena_size=1 << 20)
+            interpreter = runtime.Interpreter.from_file(str(path), arena_size=1 << 20)
             interpreter.print_allocations()
             del interpreter
         finally:
             os.dup2(before, 2)
         said.seek(0)
         found = re.search(rb"Arena allocation total (\d+)", said.read())
-    return {**facts, "memory_bytes": int(found[1]) if found else None}
+    return {"memory_bytes": int(found[1]) if found else None}
 
 
-def run_litert(folder: Path, facts: Facts) -> tuple[Callable[[], Any], Answer]:
+def run_litert(case: Case, path: Path) -> Model:
     from ai_edge_litert import interpreter as litert
 
-    interpreter = litert.Interpreter(model_path=str(folder / facts["model"]), num_threads=1)
+    interpreter = litert.Interpreter(model_path=str(path), num_threads=1)
     interpreter.allocate_tensors()
-    read, given = interpreter.get_input_details()[0], interpreter.get_output_details()[0]
-    decide = interpreter._interpreter.Invoke
-
-    def answer(window: NDArray[np.float32]) -> NDArray[np.float64]:
-        interpreter.set_tensor(read["index"], int8_of(read, window.T[None, None]))
-        decide()
-        return floats_of(given, interpreter.get_tensor(given["index"])[0])
-
-    return decide, answer
+    starts, ends = interpreter.get_input_details(), interpreter.get_output_details()
+    return tflite_model(
+        case, interpreter, starts, ends, lambda i, values: interpreter.set_tensor(starts[i]["index"], values),
+        lambda i: interpreter.get_tensor(ends[i]["index"]),
+    )  # fmt: skip
 
 
-def run_tflite_micro(folder: Path, facts: Facts) -> tuple[Callable[[], Any], Answer]:
+def run_tflite_micro(case: Case, path: Path) -> Model:
     from tflite_micro.python.tflite_micro import runtime
 
-    interpreter = runtime.Interpreter.from_file(str(folder / facts["model"]), arena_size=1 << 20)
-    read, given = interpreter.get_input_details(0), interpreter.get_output_details(0)
-    decide = interpreter._interpreter.Invoke
+    interpreter = runtime.Interpreter.from_file(str(path), arena_size=1 << 20)
+    ports = range(1 + len(states_of(case)))
+    starts, ends = ([of(i) for i in ports] for of in (interpreter.get_input_details, interpreter.get_output_details))
+    return tflite_model(
+        case, interpreter, starts, ends, lambda i, values: interpreter.set_input(values, i), interpreter.get_output
+    )
 
-    def answer(window: NDArray[np.float32]) -> NDArray[np.float64]:
-        interpreter.set_input(int8_of(read, window.T[None, None]), 0)
-        decide()
-        return floats_of(given, interpreter.get_output(0)[0])
 
-    return decide, answer
+def tflite_model(
+    case: Case,
+    interpreter: Any,
+    starts: Sequence[Mapping[str, Any]],
+    ends: Sequence[Mapping[str, Any]],
+    put: Callable[[int, NDArray[Any]], None],
+    get: Callable[[int], NDArray[Any]],
+) -> Model:
+    """Return the model of an interpreter, whose states must have the same scale before and after a step."""
+    for i in range(1, 1 + len(states_of(case))):
+        if list(starts[i]["shape"]) != list(ends[i]["shape"]) or _scale(starts[i]) != _scale(ends[i]):
+            raise SystemExit(f"state {i} goes in as {starts[i]} and comes out as {ends[i]}")
+        put(i, int8_of(starts[i], np.zeros(starts[i]["shape"])))
+
+    def carry() -> None:
+        # All are read first: TensorFlow Lite Micro lets inputs and outputs share memory.
+        for i, values in [(i, get(i).copy()) for i in range(1, len(starts))]:
+            put(i, values)
+
+    return Model(
+        lambda samples: put(0, int8_of(starts[0], samples.T[None, None])), interpreter._interpreter.Invoke,
+        lambda: floats_of(ends[0], get(0)[0]), carry,
+    )  # fmt: skip
 
 
 # ---- ExecuTorch -------------------------------------------------------------------------------------------------
 
 
-def make_executorch(case: Case, folder: Path) -> Facts:
+def make_executorch(case: Case, path: Path) -> Facts:
     import torch
     from executorch.backends.xnnpack.partition.xnnpack_partitioner import XnnpackPartitioner
     from executorch.backends.xnnpack.quantizer.xnnpack_quantizer import (
@@ -212,76 +277,100 @@ def make_executorch(case: Case, folder: Path) -> Facts:
     from executorch.exir import to_edge_transform_and_lower
     from torchao.quantization.pt2e.quantize_pt2e import convert_pt2e, prepare_pt2e
 
-    class Window(torch.nn.Module):  # type: ignore[misc]
-        """The network from (1, C, 1, T) to (1, K)."""
+    names = list(states_of(case))
+
+    class Graph(torch.nn.Module):  # type: ignore[misc]
+        """The network from (1, C, 1, T) and states to (1, K) and states."""
 
         def __init__(self) -> None:
             super().__init__()
-            parts: list[torch.nn.Module] = []
+            layers: list[torch.nn.Module] = []
             for i in range(int(case["layers"])):
                 w, dilation = case[f"w{i}"], int(case[f"dilation{i}"])
-                if case["padded"]:
-                    parts.append(torch.nn.ZeroPad2d(((w.shape[2] - 1) * dilation, 0, 0, 0)))
                 conv = torch.nn.Conv2d(w.shape[1], len(w), (1, w.shape[2]), dilation=(1, dilation))
                 conv.weight.data = torch.tensor(w[:, :, None])
                 conv.bias.data = torch.tensor(case[f"b{i}"])
-                parts += [conv, torch.nn.ReLU()]
-            self.layers = torch.nn.Sequential(*parts)
+                pad = torch.nn.ZeroPad2d(((w.shape[2] - 1) * dilation if case["padded"] else 0, 0, 0, 0))
+                layers.append(torch.nn.Sequential(*([pad] if case["padded"] else []), conv, torch.nn.ReLU()))
+            self.layers = torch.nn.ModuleList(layers)
             self.dense = torch.nn.Linear(case["dense_w"].shape[1], len(case["dense_w"]))
             self.dense.weight.data = torch.tensor(case["dense_w"])
             self.dense.bias.data = torch.tensor(case["dense_b"])
 
-        def forward(self, x: Any) -> Any:
-            return self.dense(self.layers(x).mean((2, 3), keepdim=True).flatten(1))
+        def forward(self, z: Any, *states: Any) -> Any:
+            before, after = dict(zip(names, states, strict=True)), []
 
-    def given(row: NDArray[np.float32]) -> Any:
-        return torch.tensor(row[None, :, None]).contiguous(memory_format=torch.channels_last)
+            def with_state(name: str, z: Any) -> Any:
+                whole = torch.cat([before[name], z], 3)
+                after.append(whole[..., z.shape[3] :])
+                return whole
 
-    module, rows = Window().eval(), case["calibration"]
-    example = (given(rows[0]),)
+            for i, layer in enumerate(self.layers):
+                z = layer(with_state(f"history{i}", z) if f"history{i}" in before else z)
+            if "blocks" in before:
+                z = with_state("blocks", z.mean((2, 3), keepdim=True))
+            return self.dense(z.mean((2, 3), keepdim=True).flatten(1)), *after
+
+    module = Graph().eval()
+    rows = list(zip(*(case[f"calibration.{name}"] for name in ("x", *names)), strict=True))
+
+    def given(row: Sequence[NDArray[np.float32]]) -> tuple[Any, ...]:
+        tensors = (torch.tensor(values).reshape(1, len(values), 1, -1) for values in row)
+        return tuple(tensor.contiguous(memory_format=order_of(case)) for tensor in tensors)
+
     quantizer = XNNPACKQuantizer().set_global(get_symmetric_quantization_config(is_per_channel=True))
-    prepared = prepare_pt2e(torch.export.export(module, example).module(), quantizer)
+    prepared = prepare_pt2e(torch.export.export(module, given(rows[0])).module(), quantizer)
     for row in rows:
-        prepared(given(row))
-    whole = torch.export.export(convert_pt2e(prepared), example)
+        prepared(*given(row))
+    whole = torch.export.export(convert_pt2e(prepared), given(rows[0]))
     lowered = to_edge_transform_and_lower(whole, partitioner=[XnnpackPartitioner()])
     left = [str(n.target) for n in lowered.exported_program().graph.nodes if n.op == "call_function"]
-    (folder / "int8.pte").write_bytes(lowered.to_executorch().buffer)
-    outside = [name for name in left if "executorch_call_delegate" not in name and "getitem" not in name]
-    return {"model": "int8.pte", "outside_xnnpack": outside}
+    path.write_bytes(lowered.to_executorch().buffer)
+    return {"outside_xnnpack": [n for n in left if "executorch_call_delegate" not in n and "getitem" not in n]}
 
 
-def run_executorch(folder: Path, facts: Facts) -> tuple[Callable[[], Any], Answer]:
+def order_of(case: Case) -> Any:
+    """Return the memory format of the inputs: XNNPACK's quantized `cat` fails with channels last (executorch 1.5.1)."""
+    import torch
+
+    return torch.contiguous_format if states_of(case) else torch.channels_last
+
+
+def run_executorch(case: Case, path: Path) -> Model:
     import torch
     from executorch.runtime import Runtime
 
     torch.set_num_threads(1)
-    with np.load(folder / "case.npz") as case:
-        _, channels, length = case["windows"].shape
-    method = Runtime.get().load_program(folder / facts["model"]).load_method("forward")
-    x = torch.zeros(1, channels, 1, length).contiguous(memory_format=torch.channels_last)
-    inputs = [x]
+    method = Runtime.get().load_program(path).load_method("forward")
+    shapes = [case["x"].shape[1:], *states_of(case).values()]
+    inputs = [torch.zeros(1, c, 1, n).contiguous(memory_format=order_of(case)) for c, n in shapes]
+    out: list[Any] = []
 
-    def decide() -> Any:
-        return method.execute(inputs)
+    def carry() -> None:
+        for state, values in zip(inputs[1:], out[1:], strict=True):
+            state.copy_(values)
 
-    def answer(window: NDArray[np.float32]) -> NDArray[np.float64]:
-        x.copy_(torch.tensor(window[None, :, None]))
-        return np.asarray(decide()[0][0].numpy(), dtype=np.float64)
+    def decide() -> None:
+        out[:] = method.execute(inputs)
 
-    return decide, answer
+    return Model(
+        lambda samples: inputs[0].copy_(torch.tensor(samples[None, :, None])), decide,
+        lambda: np.asarray(out[0][0].numpy(), dtype=np.float64), carry,
+    )  # fmt: skip
 
 
 # ---- All runtimes -----------------------------------------------------------------------------------------------
 
 Make = Callable[[Case, Path], Facts]
-Run = Callable[[Path, Facts], tuple[Callable[[], Any], Answer]]
-PEERS: dict[str, tuple[Make, Run]] = {
+Run = Callable[[Case, Path], Model]
+# The last only makes C, which programs.py builds.
+PEERS: dict[str, tuple[Make, Run | None]] = {
     "tflite-micro": (make_tflite_micro, run_tflite_micro),
     "litert": (make_tflite, run_litert),
     "executorch": (make_executorch, run_executorch),
     "onnxruntime": (make_onnx, run_onnx),
     "onnxruntime-int8": (make_onnx_int8, run_onnx),
+    "cmsis-nn": (make_cmsis_nn, None),
 }
 PACKAGES = (
     "tflite-micro", "ai-edge-litert", "ai-edge-quantizer", "executorch", "torch", "torchao", "onnxruntime", "onnx",
@@ -289,28 +378,37 @@ PACKAGES = (
 )  # fmt: skip
 
 
-def make(peer: str, folder: Path) -> Facts:
+def make(case: Case, peer: str, path: Path) -> Facts:
     """Build the model file and describe it."""
-    with np.load(folder / "case.npz") as case:
-        facts = PEERS[peer][0](dict(case), folder)
-    facts["model_bytes"] = (folder / facts["model"]).stat().st_size
+    facts = PEERS[peer][0](case, path)
+    facts["model_bytes"] = path.stat().st_size
     facts["versions"] = {}
     for package in PACKAGES:
         try:
             facts["versions"][package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             continue
-    (folder / f"{peer}.json").write_text(json.dumps(facts))
     return facts
 
 
-def serve(peer: str, folder: Path, say: Callable[[str], None]) -> None:
+def serve(case: Case, peer: str, path: Path, say: Callable[[str], None]) -> None:
     """Reply to requests until the input ends."""
-    decide, answer = PEERS[peer][1](folder, json.loads((folder / f"{peer}.json").read_text()))
-    marks = ctypes.CDLL(str(folder / "marks.so")) if (folder / "marks.so").exists() else None
-    with np.load(folder / "case.npz") as case:
-        windows = case["windows"]
-    answer(windows[0])
+    run = PEERS[peer][1]
+    if run is None:
+        raise SystemExit(f"{peer} does not run here")
+    model = run(case, path)
+    shared = path.with_name("marks.so")
+    marks = ctypes.CDLL(str(shared)) if shared.exists() else None
+
+    def answer(samples: NDArray[np.float32]) -> NDArray[np.float64]:
+        model.put(samples)
+        model.decide()
+        logits = model.logits()
+        model.carry()
+        return logits
+
+    answer(case["x"][0])
+    decide = model.decide
     for line in sys.stdin:
         word, _, rest = line.strip().partition(" ")
         if word == "run":
@@ -320,7 +418,7 @@ def serve(peer: str, folder: Path, say: Callable[[str], None]) -> None:
                 decide()
             say(f"{time.perf_counter() - began:.9f}")
         elif word == "check":
-            logits = np.stack([answer(window) for window in windows])
+            logits = np.stack([answer(samples) for samples in case["x"]])
             Path(rest).write_bytes(logits.astype("<f8").tobytes())
             say(str(len(logits)))
         else:
@@ -330,7 +428,7 @@ def serve(peer: str, folder: Path, say: Callable[[str], None]) -> None:
 
 
 def main() -> None:
-    word, peer, folder = sys.argv[1:]
+    word, peer, algorithm, folder = sys.argv[1:]
     # Runtimes print to standard output; keep it for the replies.
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
@@ -338,10 +436,13 @@ def main() -> None:
     def say(text: str) -> None:
         print(text, file=out, flush=True)
 
+    with np.load(Path(folder) / f"{algorithm}.npz") as stored:
+        case = dict(stored)
+    path = Path(folder) / f"{peer}-{algorithm}.model"
     if word == "make":
-        say(json.dumps(make(peer, Path(folder))))
+        say(json.dumps(make(case, peer, path)))
     else:
-        serve(peer, Path(folder), say)
+        serve(case, peer, path, say)
 
 
 if __name__ == "__main__":

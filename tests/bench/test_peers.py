@@ -16,8 +16,9 @@ import pytest
 REPO = Path(__file__).parents[2]
 
 import peers
-from opponents.case import fold, forward, macs_of, make_case
-from opponents.programs import Workshop, ours, plain_window
+from opponents import tables
+from opponents.case import Case, fold, forward, macs_of, make_case
+from opponents.programs import CannotBuild, Workshop, ours, plain_loops, require_cmsis_nn
 from opponents.running import Died, Running
 
 from plushsense.models.arch import Arch
@@ -36,7 +37,7 @@ def compiler(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monke
     compiled, kept = Workshop.compiled, built_once(tmp_path_factory, "peers", lambda draft: None)
 
     def once(shop: Workshop, source: Path, name: str, *flags: str) -> Path:
-        if source.name == "window.c":
+        if source.name == "floats.c":
             return compiled(shop, source, name, *flags)
         if not (kept / f"{name}.o").exists():
             compiled(shop, source, name, *flags).replace(kept / f"{name}.o")
@@ -54,28 +55,29 @@ def main(monkeypatch: pytest.MonkeyPatch, *more: str) -> int:
     return peers.main()
 
 
-def test_without_any_peer_ours_and_the_plain_window_are_measured(
+def test_without_any_peer_ours_and_plain_loops_are_measured_with_both_algorithms(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, done = main(monkeypatch, "--only", "plain", "--json", "--decisions", "3"), capsys.readouterr()
     assert code == 0, done.err
     report = json.loads(done.out)
-    rows = {row["name"]: row for row in report["rows"]}
-    assert len(rows) == 8
-    for name, row in rows.items():
-        assert len(row["seconds"]) == 2 and min(row["seconds"]) > 0, name
-        assert row["memory_bytes"] > 0 and row["code_bytes"] > 0, name
-    plain, mine = rows["plain float C of this bench -O2"], rows[peers.OUR_ROW]
-    assert plain["check"]["agreement"] == 1.0 and plain["check"]["logit_error"] < 1e-5
-    assert mine["check"]["decisions"] == 200 and mine["check"]["agreement"] > 0.85
-    assert 0 < mine["check"]["logit_error"] < 0.2
+    rows = {(row["name"], row["reads"]): row for row in report["rows"]}
+    assert len(rows) == 5
+    for row in rows.values():
+        assert row["us"]["p90"] >= row["us"]["median"] >= row["us"]["p10"] > 0
+        assert row["memory_bytes"] > 0 and row["code_bytes"] > 0
+    stream, window = (rows[tables.LOOPS_ROW, algorithm] for algorithm in peers.ALGORITHMS)
+    for plain in (stream, window):
+        assert plain["check"]["agreement"] == 1.0 and plain["check"]["logit_error"] < 1e-5
+    mine, whole = rows[peers.OUR_ROW, "inputs"], rows[tables.WHOLE_ROW, "frames"]
+    assert whole["check"]["decisions"] == 200 and whole["check"]["agreement"] > 0.85
+    assert 0 < whole["check"]["logit_error"] < 0.2
     assert mine["times_slower"] == 1.0
     if shutil.which("valgrind") is None:
         missing("compilers", "valgrind is not installed")
-    # Five samples against forty, of the same network in the same process, whatever the compiler makes of it.
-    assert 2000 < mine["instructions"] < plain["instructions"]
-    assert plain["times_instructions"] == plain["instructions"] / mine["instructions"]
-    assert mine["instructions"] > rows["PlushSense C -O2, network only"]["instructions"]
+    # Five samples against forty, of the same network in the same loops, whatever the compiler makes of it.
+    assert 1000 < stream["instructions"] < window["instructions"]
+    assert 1000 < mine["instructions"] < whole["instructions"]
 
 
 def test_a_peer_that_is_not_installed_is_named_with_how_to_get_it(
@@ -90,10 +92,11 @@ def test_a_peer_that_is_not_installed_is_named_with_how_to_get_it(
     for title, way in (
         ("LiteRT", "not here: pip install ai-edge-litert ai-edge-quantizer"),
         ("ExecuTorch", "not here: pip install executorch"),
-        ("onnx2c", "not here: pip install onnxruntime onnx"),
+        ("onnx2c", "not here: pip install onnx"),
     ):
-        assert any(line.startswith(title) and line.endswith(way) for line in lines), done.out
-    assert sum("not measured" in line for line in lines) == len(peers.TARGETS)
+        assert sum(line.startswith(title) and line.endswith(way) for line in lines) == 2, done.out
+    with pytest.raises(CannotBuild, match="give --cmsis-nn DIR"):
+        require_cmsis_nn(tmp_path)
 
 
 @pytest.mark.parametrize("bad", [("--arch", "5_x"), ("--bundle", "nowhere.plush"), ("--cc", "no-such-compiler")])
@@ -122,19 +125,32 @@ def test_the_others_read_the_form_that_costs_them_less() -> None:
         assert case.macs == min(macs_of(case.arch, "window"), macs_of(case.arch, "span"))
 
 
-def test_a_plain_window_with_zeros_before_it_gives_the_floats_answer(tmp_path: Path) -> None:
-    case = make_case("5_4d2", "4,6", layout="accel-3", window=40, form="window")
-    case.save(tmp_path)
+@pytest.fixture(scope="module")
+def small() -> Case:
+    return make_case("5_4d2", "4,6", layout="accel-3", window=40, form="window")
+
+
+def test_plain_loops_give_the_floats_answer_of_each_algorithm(small: Case, tmp_path: Path) -> None:
+    small.save(tmp_path)
     shop = Workshop(tmp_path)
-    for entry in (*ours(case, shop), *plain_window(case, shop)):
+    for entry in (*ours(small, shop), *(plain_loops(small, shop, algorithm) for algorithm in peers.ALGORITHMS)):
         with Running(entry.command, tmp_path) as process:
-            near = peers.checked(entry, process, case)
-        if entry.reads == "window":
+            near = peers.checked(entry, process, small)
+        if entry.reads in peers.ALGORITHMS:
             assert near is not None and near["agreement"] == 1.0 and near["logit_error"] < 1e-5
-        if entry.reads == "stream":
+        if entry.reads == "inputs":
             assert near is None
-    # The two forms are not the same question.
-    assert np.abs(case.window_logits - case.stream_logits).max() > 0.01
+    # The two are not the same question.
+    assert np.abs(small.window_logits - small.stream_logits).max() > 0.01
+
+
+def test_a_runtime_with_the_state_as_inputs_and_outputs_gives_the_streams_answer(small: Case, tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    small.save(tmp_path)
+    entry = peers.python_entry("onnxruntime", "stream", sys.executable, Workshop(tmp_path))
+    with Running(entry.command, tmp_path) as process:
+        near = peers.checked(entry, process, small)
+    assert near is not None and near["agreement"] == 1.0 and near["logit_error"] < 1e-5
 
 
 def test_a_program_that_ends_is_told(tmp_path: Path) -> None:
@@ -146,25 +162,53 @@ def test_a_program_that_ends_is_told(tmp_path: Path) -> None:
     assert str(told.value) == "no model"
 
 
-def row(name: str, family: str, seconds: list[float], instructions: float | None) -> dict[str, Any]:
-    return {"name": name, "family": family, "seconds": seconds, "instructions": instructions}
+def row(name: str, reads: str, instructions: float | None, times: float) -> dict[str, Any]:
+    near = {"decisions": 200, "agreement": 0.95, "logit_error": 0.05}
+    sizes = {"model_bytes": 1000, "code_bytes": None, "memory_bytes": None}
+    us = {"median": 10 * times, "p10": 9.0, "p90": 99.0}
+    return {
+        "name": name,
+        "reads": reads,
+        "instructions": instructions,
+        "times_slower": times,
+        "us": us,
+        "check": near,
+    } | sizes
 
 
-def test_targets_are_judged_on_the_nearest_peer() -> None:
+def test_the_tables_separate_kernels_from_algorithms_and_name_who_is_below_the_aim() -> None:
     rows = [
-        row(peers.OUR_ROW, "ours", [1e-5, 2e-5], 100.0),
-        row(peers.PLAIN_ROW, "ours", [2e-5, 2e-5], 300.0),
-        row("big", "portable C", [1e-3, 4e-3], 9000.0),
-        row("small", "portable C", [1e-3, 1e-3], 5400.0),
-        row("quick", "xnnpack", [1e-5, 1e-5], 600.0),
-        row("uncounted", "xnnpack", [1e-5, 1e-5], None),
-    ]
-    peers.compare(rows)
-    assert [r["times_instructions"] for r in rows] == [1.0, 3.0, 90.0, 54.0, 6.0, None]
-    assert rows[2]["times_slower"] == pytest.approx(150.0)  # of the rounds 100 and 200
-    told = peers.verdicts(rows)
-    assert [(t["against"], t["ratio"], t["reached"]) for t in told] == [
-        ("small", 18.0, False),
-        ("quick", 6.0, True),
-        ("quick", 2.0, False),
-    ]
+        row(peers.OUR_ROW, "inputs", 1000.0, 1.0), row(tables.PLAIN_ROW, "frames", 2500.0, 2.5),
+        row(tables.ONNX2C_ROW, "stream", 4000.0, 4.0), row(tables.ONNX2C_ROW, "window", 200_000.0, 400.0),
+        row("quick", "stream", 1400.0, 0.5), row("uncounted", "stream", None, 3.0),
+    ]  # fmt: skip
+    chip = [row(peers.OUR_ROW, "inputs", 2000.0, 9.0), row("CMSIS-NN", "stream", 2480.0, 9.0)]
+    kernels = tables.same_algorithm(rows).markdown().splitlines()
+    assert [line.split(" | ")[:3] for line in kernels[2:]] == [
+        [f"| {peers.OUR_ROW}", "1 000", "1.00"], [f"| {tables.PLAIN_ROW}", "2 500", "2.50"], ["| uncounted", "—", "—"],
+        ["| quick", "1 400", "1.40"], ["| onnx2c float C -O3", "4 000", "4.00"],
+    ]  # fmt: skip
+    (algorithm,) = tables.both_algorithms(rows).markdown().splitlines()[2:]
+    assert algorithm.split(" | ")[:5] == ["| onnx2c float C -O3", "200 000", "50.00", "4000.0 (9.0–99.0)", "100.00"]
+    assert "| CMSIS-NN | stream | 2 480 | 1.24 | 2.48 |" in tables.on_chip(chip, 1000).markdown()
+    told = tables.verdict({"rows": rows, "chip": chip})
+    assert "instructions: quick (1.40), CMSIS-NN on the Cortex-M4 (1.24); by time: quick (0.50)." in told
+    assert told.endswith("toy does: onnx2c float C -O3 1.60.")
+
+
+def test_the_page_has_the_tables_of_the_results_of_the_bench() -> None:
+    """After a change of what the bench prints, measure again with --save (see the page)."""
+    results, text = json.loads(peers.RESULTS.read_text("utf-8")), peers.PAGE.read_text("utf-8")
+    assert peers.page_of(text, results) == text
+    for name, symbol in peers.NETWORKS.items():
+        report = results[name]
+        assert report["case"]["symbol"] == symbol and report["absent"] == {}
+        measured = {(row["name"].split(", ")[0], row["reads"]) for row in report["rows"]}
+        named = [title.split(", ")[0] for title, _ in peers.PEERS.values()]
+        for title in (*named, tables.ONNX2C_ROW, tables.LOOPS_ROW):
+            assert {(title, "stream"), (title, "window")} <= measured
+        assert {row["name"] for row in report["chip"]} >= {peers.OUR_ROW, "CMSIS-NN int8 -O3", tables.ONNX2C_ROW}
+        ours = next(row["instructions"] for row in report["rows"] if row["name"] == peers.OUR_ROW)
+        assert report["case"]["macs_ours"] / 8 < ours < report["case"]["macs"]
+    with pytest.raises(ValueError, match="no place for the network paper"):
+        peers.page_of("", results)
