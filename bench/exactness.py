@@ -76,11 +76,13 @@ def compare(path: str, dataset: str, python: str, peers: list[str]) -> dict[str,
     with tempfile.TemporaryDirectory(prefix="exactness-") as name:
         folder = Path(name)
         if peers:
-            replace(make_case("", "", form="span", bundle=path), calibration=given, windows=spans).save(folder)
+            case = make_case("", "", form="span", bundle=path)
+            calibration = case.calibration | {"window": {"x": given}}
+            replace(case, calibration=calibration, windows=spans).save(folder)
         for peer in peers:
             say(f"{PEERS[peer][0]} …")
             try:
-                entry = python_entry(peer, python, Workshop(folder))
+                entry = python_entry(peer, "window", python, Workshop(folder))
                 with Running(entry.command, folder) as process:
                     rows[entry.name] = closeness(process.check(folder, arch.classes), exact)
             except (CannotBuild, Died) as reason:

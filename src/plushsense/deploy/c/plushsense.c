@@ -20,7 +20,7 @@
 #define INPUT_BYTES 12u     /* offset, bias, multiplier and two shifts of one channel of the network */
 #define LOGIT_LIMIT 16384
 #define SPARE 4u            /* rows for new samples, before those under the taps move */
-#define RING 92u            /* words: see checksum() */
+#define RING 90u            /* words: see checksum() */
 #define WEIGHT_ZERO 128u    /* weights are stored with this added: some cores cannot load a signed byte */
 
 /* Not copied to where it is called: for the registers of a loop, or for the flash; or copied, for the same registers. */
@@ -299,15 +299,13 @@ static uint32_t checksum(const uint8_t *bytes, uint32_t n)
         word = sum;
         sum = 0;
     }
-    while (left >= 89u + 4u) {
-        const uint32_t *end = past + (left < 89u + RING ? (left - 89u) / 4u * 4u : RING);
+    while (left >= 89u + 2u) {
+        const uint32_t *end = past + (left < 89u + RING ? (left - 89u) / 2u * 2u : RING);
 
         left -= (uint32_t)(end - past);
-        for (at = past; at != end; at += 4, words += 16) {
+        for (at = past; at != end; at += 2, words += 8) {
             PLUSH_TAKE_OUT(0);
             PLUSH_TAKE_OUT(1);
-            PLUSH_TAKE_OUT(2);
-            PLUSH_TAKE_OUT(3);
         }
     }
     for (; left > 0; left--, at++, words += 4) {
@@ -2064,7 +2062,9 @@ static const uint8_t *invariants(plush_toy *toy, const int16_t *axes, const uint
     return plan;
 }
 
-/* The vector layer: the other inputs as they are, and what does not turn with the toy of the rest. */
+/* The vector layer: the other inputs as they are, and what does not turn with the toy of the rest. For size, as most
+ * networks have none. */
+PLUSH_SMALL_APART PLUSH_CODE
 static void vector_sample(plush_toy *toy, const int32_t *x, uint8_t *row)
 {
     uint32_t others = toy->inputs - 3u * toy->vectors - 3u, outputs = 3u * toy->vector_kernels, i;
