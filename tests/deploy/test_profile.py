@@ -63,7 +63,7 @@ def test_a_larger_network_costs_more_only_where_it_is_larger(small: Path, tmp_pa
     [
         ("14d1_39d2_41d4", {"xtensa": (225_000, 28), "cortex-m4": (95_000, 26)}),
         ("14d1_19d2_19d4", {"xtensa": (125_000, 22), "cortex-m4": (52_000, 22), "riscv32": (125_000, 22)}),
-        ("v14_17d2_19d4", {"xtensa": (185_000, 25), "cortex-m4": (85_000, 24)}),
+        ("v14_17d2_19d4", {"xtensa": (185_000, 26), "cortex-m4": (85_000, 24)}),
     ],
 )
 def test_the_networks_of_the_issue_stay_within_their_limits(

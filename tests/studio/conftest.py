@@ -25,13 +25,12 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def studio(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Studio]]:
+def studio(tmp_path: Path) -> Iterator[Callable[..., Studio]]:
     """``studio("--device", URL, home=...)`` starts one; all are stopped at the end, and none may have failed inside."""
     begun: list[Studio] = []
-    objects = built_once(tmp_path_factory, "objects", lambda draft: None)
 
     def start(*options: str, home: Path | None = None, **more: Any) -> Studio:
-        begun.append(Studio(home or tmp_path / "home", options, objects=objects, **more).start())
+        begun.append(Studio(home or tmp_path / "home", options, **more).start())
         return begun[-1]
 
     yield start

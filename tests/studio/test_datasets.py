@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.dataset.backup import check_backup
-from support.browsing import axe, marked
+from support.browsing import LONG_MS, axe, marked
 
 Fixture = Callable[..., Any]
-LONG_MS = 90_000
 
 
 def test_a_backup_is_made_a_person_removed_and_the_backup_restored(studio: Fixture, look: Fixture, home: Path) -> None:

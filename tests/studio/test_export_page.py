@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from support.browsing import TABLET, axe, connected, marked
+from support.browsing import LONG_MS, TABLET, axe, connected, marked
 from support.exported import bundle_of, flip, sums
 
 Fixture = Callable[..., Any]
@@ -48,7 +48,7 @@ def test_export_verify_and_break(
     )
     marked(page, "name").fill("one")
     marked(page, "do").click()
-    marked(page, "export-facts").wait_for(timeout=60_000)
+    marked(page, "export-facts").wait_for(timeout=LONG_MS)
     command = [sys.executable, "-m", "plushsense", "export", str(home / "bundles" / "little.plush")]
     subprocess.run([*command, str(tmp_path / "two")], check=True, capture_output=True)
     assert sums(home / "exports" / "one") == sums(tmp_path / "two")
@@ -106,7 +106,7 @@ def test_export_verify_and_break(
     assert sideways(tablet) == 0 and axe(tablet) == []
     shots(tablet, "export-lv-dark-tablet")
     marked(tablet, "stop").click()
-    marked(page, "ended").wait_for(timeout=60_000)
+    marked(page, "ended").wait_for(timeout=LONG_MS)
     assert "Stopped: Verify “one”" in marked(page, "ended").inner_text()
     assert browser.complaints == [] and other.complaints == []
 

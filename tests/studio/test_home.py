@@ -9,11 +9,10 @@ from typing import Any
 import pytest
 
 from plushsense.studio.app.workspace import DATASETS, Workspace
-from support.browsing import DESK, TABLET, axe, marked
+from support.browsing import DESK, LONG_MS, TABLET, axe, marked
 from support.recorded import record
 
 Fixture = Callable[..., Any]
-LONG_MS = 90_000
 
 
 def test_from_nothing_to_a_data_set_by_one_click(studio: Fixture, look: Fixture, tmp_path: Path) -> None:

@@ -15,10 +15,9 @@ from plushsense.core.sentences import Sentence
 from plushsense.dataset.backup import backup
 from plushsense.studio.app.workspace import DATASETS
 from plushsense.studio.tasks import TaskReporter, run_inspect
-from support.browsing import TABLET, axe, marked
+from support.browsing import LONG_MS, TABLET, axe, marked
 
 Fixture = Callable[..., Any]
-LONG_MS = 90_000
 
 
 def recordings(furniture: Path, person: str, count: int = 3) -> list[Path]:

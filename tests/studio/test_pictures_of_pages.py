@@ -19,7 +19,7 @@ import pytest
 import plushsense as ps
 from plushsense.studio.app.shell import PAGES
 from plushsense.studio.app.workspace import Workspace
-from support.browsing import DESK, PHONE, TABLET, Look, Studio, axe, connected, english, marked
+from support.browsing import DESK, LONG_MS, PHONE, TABLET, Look, Studio, axe, connected, english, marked
 from support.recorded import record
 from support.recording_pages import begun, sat, showing
 from support.requirements import missing
@@ -56,7 +56,7 @@ def _home(page: Any, studio: Studio) -> None:
         marked(page, "chosen").wait_for()
     if not marked(page, "job-done").count():
         marked(page, "check").click()
-    marked(page, "job-done").first.wait_for(timeout=90_000)
+    marked(page, "job-done").first.wait_for(timeout=LONG_MS)
     if not marked(page, "trial").count():
         marked(page, "test").click()
     page.locator("[data-test=trial].ps-message-good").wait_for()
@@ -109,7 +109,7 @@ def _export(page: Any, studio: Studio) -> None:
     if not (studio.home / "exports" / "little").exists():
         marked(page, "name").fill("little")
         marked(page, "do").click()
-        marked(page, "export-facts").wait_for(timeout=90_000)
+        marked(page, "export-facts").wait_for(timeout=LONG_MS)
         page.goto(f"{studio.url}/export?name=little")
         connected(page)
     marked(page, "export-facts").wait_for()

@@ -14,7 +14,7 @@ import pytest
 from plushsense.dataset.about import Creator
 from plushsense.dataset.publishing.checking import VALIDATORS
 from plushsense.dataset.store import DatasetHead
-from support.browsing import TABLET, axe, connected, marked
+from support.browsing import LONG_MS, TABLET, axe, connected, marked
 
 Fixture = Callable[..., Any]
 pytestmark = pytest.mark.usefixtures("publish_tools")
@@ -51,7 +51,7 @@ def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture,
     marked(page, "stop").wait_for()
     page.reload()
     connected(page)
-    marked(page, "validators").wait_for(timeout=90_000)
+    marked(page, "validators").wait_for(timeout=LONG_MS)
     answers = marked(page, "validators").inner_text()
     assert all(name in answers for name in VALIDATORS) and answers.count("✓ passed") == len(VALIDATORS)
     assert "recognises the right one of 3 people" in marked(page, "recognised").inner_text()
@@ -90,7 +90,7 @@ def test_publish_check_and_break(studio: Fixture, look: Fixture, shots: Fixture,
     other = look(TABLET, dark=True, language="lv", touch=True)
     tablet = other.open(f"{url}/publish?name=one")
     marked(tablet, "check").click()
-    marked(tablet, "problems").wait_for(timeout=90_000)
+    marked(tablet, "problems").wait_for(timeout=LONG_MS)
     assert "✗ nederīga" in marked(tablet, "answers").inner_text()
     assert "gestures.csv" in marked(tablet, "problems").inner_text()
     assert axe(tablet) == []
@@ -118,7 +118,7 @@ def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, shots: Fix
     assert axe(page) == []
     shots(page, "publish-pseudonyms")
     marked(page, "rename-do").click()
-    marked(page, "go-renamed").wait_for(timeout=60_000)
+    marked(page, "go-renamed").wait_for(timeout=LONG_MS)
     assert (few / "keys" / "people.csv").is_file() and not list((few / "datasets" / "shared").rglob("people.csv"))
     marked(page, "go-renamed").click()
     marked(page, "renamed-already").wait_for()
@@ -131,7 +131,7 @@ def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, shots: Fix
     marked(page, "name").fill("stopped")
     marked(page, "do").click()
     marked(page, "stop").click()
-    marked(page, "ended").get_by_text("Stopped").wait_for(timeout=60_000)
+    marked(page, "ended").get_by_text("Stopped").wait_for(timeout=LONG_MS)
     assert not (few / "packages" / "stopped.zip").exists()
     # What was said is still there, and the disk's refusal is a sentence.
     shutil.rmtree(few / "packages", ignore_errors=True)
@@ -141,7 +141,7 @@ def test_pseudonyms_refusals_and_stop(studio: Fixture, look: Fixture, shots: Fix
     assert marked(page, "contact-mail").input_value() == "ada@example.org"
     marked(page, "with-reidentification").click()
     marked(page, "do").click()
-    marked(page, "ended").get_by_text("cannot be created").wait_for(timeout=60_000)
+    marked(page, "ended").get_by_text("cannot be created").wait_for(timeout=LONG_MS)
     page.goto(f"{url}/publish?name=nothing")
     connected(page)
     assert "There is no package “nothing”" in marked(page, "message").inner_text()

@@ -18,7 +18,7 @@ from zipfile import ZipFile
 
 from plushsense.devices.virtual.session import GESTURES
 from plushsense.studio.app.words import Words
-from support.browsing import axe, connected, english, marked
+from support.browsing import LONG_MS, axe, connected, english, marked
 from support.recording_pages import heard, showing, start_recording
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def test_a_therapist_can_do_it_alone(studio: Fixture, look: Fixture, shots: Fixt
 
     with t.step("look at the recordings"):
         t.press(W("record.collect"))
-        t.page.wait_for_url("**/review?dataset=**", timeout=120_000)
+        t.page.wait_for_url("**/review?dataset=**", timeout=LONG_MS)
         marked(t.page, "accept-sure").wait_for()
 
     with t.step("second child"):
@@ -138,7 +138,7 @@ def test_a_therapist_can_do_it_alone(studio: Fixture, look: Fixture, shots: Fixt
         connected(t.page)
         record(t, CLOSED, len(GESTURES))
         t.press(W("record.collect"))
-        t.page.wait_for_url("**/review?dataset=**", timeout=120_000)
+        t.page.wait_for_url("**/review?dataset=**", timeout=LONG_MS)
 
     with t.step("what is doubtful"):
         before = marked(t.page, "accept-sure").inner_text()

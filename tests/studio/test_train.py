@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import shutil
@@ -15,13 +16,12 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from plushsense.cli.main import main
-from support.browsing import TABLET, axe, marked
+from support.browsing import LONG_MS, TABLET, axe, marked
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
 Fixture = Callable[..., Any]
-_LONG_MS = 90_000
 PHONE = (390, 844)
 
 
@@ -53,7 +53,7 @@ def kind(page: Page, name: str) -> None:
 
 def state(page: Page, wanted: str) -> Any:
     found = page.locator(f'[data-test="job"][data-state="{wanted}"]').first
-    found.wait_for(timeout=_LONG_MS)
+    found.wait_for(timeout=LONG_MS)
     return found
 
 
@@ -83,7 +83,7 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
             "(least) => +((document.querySelector('[data-test=at]')?.textContent.match(/epoch (\\d+) of/) || [])[1]"
             " || 0) >= least",
             arg=least,
-            timeout=_LONG_MS,
+            timeout=LONG_MS,
         )
         while not list(kept.glob("[!.]*.npz")):
             page.wait_for_timeout(20)
@@ -283,7 +283,10 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     studio: Fixture, look: Fixture, shots: Fixture, home: Path
 ) -> None:
     (home / "tiny.toml").write_text(_GRID, encoding="utf-8")
-    (home / "little.toml").write_text(_GRID, encoding="utf-8")
+    # As many threads as there are cores: its networks are trained in the process of the job, not in processes of their
+    # own, which would each load PyTorch again for each rung. The tests' own os.cpu_count() is 1.
+    threads = len(os.sched_getaffinity(0))
+    (home / "little.toml").write_text(_GRID.replace("[grid]", f"[grid]\nthreads = {threads}"), encoding="utf-8")
     (home / "wrong.toml").write_text('[grid]\nepochs = [0]\narchitectures = ["14x"]\n', encoding="utf-8")
     browser = look()
     page = browser.open(f"{studio(home=home).url}/train")
@@ -291,7 +294,7 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     marked(page, "split-about").get_by_text("leaky", exact=True).first.wait_for()
     choose(page, "grid", "wrong.toml")
     marked(page, "estimate").click()
-    marked(page, "plan").get_by_role("alert").wait_for(timeout=_LONG_MS)
+    marked(page, "plan").get_by_role("alert").wait_for(timeout=LONG_MS)
     said = marked(page, "plan").inner_text()
     assert "Epochs 0 cannot be trained" in said
     assert "14x" in said
@@ -300,7 +303,7 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     marked(page, "start").click()
     marked(page, "message").get_by_text("Look at the cost first").wait_for()
     marked(page, "estimate").click()
-    marked(page, "plan-text").wait_for(timeout=_LONG_MS)
+    marked(page, "plan-text").wait_for(timeout=LONG_MS)
     assert "4 trials in 4 trainings (folds: 1, seeds: 1), 0 done before" in marked(page, "plan-text").inner_text()
     marked(page, "plan").get_by_text("leaky", exact=True).first.wait_for()
     assert axe(page) == []
@@ -329,10 +332,10 @@ def test_a_sweep_shows_its_cost_first_and_its_front_in_the_end(
     choose(page, "split", "15 % of the windows")
     fill(page, "max_parameters", "1400")
     marked(page, "estimate").click()
-    marked(page, "plan-text").get_by_text("networks compared after 1, 2 epochs, 1 beyond").wait_for(timeout=_LONG_MS)
+    marked(page, "plan-text").get_by_text("networks compared after 1, 2 epochs, 1 beyond").wait_for(timeout=LONG_MS)
     marked(page, "start").click()
     found_job = page.locator('[data-test="job"][data-state="done"]', has_text="Find a small network")
-    found_job.wait_for(timeout=_LONG_MS)
+    found_job.wait_for(timeout=LONG_MS)
     (found,) = (home / "datasets" / "virtual" / "evaluations").glob("search-little-*")
     best = json.loads((found / "search.json").read_text(encoding="utf-8"))["winner"]
     assert best["parameters"] <= 1400
@@ -400,7 +403,7 @@ def test_one_button_makes_a_network_that_a_stop_does_not_lose(
     # While the network is tested, it is saved already.
     page.wait_for_function(
         "() => document.querySelector('[data-test=at]')?.textContent.includes('pārbauda ar svešiem cilvēkiem')",
-        timeout=_LONG_MS,
+        timeout=LONG_MS,
     )
     marked(page, "stop").click()
     stopped = state(page, "stopped")

@@ -8,11 +8,9 @@ import json
 import multiprocessing
 import os
 import re
-import select
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 import threading
 from collections.abc import Coroutine
@@ -21,15 +19,10 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import urlsplit
 
-from plushsense.deploy import profile
-from plushsense.deploy.proof import verify
-from plushsense.studio.app import jobs
 from plushsense.studio.app.shell import PAGES
-from support.kept_objects import keeping
 
 if TYPE_CHECKING:
     from playwright.sync_api import BrowserContext, Page, Request
@@ -48,106 +41,24 @@ CHROMIUM = [
 ]
 _PROGRAMS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 _START_S = 120.0
-_WAIT_MS = 60_000
+_WAIT_MS = 120_000
 _SETTLE_MS = 200
 _POLL_MS = 25
 _LOOKS = 4
+LONG_MS = 300_000
+"""How long to wait for a job of the studio."""
 DESK, TABLET, PHONE = (1280, 800), (820, 1180), (390, 844)
 
 
-# Importing takes longer than starting: a server process imports once, and every studio and task is forked from it.
+# Importing takes longer than starting: a server process imports once, and every studio is forked from it.
 _FORKING = multiprocessing.get_context("forkserver")
 _FORKING.set_forkserver_preload(
-    [
-        *("nicegui", "plushsense.studio.app.serve"),
-        *(f"plushsense.studio.pages.{name}.page" for name in PAGES),
-        *("plushsense.studio.tasks", "plushsense.training.fit", "plushsense.experiments.search.run"),
-        *("plushsense.trials.budget", "plushsense.trials.estimate", "plushsense.reports.figures"),
-        *("mlcroissant", "frictionless", "rocrate.rocrate", "datacite", "sklearn.ensemble"),
-    ]
+    ["nicegui", "plushsense.studio.app.serve", *(f"plushsense.studio.pages.{name}.page" for name in PAGES)]
 )
 
 
-class ForkedTask:
-    """What `plushsense.studio.app.jobs` uses of `subprocess.Popen`, for a task that is forked with its imports."""
-
-    requests: socket.socket
-    """To the process that forks tasks."""
-    objects: Path | None = None
-    """A folder for object files of C, which tests share."""
-
-    def __init__(self, words: list[str], **how: object) -> None:
-        assert words[1:] == ["-m", "plushsense.studio.tasks"]
-        (its_in, to), (back, its_out), (self._ended, end) = os.pipe(), os.pipe(), os.pipe()
-        socket.send_fds(self.requests, [b"?"], [its_in, its_out, end])
-        for mine in (its_in, its_out, end):
-            os.close(mine)
-        self.pid = int.from_bytes(self.requests.recv(8), "little")
-        self.stdin, self.stdout = open(to, "w", encoding="utf-8"), open(back, encoding="utf-8")
-
-    def wait(self, timeout: float | None = None) -> int:
-        """Wait for its end, which closes the pipe that only it has."""
-        if not select.select([self._ended], [], [], timeout)[0]:
-            raise subprocess.TimeoutExpired("a task", timeout or 0.0)
-        return 0
-
-    def poll(self) -> int | None:
-        """Return None while it runs."""
-        return 0 if select.select([self._ended], [], [], 0)[0] else None
-
-    @classmethod
-    def prepare(cls) -> None:
-        """Fork the process that forks tasks, while this one has no threads; use it instead of new interpreters."""
-        cls.requests, theirs = socket.socketpair()
-        if os.fork() == 0:
-            cls.requests.close()
-            signal.signal(signal.SIGCHLD, signal.SIG_IGN)
-            while True:
-                data, ends, _, _ = socket.recv_fds(theirs, 1, 3)
-                if not data:
-                    os._exit(0)
-                if (pid := os.fork()) == 0:
-                    theirs.close()
-                    _run_task(*ends)
-                for end in ends:
-                    os.close(end)
-                theirs.sendall(pid.to_bytes(8, "little"))
-        theirs.close()
-        setattr(jobs, "subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": cls}))  # noqa: B010
-
-
-def _run_task(words: int, messages: int, ended: int) -> None:
-    """Run ``plushsense.studio.tasks`` in this process, with one worker where nothing else is requested."""
-    from plushsense.studio.tasks import main
-
-    os.setsid()
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    for here, there in ((words, 0), (messages, 1), (os.open(os.devnull, os.O_WRONLY), 2)):
-        os.dup2(here, there)
-        os.close(here)
-    sys.stdin, sys.stdout, sys.stderr = (
-        open(n, mode, encoding="utf-8", closefd=False) for n, mode in enumerate(("r", "w", "w"))
-    )
-    setattr(os, "cpu_count", lambda: 1)  # noqa: B010
-    if ForkedTask.objects is not None:
-        for module in (profile, verify):
-            setattr(module, "build", keeping(ForkedTask.objects))  # noqa: B010
-    try:
-        main()
-        sys.stdout.flush()
-    finally:
-        os._exit(0)
-
-
 def _run_studio(
-    words: list[str],
-    folder: str,
-    out: Connection,
-    errors: Connection,
-    open_files: int,
-    without: tuple[str, ...],
-    objects: Path | None,
+    words: list[str], folder: str, out: Connection, errors: Connection, open_files: int, without: tuple[str, ...]
 ) -> None:
     """Run ``plushsense studio`` in this process, with its output to two pipes."""
     import resource
@@ -157,14 +68,12 @@ def _run_studio(
     # Nothing that a test of the whole suite sets must reach it.
     for name in [k for k in os.environ if k.startswith(("NICEGUI_", "PYTEST_"))]:
         del os.environ[name]
-    os.chdir(folder)
-    ForkedTask.objects = objects
-    ForkedTask.prepare()
     # NiceGUI does not serve from what it takes for the process of a pool.
     multiprocessing.current_process().name = "MainProcess"
     os.dup2(out.fileno(), 1)
     os.dup2(errors.fileno(), 2)
     sys.stdout, sys.stderr = (open(n, "w", encoding="utf-8", closefd=False) for n in (1, 2))
+    os.chdir(folder)
     sys.modules.update(dict.fromkeys(without))  # type: ignore[arg-type]
     if open_files:
         resource.setrlimit(resource.RLIMIT_NOFILE, (open_files, open_files))
@@ -200,8 +109,6 @@ class Studio:
     """The limit on its open files; 0: the tests' own."""
     without: tuple[str, ...] = ()
     """Modules that it shall not find."""
-    objects: Path | None = None
-    """Where its tasks find and keep object files of C."""
     _pipes: list[Connection] = field(default_factory=list)
 
     def start(self) -> Studio:
@@ -211,7 +118,7 @@ class Studio:
         out, its_out = _FORKING.Pipe(duplex=False)
         errors, its_errors = _FORKING.Pipe(duplex=False)
         self._pipes = [out, errors]
-        arguments = (words, str(self.home.parent), its_out, its_errors, self.open_files, self.without, self.objects)
+        arguments = (words, str(self.home.parent), its_out, its_errors, self.open_files, self.without)
         self.process = _FORKING.Process(target=_run_studio, args=arguments)
         self.process.start()
         its_out.close()

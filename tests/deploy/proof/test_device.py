@@ -190,7 +190,7 @@ def test_wrong_answers_and_words_of_a_chip(
 ) -> None:
     for n, (old, new, words) in enumerate(
         (
-            ("+ half(scale[7])) >> scale[7];", ") >> scale[7];", "should be"),
+            ("(t * times + half(after)) >> after;", "(t * times) >> after;", "should be"),
             ("#define HEAD_BYTES 16u", "#define HEAD_BYTES 20u", "plush_begin() says PLUSH_DAMAGED"),
         )
     ):
