@@ -38,6 +38,8 @@ def test_counts(target: str, small: Path, target_here: Here) -> None:
     assert cost.gap <= cost.call_most <= cost.call_bound < 1.5 * cost.call_most
     assert cost.sections["plush_model"]["rodata"] == facts["model_bytes"]
     assert cost.flash_bytes > facts["model_bytes"] + 2000
+    code = cost.sections["plushsense"]
+    assert 3_000 < code["others"] < code["text"] - 4_000, "plush_begin and its like, and what plush_push runs"
     assert 0 <= TOY_BYTES - cost.toy_bytes <= 24 and cost.memory_bytes == facts["memory_bytes"]
     assert cost.ram_bytes == cost.toy_bytes + cost.memory_bytes
     assert cost.stack_push is not None
@@ -181,8 +183,8 @@ def test_estimates_are_a_band_and_a_verdict() -> None:
     stream = Arch.parse("9d1_5d2", "4,6", channels=3, classes=4)
     window = Arch.parse("9d1_5d2", "4,6", channels=3, classes=4, padding="mirror")
     sections = {
-        "plushsense": {"text": 15_000, "cold": 5_000, "rodata": 0, "data": 0, "bss": 0},
-        "plush_model": {"text": 0, "cold": 0, "rodata": 10_000, "data": 0, "bss": 0},
+        "plushsense": {"text": 15_000, "others": 5_000, "rodata": 0, "data": 0, "bss": 0},
+        "plush_model": {"text": 0, "others": 0, "rodata": 10_000, "data": 0, "bss": 0},
     }
 
     def of(instructions: int, core: Core = core, arch: Arch = stream) -> Estimate:

@@ -168,7 +168,10 @@ _FLOAT = re.compile(r"^__(\w*[sdt]f\d?$|float|fix|aeabi_[fd](?!iv)|aeabi_u?[il]2
 _MASKING = re.compile(r"\t(cpsi[de]|msr|rsil|[wx]sr(?:\.\w+)?|waiti|csr[rwsc]\w*|wfi|wfe|cli|hlt)\b")
 _SECTIONS = {"text": (".text", ".literal"), "rodata": (".rodata", ".srodata"), "data": (".data", ".sdata")}
 _SECTIONS["bss"] = (".bss", ".sbss")
-_SECTIONS["cold"] = (".text.unlikely", ".literal.unlikely")  # part of text: where gcc puts what it compiles for size
+# Part of text: functions of plush_begin and its like, which no plush_push calls.
+_OTHERS = "checksum check word_at next_bytes next_fill next_text next_scales read_head take share_out prepare bytes_needed"
+_OTHERS += " take_over plush_memory_bytes plush_begin plush_swap plush_patch plush_model_id"
+_SECTIONS["others"] = tuple(f"{kind}.unlikely.{name}" for name in _OTHERS.split() for kind in (".text", ".literal"))
 
 
 @dataclass(frozen=True)
@@ -211,7 +214,7 @@ class Cost:
     def running_bytes(self, *, with_model: bool = True) -> int:
         """Return the bytes that ``plush_push`` may run and read: all but the code of ``plush_begin`` and its like."""
         code, model = (self.sections[name] for name in ("plushsense", "plush_model"))
-        own = code["text"] - code["cold"] + code["rodata"] + code["data"]
+        own = code["text"] - code["others"] + code["rodata"] + code["data"]
         return own + (model["rodata"] + model["data"] if with_model else 0)
 
     @property

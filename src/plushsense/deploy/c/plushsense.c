@@ -1667,8 +1667,8 @@ static void event_step(plush_toy *toy, uint32_t best, uint32_t ms)
         closed_step(toy, said, affect, ms);
 }
 
-/* A step is complete: the answer, and room for the next block of the pooling. */
-PLUSH_APART
+/* A step is complete: the answer, and room for the next block of the pooling. For size, as it runs once a step. */
+PLUSH_SMALL_APART PLUSH_CODE
 static void answer(plush_toy *toy, uint32_t ms)
 {
 #ifndef PLUSH_WINDOW
