@@ -169,8 +169,8 @@ _MASKING = re.compile(r"\t(cpsi[de]|msr|rsil|[wx]sr(?:\.\w+)?|waiti|csr[rwsc]\w*
 _SECTIONS = {"text": (".text", ".literal"), "rodata": (".rodata", ".srodata"), "data": (".data", ".sdata")}
 _SECTIONS["bss"] = (".bss", ".sbss")
 # Part of text: functions of plush_begin and its like, which no plush_push calls.
-_OTHERS = "checksum check word_at next_bytes next_fill next_text next_scales read_head take share_out prepare bytes_needed"
-_OTHERS += " take_over plush_memory_bytes plush_begin plush_swap plush_patch plush_model_id"
+_OTHERS = "checksum check word_at next_bytes next_fill next_text next_scales read_head take share_out prepare"
+_OTHERS += " bytes_needed take_over plush_memory_bytes plush_begin plush_swap plush_patch plush_model_id"
 _SECTIONS["others"] = tuple(f"{kind}.unlikely.{name}" for name in _OTHERS.split() for kind in (".text", ".literal"))
 
 
