@@ -166,7 +166,11 @@ _HEAP = ("malloc", "calloc", "realloc", "free", "reallocarray", "aligned_alloc",
 _FLOAT = re.compile(r"^__(\w*[sdt]f\d?$|float|fix|aeabi_[fd](?!iv)|aeabi_u?[il]2[fd])")
 # Instructions of Arm, Xtensa, RISC-V and x86 that change the state of interrupts or wait.
 _MASKING = re.compile(r"\t(cpsi[de]|msr|rsil|[wx]sr(?:\.\w+)?|waiti|csr[rwsc]\w*|wfi|wfe|cli|hlt)\b")
-_SECTIONS = {"text": (".text", ".literal"), "rodata": (".rodata", ".srodata"), "data": (".data", ".sdata")}
+_SECTIONS: dict[str, tuple[str, ...]] = {
+    "text": (".text", ".literal"),
+    "rodata": (".rodata", ".srodata"),
+    "data": (".data", ".sdata"),
+}
 _SECTIONS["bss"] = (".bss", ".sbss")
 # Part of text: functions of plush_begin and its like, which no plush_push calls.
 _OTHERS = "checksum check word_at next_bytes next_fill next_text next_scales read_head take share_out prepare"
