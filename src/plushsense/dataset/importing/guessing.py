@@ -103,8 +103,8 @@ class GuessedPattern:
 
 
 @dataclass
-class _Guess:
-    """What has been found out so far."""
+class _PatternDraft:
+    """The keys, columns, channels and doubts of the pattern being guessed, filled in step by step."""
 
     keys: dict[str, Any] = field(default_factory=dict)
     taken: set[str] = field(default_factory=set)
@@ -142,7 +142,7 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
         raise DatasetError(f"'{source}' holds no table: its files that end in '{ending}' have no row with a number.")
     if sum(parse_name(f.name) is not None for f in mine) > 0.8 * len(mine):
         raise DatasetError(f"'{source}' holds recordings of the GestureRecorder: import it without a pattern.")
-    guess = _Guess()
+    guess = _PatternDraft()
     if others := len(files) - len(of_ending):
         guess.doubts.append(f"{others} files that do not end in '{ending}' are left out")
     samples = [text for f in mine[:: max(1, len(mine) // _FILES)][:_FILES] if (text := _lines(f, guess))]
@@ -181,7 +181,7 @@ def _has_rows(path: Path, width: int = 1, separator: str = "") -> bool:
     return any(line.lstrip()[:1] in ("{", "[") or any(map(_is_number, re.split(r"[,;\t| ]", line))) for line in lines)
 
 
-def _lines(path: Path, guess: _Guess) -> list[str]:
+def _lines(path: Path, guess: _PatternDraft) -> list[str]:
     with path.open("rb") as file:
         raw = file.read(400_000)
     try:
@@ -196,7 +196,7 @@ def _is_number(text: str) -> bool:
     return bool(re.fullmatch(r"\s*[-+]?(\d{1,30}[.,]?\d*|[.,]\d+)([eE][-+]?\d{1,2})?\s*", text))
 
 
-def _text_columns(samples: list[list[str]], guess: _Guess) -> list[_Column]:
+def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[_Column]:
     """Find separator, lines before and after the names, and the columns of tables of text."""
     body = [line for lines in samples for line in lines[5:] if line.strip()] or samples[0]
     width, separator = 1, ""
@@ -263,7 +263,7 @@ def _named(columns: Sequence[_Column], names: Iterable[str]) -> _Column | None:
     return exact or next((c for c, name in plain if any(k in name for k in known if len(k) > 3)), None)
 
 
-def _roles(columns: list[_Column], guess: _Guess) -> None:
+def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
     """Decide which columns are time, person, label and channels."""
     left = list(columns)
 
@@ -310,7 +310,7 @@ def _roles(columns: list[_Column], guess: _Guess) -> None:
     _vectors(guess)
 
 
-def _clock(time: _Column | None, guess: _Guess) -> None:
+def _clock(time: _Column | None, guess: _PatternDraft) -> None:
     """Find the unit of the times, and the rate."""
     if time is None:
         guess.keys["row_rate_hz"] = guess.rate_hz = _USUAL_HZ
@@ -338,7 +338,7 @@ def _channel(name: str, kind: str, **more: Any) -> dict[str, Any]:
     return {"name": name, "unit": "", "kind": kind, **more}
 
 
-def _measured(column: _Column, guess: _Guess) -> dict[str, Any]:
+def _measured(column: _Column, guess: _PatternDraft) -> dict[str, Any]:
     """Return the channel of a column of numbers: its kind, and a step that keeps its decimals."""
     name = re.sub(r"\W+", "_", column.key.casefold()).strip("_") or f"channel{len(guess.channels) + 1}"
     if name != column.name.casefold() or column.key != column.name:
@@ -360,7 +360,7 @@ def _measured(column: _Column, guess: _Guess) -> dict[str, Any]:
     return _channel(name, "sensor", **more)
 
 
-def _vectors(guess: _Guess) -> None:
+def _vectors(guess: _PatternDraft) -> None:
     """Find triples of accelerations whose names differ only in x, y and z."""
     by_stem: dict[str, dict[str, str]] = {}
     for channel in guess.channels:
@@ -371,7 +371,7 @@ def _vectors(guess: _Guess) -> None:
     guess.vectors = [[axes[a] for a in "xyz"] for axes in by_stem.values() if len(axes) == 3]
 
 
-def _paths(files: list[Path], ending: str, guess: _Guess) -> None:
+def _paths(files: list[Path], ending: str, guess: _PatternDraft) -> None:
     """Find out which parts of the paths are person, session, label and take."""
     depth = _usual_least([len(f.parts) for f in files])
     before = "**/" if any(len(f.parts) > depth for f in files) else ""
@@ -445,7 +445,7 @@ def _role(texts: list[str], several: bool, taken: set[str], at: int) -> str:
     return "*"
 
 
-def _aliases(guess: _Guess) -> None:
+def _aliases(guess: _PatternDraft) -> None:
     """Find spellings of one label that differ in more than case, spaces and underlines."""
     groups: dict[str, Counter[str]] = {}
     for label, count in guess.labels.items():
@@ -474,7 +474,7 @@ def _key(key: str) -> str:
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key, ensure_ascii=False)
 
 
-def _toml(guess: _Guess, name: str) -> str:
+def _toml(guess: _PatternDraft, name: str) -> str:
     """Return the TOML of a guess, with what is uncertain as comments at its beginning."""
     lines = [
         f"# Guessed from the files in {json.dumps(name)}. Look at it, then see ten rows with",

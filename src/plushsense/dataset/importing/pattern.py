@@ -72,7 +72,9 @@ def path_expression(text: str) -> re.Pattern[str]:
 
 @dataclass(frozen=True)
 class ImportPattern:
-    """Where the parts of recordings stand in files of other projects: the keys of a TOML file.
+    """Settings for importing files of other projects, as read from a TOML file.
+
+    They say where person, session, label, take and channels are found in paths and columns.
 
     Attributes:
         layout: name of a built-in layout, path of a layout file beside this file, or a table with the keys of a layout;

@@ -19,7 +19,7 @@ ROWS, _RECORDINGS = 10, 5
 
 @dataclass(frozen=True)
 class PreviewRow:
-    """One row as it is understood; ``values`` are in the units of the file, None where a value is invalid."""
+    """One sample of a previewed recording; ``values`` are in the units of the file, None where a value is invalid."""
 
     file: str
     subject: str
@@ -31,7 +31,7 @@ class PreviewRow:
 
 @dataclass(frozen=True)
 class ImportPreview:
-    """What an import would do: ``rows`` of some recordings, and how many recordings there are of each gesture.
+    """Result of a dry run of an import: sample rows, counts of recordings by gesture, and what would be left out.
 
     ``recordings`` and ``streams`` count files; recordings that are parts of a labelled stream are not counted.
     """

@@ -92,8 +92,11 @@ class _PacketLink:
 
 
 @dataclass(frozen=True)
-class _Chip:
-    """What a chip says of itself: bytes of memory for a toy, bytes of room for models and patches, its counter."""
+class _DeviceInfo:
+    """Memory sizes and cycle counter that the program on a chip reports when it is contacted.
+
+    ``memory_bytes`` are for the state of a toy, ``room_bytes`` for models and patches.
+    """
 
     memory_bytes: int
     room_bytes: int
@@ -150,7 +153,7 @@ def verify_device(
     return VerificationReport(export.title, (), decisions, counted(fitting), (run,), tuple(not_run), ())
 
 
-def _greet(packets: _PacketLink, export: Export) -> _Chip:
+def _greet(packets: _PacketLink, export: Export) -> _DeviceInfo:
     """Ask until the chip answers, which may still boot, and check that it runs the harness of this export."""
     url, until = packets.link.url, time.monotonic() + HELLO_S
     # The rest of a packet, if the chip still waits for it because a computer was stopped.
@@ -167,7 +170,7 @@ def _greet(packets: _PacketLink, export: Export) -> _Chip:
     )
 
 
-def _checked(hello: bytes, export: Export, url: str) -> _Chip:
+def _checked(hello: bytes, export: Export, url: str) -> _DeviceInfo:
     version, model_id, channels, classes, memory_bytes, room_bytes = _HELLO.unpack_from(hello)
     own = image_check(export.image)
     if version != VERSION:
@@ -181,7 +184,7 @@ def _checked(hello: bytes, export: Export, url: str) -> _Chip:
             f"'{url}' runs the model {model_id:08x}, and '{export.folder}' holds {own:08x}: flash the harness of this "
             "export."
         )
-    return _Chip(memory_bytes, room_bytes, hello[_HELLO.size :].decode("utf-8", "replace"))
+    return _DeviceInfo(memory_bytes, room_bytes, hello[_HELLO.size :].decode("utf-8", "replace"))
 
 
 def _run(
@@ -234,7 +237,9 @@ def _run(
     return results, measured
 
 
-def _cycles(chip: _Chip, measured: dict[int, tuple[int, int, int, int]], cases: Sequence[Vectors]) -> Cycles | None:
+def _cycles(
+    chip: _DeviceInfo, measured: dict[int, tuple[int, int, int, int]], cases: Sequence[Vectors]
+) -> Cycles | None:
     """Return the cycles of the export's own model, over all cases with it; None without a counter."""
     own = [m for n, m in measured.items() if cases[n].model is None]
     steps = sum(m[1] for m in own)
