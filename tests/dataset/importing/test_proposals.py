@@ -80,7 +80,7 @@ def test_headers_that_fit_no_layout_or_several(tmp_path: Path, cli: Callable[...
     folder.mkdir(parents=True)
     path = folder / "Wave_1700000000000_3.csv"
     path.write_text("a, b\n1, 2\n")
-    with pytest.raises(ConfigError, match="--layout is needed: Accepted are accel-3"):
+    with pytest.raises(ConfigError, match="--layout is needed: accepted are accel-3"):
         import_recordings(tmp_path / "R", tmp_path / "DS")
     layouts = [load_layout(name) for name in ("plush-14", "plush-15")]
     path.write_text("; ".join(layouts[0].csv.header) + "\n")

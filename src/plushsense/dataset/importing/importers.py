@@ -101,11 +101,11 @@ class ImportOptions:
             name = found[0].name
             message = f"the layout is '{name}', as the header of the files has its channels"
             return found[0], [Sentence(message, reason="layout_guessed", layout=name)]
-        fit = f"the header of the files fits {' and '.join(layout.name for layout in found)}. " if found else ""
+        fit = f"The header of the files fits {' and '.join(layout.name for layout in found)}. " if found else ""
         raise ConfigError(
-            f"--layout is needed: {fit}Accepted are {', '.join(layout_names())}, or a TOML file of your own, which "
-            "names the channels (see docs/importing.md). For files of another form, let --guess FILE.toml write a "
-            "pattern.",
+            f"--layout is needed: accepted are {', '.join(layout_names())}, or a TOML file of your own, which "
+            f"names the channels (see docs/importing.md). {fit}For files of another form, let --guess FILE.toml write "
+            "a pattern.",
             reason="layout_unknown",
         )
 

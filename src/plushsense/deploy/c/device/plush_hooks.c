@@ -44,10 +44,6 @@ void plush_hook_write(uint8_t byte)
 #if defined(__XTENSA__)
 #define COUNTER "CCOUNT"
 
-static void start_counter(void)
-{
-}
-
 uint32_t plush_hook_cycles(void)
 {
     uint32_t count;
@@ -57,10 +53,6 @@ uint32_t plush_hook_cycles(void)
 }
 #elif defined(__riscv) && !defined(ESP_PLATFORM) /* the ESP32-C3 counts elsewhere: see below */
 #define COUNTER "mcycle"
-
-static void start_counter(void)
-{
-}
 
 uint32_t plush_hook_cycles(void)
 {
@@ -73,10 +65,6 @@ uint32_t plush_hook_cycles(void)
 #include "esp_cpu.h"
 #define COUNTER "esp_cpu_get_cycle_count"
 
-static void start_counter(void)
-{
-}
-
 uint32_t plush_hook_cycles(void)
 {
     return (uint32_t)esp_cpu_get_cycle_count();
@@ -88,23 +76,12 @@ uint32_t plush_hook_cycles(void)
 #define DWT_CTRL (*(volatile uint32_t *)UINT32_C(0xe0001000))
 #define DWT_CYCCNT (*(volatile uint32_t *)UINT32_C(0xe0001004))
 
-static void start_counter(void)
-{
-    DEMCR |= UINT32_C(1) << 24; /* TRCENA */
-    DWT_CYCCNT = 0;
-    DWT_CTRL |= 1u; /* CYCCNTENA */
-}
-
 uint32_t plush_hook_cycles(void)
 {
     return DWT_CYCCNT;
 }
 #else /* such as Cortex-M0+ */
 #define COUNTER ""
-
-static void start_counter(void)
-{
-}
 
 uint32_t plush_hook_cycles(void)
 {
@@ -118,7 +95,11 @@ void plush_hook_begin_counter(void)
 {
     uint32_t before, i;
 
-    start_counter();
+#ifdef DWT_CTRL
+    DEMCR |= UINT32_C(1) << 24; /* TRCENA */
+    DWT_CYCCNT = 0;
+    DWT_CTRL |= 1u; /* CYCCNTENA */
+#endif
     before = plush_hook_cycles();
     for (i = 0; i < 1000 && plush_hook_cycles() == before; i++) {
     }
