@@ -205,7 +205,10 @@ def test_a_furnished_home_opens(studio: Fixture, look: Fixture, home: Path) -> N
 
 
 HOSTILE = "<img src=x onerror='window.ran=1'>"
-WAYS = re.compile(r"ui\.(?:html|markdown)\(|sanitize=False|from html import|innerHTML|outerHTML|insertAdjacent|v-html")
+RUNS = "javascript:window.ran=1"
+WAYS = re.compile(
+    r"ui\.(?:html|markdown|add_\w+)\(|sanitize=False|from html import|innerHTML|outerHTML|insertAdjacent|v-html"
+)
 
 
 def test_html_is_made_in_one_way() -> None:
@@ -219,6 +222,7 @@ def test_html_is_made_in_one_way() -> None:
     }
     assert found == {
         "shell.py: return ui.html(content, sanitize=lambda given: str(escape(given)), tag=kind)",
+        'shell.py: ui.add_head_html(f"<style>{css}</style>")',
         # One of three drawings of ours.
         "live_view.js: this.n.face.innerHTML = face(eyes);",
     }
@@ -269,4 +273,12 @@ def test_no_name_runs_as_script(studio: Fixture, look: Fixture, tmp_path: Path) 
         assert page.locator("img[src=x]").count() == 0, path
         assert page.evaluate("window.ran") is None, path
         page.close()
-    assert not [c for c in browser.complaints if "404" in c]
+    assert browser.complaints == []
+    # Even where a name became HTML, the policy would keep it from running.
+    page = browser.open(url)
+    page.evaluate("html => document.body.insertAdjacentHTML('beforeend', html)", f"{HOSTILE}<a href='{RUNS}'>run</a>")
+    page.locator("img[src=x]").wait_for(state="attached")
+    page.get_by_role("link", name="run").click()
+    page.wait_for_load_state("networkidle")
+    assert page.evaluate("window.ran") is None
+    assert len([c for c in browser.complaints if "Content Security Policy" in c]) == 2

@@ -22,6 +22,7 @@ from urllib.parse import parse_qs, quote, urlsplit
 
 from fastapi import APIRouter
 from fastapi.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
+from jinja2 import ChoiceLoader, DictLoader, Environment
 from starlette.requests import ClientDisconnect
 
 from plushsense.core.errors import ConfigError
@@ -48,18 +49,36 @@ _UNANSWERED = "No response returned"
 """Part of Starlette's error message when a browser disconnected before the response was ready."""
 _LOOPBACK = ("127.0.0.1", "localhost", "[::1]", "::1")
 
-# NiceGUI's Vue templates are compiled in the browser, which needs eval; nothing is loaded from elsewhere.
+# Nothing is loaded from elsewhere. NiceGUI's Vue templates are compiled in the browser, which needs eval.
 CONTENT_POLICY = (
-    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "default-src 'self'; script-src 'self' 'nonce-{nonce}' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; object-src 'none'; base-uri 'self'; "
     "form-action 'self'; frame-ancestors 'none'"
 )
-_HEADERS = [
-    (b"content-security-policy", CONTENT_POLICY.encode()),
-    (b"x-content-type-options", b"nosniff"),
-    (b"referrer-policy", b"no-referrer"),
-    (b"permissions-policy", b"camera=(), microphone=(), geolocation=()"),
-]
+"""Content security policy; a page's own inline scripts have the ``nonce`` of its response, and no others run."""
+NONCE = "plushsense.nonce"
+"""Key of the nonce in the scope of a request, see `mark_scripts`."""
+
+
+def _security_headers(nonce: str) -> list[tuple[bytes, bytes]]:
+    return [
+        (b"content-security-policy", CONTENT_POLICY.format(nonce=nonce).encode()),
+        (b"x-content-type-options", b"nosniff"),
+        (b"referrer-policy", b"no-referrer"),
+        (b"permissions-policy", b"camera=(), microphone=(), geolocation=()"),
+    ]
+
+
+def mark_scripts(templates: Environment, name: str) -> None:
+    """Give the scripts in the source of the page template ``name`` the nonce of the request, see `CONTENT_POLICY`.
+
+    What is filled into the template has no nonce, so that a script in it does not run.
+    """
+    assert templates.loader is not None
+    source = templates.loader.get_source(templates, name)[0]
+    marked = source.replace("<script", f"<script nonce=\"{{{{ request.scope['{NONCE}'] }}}}\"")
+    templates.loader = ChoiceLoader([DictLoader({name: marked}), templates.loader])
+
 
 
 def is_loopback(host: str) -> bool:
@@ -173,6 +192,7 @@ async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers
         await _refuse(scope, send, 413, refusal)
         return
     received, too_large, started, disconnected = 0, False, False, False
+    scope[NONCE] = nonce = secrets.token_urlsafe(16)
 
     async def receiving() -> dict[str, Any]:
         nonlocal received, too_large, disconnected
@@ -192,7 +212,7 @@ async def _bounded(app: App, scope: Scope, receive: Receive, send: Send, headers
             return
         if message["type"] == "http.response.start":
             started = True
-            message = {**message, "headers": [*message.get("headers", []), *_HEADERS]}
+            message = {**message, "headers": [*message.get("headers", []), *_security_headers(nonce)]}
         await send(message)
 
     try:
@@ -214,7 +234,7 @@ def _is_upload(scope: Scope) -> bool:
 
 async def _to_start(send: Send, visitor: str) -> None:
     """Redirect to the home page, which removes the token from the address, and set the cookie ``visitor`` if given."""
-    headers = [(b"location", f"/?{WELCOME}".encode()), (b"cache-control", b"no-store"), *_HEADERS]
+    headers = [(b"location", f"/?{WELCOME}".encode()), (b"cache-control", b"no-store"), *_security_headers(secrets.token_urlsafe(16))]
     if visitor:
         headers.append((b"set-cookie", f"{COOKIE}={visitor}; Path=/; HttpOnly; SameSite=Strict".encode()))
     await send({"type": "http.response.start", "status": 303, "headers": headers})
@@ -229,7 +249,8 @@ async def _refuse(scope: Scope, send: Send, status: int, message: str) -> None:
 
 
 async def _answer(send: Send, status: int, body: bytes, kind: str) -> None:
-    headers = [(b"content-type", f"{kind}; charset=utf-8".encode()), (b"cache-control", b"no-store"), *_HEADERS]
+    headers = [(b"content-type", f"{kind}; charset=utf-8".encode()), (b"cache-control", b"no-store")]
+    headers += _security_headers(secrets.token_urlsafe(16))
     if status != 413:
         # Close the connection, except after 413: a browser reads that response only after sending the whole body.
         headers.append((b"connection", b"close"))

@@ -29,6 +29,7 @@ from plushsense.studio.app.guard import (
     Visitors,
     is_loopback,
     limited_protocol,
+    mark_scripts,
 )
 from plushsense.studio.app.workspace import WORK, Workspace
 
@@ -36,6 +37,8 @@ PORT = 8137
 _OPENING_S = 30.0
 _COLLECT_S = 10.0
 _ICONS = Path(__file__).with_name("icons.js")
+# Announce a lost connection to screen readers.
+_ALERTS = "document.querySelectorAll('.nicegui-error-popup').forEach(box => box.setAttribute('role', 'alert'));\n"
 # Imported by NiceGUI's socket library for clients: 15 MB that a server does not need.
 _CLIENTS = ("aiohttp", "requests")
 # Parameters of `mallopt` in malloc.h of glibc.
@@ -77,6 +80,7 @@ def run(
     with _without_clients():
         need("nicegui", "studio")
         from nicegui import app, ui
+        from nicegui.client import templates
 
     from plushsense.studio.app.guard import router
     from plushsense.studio.app.shell import PAGES
@@ -106,9 +110,10 @@ def run(
     limits = ConnectionLimits.of_process()
     # NiceGUI warns about its own tasks that are still running at shutdown; users cannot act on that.
     logging.getLogger("nicegui").addFilter(lambda record: "Could not cancel" not in str(record.msg))
+    mark_scripts(templates.env, "index.html")
     # Switch off Quasar's loading bar, because it has no accessible name.
     app.config.quasar_config["loadingBar"] = {"skipHijack": True}
-    app.config.vue_config_script = _ICONS.read_text(encoding="utf-8") + app.config.vue_config_script
+    app.config.vue_config_script = _ALERTS + _ICONS.read_text(encoding="utf-8") + app.config.vue_config_script
     app.on_startup(lambda: threading.Thread(target=announce, daemon=True).start())
     app.on_delete(_release_memory())
     app.on_shutdown(workspace.close)

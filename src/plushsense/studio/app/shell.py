@@ -178,7 +178,7 @@ def frame(workspace: Workspace, name: str) -> Iterator[Page]:
     page = Page(workspace, name, words, bool(dark))
     _set_appearance(words, dark)
     ui.page_title(f"{words(f'pages.{name}')} · PlushSense")
-    ui.add_head_html(f"<style>{_CSS.read_text(encoding='utf-8')}</style>")
+    add_style(_CSS.read_text(encoding="utf-8"))
     with ui.header().classes("ps-header items-center no-wrap"):
         # Written as HTML because a link made by NiceGUI would reload the page.
         html(Markup('<a class="ps-skip" href="#content">{}</a>').format(words("shell.skip")))
@@ -270,12 +270,7 @@ def _set_appearance(words: Words, dark: bool | None) -> None:
     translations[own.language] = {key: words(f"shell.{key}") for key in keys}  # type: ignore[index]
     style = f":root {{ color-scheme: dark; background: {_DARK_BACKGROUND}; }}"
     if dark is not False:
-        ui.add_head_html(f"<style>{style if dark else f'@media (prefers-color-scheme: dark) {{ {style} }}'}</style>")
-    # Announce a lost connection to screen readers.
-    ui.add_body_html(
-        "<script>addEventListener('DOMContentLoaded', () => document.querySelectorAll('.nicegui-error-popup')"
-        ".forEach(box => box.setAttribute('role', 'alert')))</script>"
-    )
+        add_style(style if dark else f"@media (prefers-color-scheme: dark) {{ {style} }}")
 
 
 def _choices(words: Words, dark: bool | None) -> None:
@@ -371,6 +366,11 @@ def html(content: str = "", kind: str = "div") -> ui.html:
     with ``Markup("…{}…").format(…)``, which escapes the values. Pages create HTML elements only with this function.
     """
     return ui.html(content, sanitize=lambda given: str(escape(given)), tag=kind)
+
+
+def add_style(css: str) -> None:
+    """Add styles to the page; `ui.add_css` would do so by a script, which the content security policy refuses."""
+    ui.add_head_html(f"<style>{css}</style>")
 
 
 def tag(element: E, name: str) -> E:

@@ -22,6 +22,7 @@ from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import (
     Kind,
     Page,
+    add_style,
     button,
     html,
     icon_button,
@@ -54,7 +55,7 @@ _TITLES = {
 
 def style() -> None:
     """Add the style sheet of these elements; call this once per page."""
-    ui.add_css(_CSS.read_text(encoding="utf-8"))
+    add_style(_CSS.read_text(encoding="utf-8"))
 
 
 def scroll_to(name: str) -> None:

@@ -10,7 +10,7 @@ from markupsafe import Markup
 from nicegui import ui
 
 from plushsense.reports.table import Table
-from plushsense.studio.app.shell import AFFECT_SIGNS, Page, button, html, moment, on_change, tag
+from plushsense.studio.app.shell import AFFECT_SIGNS, Page, add_style, button, html, moment, on_change, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import plain_name
 from plushsense.studio.pages.live.feedback import Feedback
@@ -100,7 +100,7 @@ class LogButtons:
     def __init__(self, page: Page, reader: LiveReader) -> None:
         self._page, self._reader = page, reader
         words = page.words
-        ui.add_css(_PRINT)
+        add_style(_PRINT)
         with ui.row().classes("w-full items-center ps-small-gap q-mt-sm"):
             self._count = tag(ui.label("").classes("ps-dim"), "log-count")
             self._session = tag(ui.select({}, label=words("log.session")).classes("w-64"), "log-session")

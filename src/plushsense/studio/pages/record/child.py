@@ -10,7 +10,7 @@ from nicegui import ui
 from nicegui.element import Element
 
 from plushsense.recording.states import RecorderStatus
-from plushsense.studio.app.shell import Page, html, on_change, tag
+from plushsense.studio.app.shell import Page, add_style, html, on_change, tag
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.widgets.elements import own_picture, picture
 
@@ -19,7 +19,7 @@ _CSS = Path(__file__).with_name("record.css")
 
 def style() -> None:
     """Add the style sheet of a session's page and of the child's screen."""
-    ui.add_css(_CSS.read_text(encoding="utf-8"))
+    add_style(_CSS.read_text(encoding="utf-8"))
 
 
 class ConnectionAlert(Element, component="connection.js"):
@@ -63,7 +63,7 @@ def show_child(page: Page, controller: RecordController, name: str) -> None:
     """Show the child's screen of the session ``name``; it follows the session live, also when that is continued."""
     style()
     # The alert of the child's screen is calmer than that of NiceGUI.
-    ui.add_css("#popup { display: none !important; }")
+    add_style("#popup { display: none !important; }")
     view = _ChildView(page, controller, name)
     on_change(controller.changed, view.draw)
     ui.timer(_DRAW_S, view.draw, immediate=False)

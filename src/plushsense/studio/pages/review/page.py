@@ -21,7 +21,7 @@ from pathlib import Path
 
 from nicegui import context, run, ui
 
-from plushsense.studio.app.shell import Page, address, query, tag
+from plushsense.studio.app.shell import Page, add_style, address, query, tag
 from plushsense.studio.pages.review.controller import DURATIONS, ONE, OVERLAY, STREAM, TABLE, ReviewController
 from plushsense.studio.pages.review.gesture_views import DurationsView, GestureOverlayView
 from plushsense.studio.pages.review.recording_view import RecordingView
@@ -34,7 +34,7 @@ _CSS = Path(__file__).with_name("review.css")
 
 async def show(page: Page) -> None:
     """Build the page."""
-    ui.add_css(_CSS.read_text(encoding="utf-8"))
+    add_style(_CSS.read_text(encoding="utf-8"))
     words, request, values = page.words, context.client.request, query()
     recordings = request.query_params.getlist("recordings") if request is not None else []
     datasets = page.workspace.datasets()

@@ -13,7 +13,7 @@ from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, NORMS, PADDINGS, VECTOR_FILTERS, VECTOR_SYMBOL
 from plushsense.scoring.splits import parse_split
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs, StudioJob
-from plushsense.studio.app.shell import Page, button, focus, html, on_change, query_path, section, tag
+from plushsense.studio.app.shell import Page, add_style, button, focus, html, on_change, query_path, section, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.train.jobs import JobsSection, warning_texts
 from plushsense.studio.pages.train.requests import (
@@ -446,7 +446,7 @@ _DRAWN_S = 0.4
 
 async def show(page: Page) -> None:
     """Build the page."""
-    ui.add_head_html(f"<style>{_CSS.read_text(encoding='utf-8')}</style>")
+    add_style(_CSS.read_text(encoding="utf-8"))
     jobs, results = page.workspace.part(Jobs), page.workspace.part(StoredResults)
     ui.label(page.words("train.intro")).classes("ps-dim")
     rows = await run.io_bound(results.rows)
