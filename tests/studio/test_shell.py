@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlencode
 from xml.dom import minidom
 
 import pytest
 
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.deploy.emit import FACTS
 from plushsense.recording.session_files import SESSION_HEAD, SESSION_LOG
 from plushsense.studio.app import shell
 from plushsense.studio.app.shell import LIGHT_COOKIE, PAGES, TOUR
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.live.clips import PROTOCOL
+from plushsense.studio.pages.review.controller import VIEWS
 from plushsense.studio.pages.train.result_details import confusion_table
 from plushsense.studio.pages.train.results import Confusion
 from plushsense.studio.widgets.elements import link, picture, verdict
@@ -228,6 +233,20 @@ def test_html_is_made_in_one_way() -> None:
     }
 
 
+def test_no_value_is_put_into_html_unescaped() -> None:
+    """`Markup` is only made of constants, and of strings whose fields are constants of ours."""
+    folder = Path(shell.__file__).parents[1]
+    made = {
+        f"{path.name}: {ast.unparse(node.args[0])}"
+        for path in folder.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("Markup")
+        if not isinstance(node.args[0], ast.Constant)
+    }
+    assert {name.partition(":")[0] for name in made} == {"elements.py", "page.py", "results_section.py"}
+    assert len(made) == 5
+
+
 def test_what_is_filled_in_is_escaped() -> None:
     words = Words("en")
     confusion = Confusion((HOSTILE, "b"), ((1, 2), (3, 4)))
@@ -242,9 +261,8 @@ def test_what_is_filled_in_is_escaped() -> None:
         minidom.parseString(each)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such names")
-def test_no_name_runs_as_script(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
-    home = tmp_path / "home"
+def hostile_home(home: Path, made: Path) -> Path:
+    """A home whose every folder, file, person, gesture and title has a name that is HTML; its data set."""
     clip = record(Workspace(home), "S01").rename(home / "recordings" / "S01" / f"live-{HOSTILE}")
     head = json.loads((clip / SESSION_HEAD).read_text("utf-8"))
     head["protocol"]["name"] = PROTOCOL
@@ -252,19 +270,40 @@ def test_no_name_runs_as_script(studio: Fixture, look: Fixture, tmp_path: Path) 
     taken = {"what": "take", "at_ms": 1, "file": f"{HOSTILE}_1_2.csv", "gesture": HOSTILE, "repetition": 1, "rows": 2}
     with (clip / SESSION_LOG).open("a", encoding="utf-8") as log:
         log.write(json.dumps(taken) + "\n")
-    simulate(tmp_path / "made", people=1, repetitions=1, dataset=home / "datasets" / HOSTILE)
-    about = home / "datasets" / HOSTILE / "dataset.toml"
-    about.write_text(
-        re.sub(r"(?m)^name = .*", f"name = {json.dumps(HOSTILE)}", about.read_text("utf-8"), count=1), "utf-8"
-    )
-    for kind in ("bundles", "protocols"):
+    # A session that was never finished: the page Record lists it by the names of its head.
+    unfinished = Path(shutil.copytree(clip, home / "recordings" / HOSTILE / HOSTILE))
+    head |= {"subject": HOSTILE, "session": HOSTILE, "device": f"tcp://{HOSTILE}"}
+    head["protocol"] |= {"name": HOSTILE, "title": HOSTILE}
+    (unfinished / SESSION_HEAD).write_text(json.dumps(head), "utf-8")
+    (unfinished / SESSION_LOG).write_text("", "utf-8")
+    simulate(made, people=1, repetitions=1)
+    for path in (made / "P01").glob("Back stroke 1*.csv"):
+        path.rename(path.with_name(path.name.replace("Back stroke 1", HOSTILE)))
+    dataset = import_recordings(made, home / "datasets" / HOSTILE, layout="plush-15", name=HOSTILE).dataset.path
+    # An import takes such characters out of the codes of people.
+    (dataset / "recordings" / "P01").rename(dataset / "recordings" / HOSTILE)
+    for index in ("recordings.csv", "index.json"):
+        (dataset / index).unlink()
+    for kind, suffix in (("bundles", ".plush"), ("protocols", ".toml"), ("packages", ".zip"), ("backups", ".zip")):
         (home / kind).mkdir(exist_ok=True)
-        (home / kind / f"{HOSTILE}.{'plush' if kind == 'bundles' else 'toml'}").write_text("{", "utf-8")
-    browser, url = look(), studio(home=home).url
-    for path in (*PAGES.values(), f"/export?name={quote(HOSTILE)}", f"/review?dataset={quote(HOSTILE)}"):
+        (home / kind / f"{HOSTILE}{suffix}").write_text("{", "utf-8")
+    for folder in (f"exports/{HOSTILE}", f"discarded/bundles/{HOSTILE}", f"discarded/recordings/S02/{HOSTILE}"):
+        (home / folder).mkdir(parents=True)
+    (home / "exports" / HOSTILE / FACTS).write_text("{", "utf-8")
+    return dataset
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such names")
+def test_no_name_runs_as_script(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    dataset = hostile_home(home, tmp_path / "made")
+    browser, url = look(), studio("--device", f"replay:///{HOSTILE}", home=home).url
+    pages = [PAGES[name] for name in ("home", "record", "train", "live")]
+    pages += [f"{PAGES[name]}?name={quote(HOSTILE)}" for name in ("export", "publish")]
+    pages += [f"/review?{urlencode({'dataset': dataset, 'view': view})}" for view in VIEWS]
+    for path in (*pages, f"/record?session={quote(f'{HOSTILE}/{HOSTILE}')}"):
         page = browser.open(url + path)
-        if path == PAGES["home"]:
-            marked(page, "dataset").get_by_text(HOSTILE).wait_for()
+        page.get_by_text(HOSTILE).first.wait_for(state="attached")
         if path == PAGES["live"]:
             page.get_by_role("button", name=f"Open S01/live-{HOSTILE}").click()
             page.get_by_role("heading", name=HOSTILE).wait_for()
