@@ -6,7 +6,7 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from support.traced import SocketTrace
 
 COMMAND = [sys.executable, "-m", "plushsense"]
 KEYS = ["t_s", "gesture", "affect", "confidence", "source", "state", "answer", "events"]
@@ -51,9 +53,10 @@ def toy(*words: str) -> Iterator[str]:
         process.wait(10)
 
 
-def live(*words: str) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def live(*words: str, before: Sequence[str] = ()) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """The decisions and the closing summary of a live run."""
-    done = subprocess.run([*COMMAND, "live", *words], capture_output=True, text=True, check=False, timeout=120)
+    command = [*before, *COMMAND, "live", *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr
     return [json.loads(line) for line in done.stdout.splitlines()], json.loads(done.stderr.splitlines()[-1])
 
@@ -81,10 +84,13 @@ def test_over_a_serial_port(plush_bundle: Path, pty_possible: None, tmp_path: Pa
     assert set(performed[0]) == {"label", "start_ms", "end_ms"}
 
 
-def test_over_tcp(plush_bundle: Path) -> None:
+def test_over_tcp(plush_bundle: Path, tmp_path: Path) -> None:
+    trace = SocketTrace(tmp_path)
     with toy("--tcp", "0", "--speed", "4", "--lost", "0.02", "--garbled", "0.02") as url:
-        decisions, summary = live("--device", url, "--model", str(plush_bundle), "--seconds", "16")
+        words = ("--device", url, "--model", str(plush_bundle), "--seconds", "16")
+        decisions, summary = live(*words, before=trace.words)
     check(decisions, summary, 16)
+    assert trace.used() == {"connect 127.0.0.1"}
 
 
 def test_a_toy_of_another_layout_says_which_one_fits(plush_bundle: Path) -> None:

@@ -10,13 +10,15 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+import urllib.request
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 
 from plushsense.cli.main import main
 from plushsense.studio.app import serve
+from support.traced import SocketTrace
 
 needs_nicegui = pytest.mark.skipif(importlib.util.find_spec("nicegui") is None, reason="nicegui is not installed")
 
@@ -93,8 +95,8 @@ def test_without_the_extra_the_command_is_told(
 class Running:
     """The verb in a process of its own."""
 
-    def __init__(self, home: Path, *options: str) -> None:
-        command = [sys.executable, "-m", "plushsense", "studio", "--home", str(home), "--no-show"]
+    def __init__(self, home: Path, *options: str, before: Sequence[str] = ()) -> None:
+        command = [*before, sys.executable, "-m", "plushsense", "studio", "--home", str(home), "--no-show"]
         env = {k: v for k, v in os.environ.items() if not k.startswith(("NICEGUI_", "PYTEST_"))}
         self.process = subprocess.Popen(
             [*command, "--port", "0", *options],
@@ -114,9 +116,12 @@ class Running:
 @needs_nicegui
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is sent otherwise there")
 def test_it_answers_says_where_and_ends_on_ctrl_c(tmp_path: Path) -> None:
-    one = Running(tmp_path / "home", "--json")
+    trace = SocketTrace(tmp_path)
+    one = Running(tmp_path / "home", "--json", before=trace.words)
     assert one.process.stdout is not None
     told = json.loads(one.process.stdout.readline())
+    with urllib.request.urlopen(told["url"], timeout=60) as answer:
+        assert answer.status == 200
     assert told["url"].startswith("http://127.0.0.1:")
     assert told["home"] == str((tmp_path / "home").resolve())
     second = Running(tmp_path / "home")
@@ -131,6 +136,8 @@ def test_it_answers_says_where_and_ends_on_ctrl_c(tmp_path: Path) -> None:
     assert third.process.stderr is not None
     assert "The studio is at  http://127.0.0.1:" in third.process.stderr.readline()
     assert third.end()[0] == 130
+    # It waits until it can connect to itself. The page Home searched for toys, and nothing was sent.
+    assert trace.used() == {"bind 127.0.0.1", "connect 127.0.0.1"}
 
 
 @needs_nicegui
@@ -140,8 +147,6 @@ def test_over_ipv6_and_under_another_name(tmp_path: Path) -> None:
         socket.create_server(("::1", 0), family=socket.AF_INET6).close()
     except OSError as cause:
         pytest.skip(f"no IPv6 loopback here: {cause}")
-    import urllib.request
-
     one = Running(tmp_path / "home", "--json", "--host", "::1", "--name", "toybox.local")
     assert one.process.stdout is not None
     url = json.loads(one.process.stdout.readline())["url"]

@@ -75,7 +75,7 @@ def test_streams_by_name_or_where_that_is_not_unique_by_source() -> None:
     assert len(urls) == 3
 
 
-def test_without_the_network_nothing_is_sent_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_network_nothing_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = list[str]()
 
     def search(scan_s: float) -> opening.DeviceListing:
@@ -83,10 +83,10 @@ def test_without_the_network_nothing_is_sent_to_it(monkeypatch: pytest.MonkeyPat
         return opening.DeviceListing()
 
     monkeypatch.setattr(
-        opening, "SEARCHES", {"LSL": "support.nowhere:search", "Serial ports": "support.nowhere:search"}
+        opening, "SEARCHES", {name: "support.nowhere:search" for name in ("LSL", "Bluetooth", "Serial ports")}
     )
     monkeypatch.setattr(opening.pkgutil, "resolve_name", lambda name: search)
     list_devices(0.1, network=False)
     assert asked == ["x"]
     list_devices(0.1)
-    assert asked == ["x"] * 3
+    assert asked == ["x"] * 4

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from plushsense.devices.virtual.session import GESTURES
 from plushsense.recording.session_files import SESSION_LOG, read_events
 from plushsense.workflow.datasets import check_dataset
 from support.pty_toys import LAYOUT, Toy, check_whole, pty_toy, recordings
+from support.traced import SocketTrace
 
 SPEED = 60.0
 KILL_SPEED = 8.0
@@ -28,11 +30,11 @@ KILL_SPEED = 8.0
 pytestmark = pytest.mark.usefixtures("pty_possible")
 
 
-def recording(out: Path, toy: Toy, speed: float, *words: str) -> subprocess.Popen[str]:
+def recording(out: Path, toy: Toy, speed: float, *words: str, before: Sequence[str] = ()) -> subprocess.Popen[str]:
     """``plushsense record`` as a program of its own, pressing its own space bar."""
     process = subprocess.Popen(
         [
-            sys.executable, "-m", "plushsense", "record", str(out), "--device", toy.url,
+            *before, sys.executable, "-m", "plushsense", "record", str(out), "--device", toy.url,
             "--subject", "S01", "--speed", str(speed), "--auto", "4", "--json", *words,
         ],
         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -56,9 +58,9 @@ def kill(process: subprocess.Popen[str]) -> None:
 
 
 def test_51_recordings_that_import_again(tmp_path: Path) -> None:
-    out, folder = tmp_path / "out", tmp_path / "out" / "S01" / "1"
+    out, folder, trace = tmp_path / "out", tmp_path / "out" / "S01" / "1", SocketTrace(tmp_path)
     with pty_toy(folder / SESSION_LOG, SPEED) as toy:
-        said = result(recording(out, toy, SPEED, "--age-group", "child"))
+        said = result(recording(out, toy, SPEED, "--age-group", "child", before=trace.words))
     assert {k: said[k] for k in ("recordings", "skipped", "redone", "lost", "gaps", "finished", "resumed")} == {
         "recordings": 51, "skipped": 0, "redone": 0, "lost": 0, "gaps": [], "finished": True, "resumed": False,
     }  # fmt: skip
@@ -74,6 +76,7 @@ def test_51_recordings_that_import_again(tmp_path: Path) -> None:
     assert [f for f in check_dataset(summary.dataset).findings if f.severity != "info"] == []
     located = {r.file.rsplit("/", 1)[-1]: r.stream_row for r in summary.dataset.recordings}
     assert located == {p.name: json.loads(p.with_suffix(".json").read_text())["stream_row"] for p in recordings(folder)}
+    assert trace.used() == set()
 
 
 def _hand_follows_prompt(folder: Path, toy: Toy) -> None:

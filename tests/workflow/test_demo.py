@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,28 +14,42 @@ import pytest
 
 from plushsense.workflow import demo
 from plushsense.workflow.demo import DemoSize
+from support.traced import SocketTrace
 
 REPO = Path(__file__).resolve().parents[2]
 TINY = DemoSize(people=4, repetitions=1, epochs=1, folds=2, live_s=15.0)
 
 
+PROGRAM = f"""
+import sys
+from plushsense.cli.main import main
+from plushsense.workflow import demo
+
+demo.QUICK = demo.{TINY!r}
+sys.exit(main(sys.argv[1:]))
+"""
+
+
 def test_demo_twice(cli: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It imports, trains, evaluates, runs live and exports, and opens no socket."""
     monkeypatch.setattr(demo, "QUICK", TINY)
-    out = tmp_path / "demo"
-    ran = cli("demo", "--quick", "--out", out, "--json")
-    assert ran.status == 0, ran.err
-    found = ran.json
+    out, trace = tmp_path / "demo", SocketTrace(tmp_path)
+    command = [*trace.words, sys.executable, "-c", PROGRAM, "demo", "--quick", "--out", str(out), "--json"]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    found = json.loads(ran.stdout)
     assert {"dataset", "bundle", "report", "export", "scores"} <= set(found)
     assert found["scores"]["split"] == "by-subject:2"
     assert [g["affect"] for g in found["live"]["gestures"]]
     assert (Path(found["export"]) / "plushsense.c").is_file()
-    assert "say nothing about a real toy" in ran.err
+    assert "say nothing about a real toy" in ran.stderr
     assert "simulation" in Path(found["report"]).read_text().lower()
     again = cli("demo", "--quick", "--out", out)
     assert again.status == 0
     assert again.out.count("SIMULATION") >= 1
     leftovers = [p.name for p in out.rglob("*") if p.name.endswith(".part") or "-unfinished-" in p.name]
     assert leftovers == []
+    assert trace.used() == set()
 
 
 def test_demo_touches_no_folder_of_yours(cli: Callable[..., Any], tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ SEARCHES: dict[str, str] = {
     "LSL": "plushsense.devices.lsl:search_streams",
 }
 """For each transport, ``module:function`` of a function (seconds to search) that returns a `DeviceListing`."""
-_BY_NETWORK = ("LSL",)
+_SENDING = ("Bluetooth", "LSL")  # They ask devices by radio, and the network by multicast.
 
 EXAMPLES = (
     "serial:///dev/ttyUSB0?baud=115200, serial://COM3, ble://AA:BB:CC:DD:EE:FF, ble://name:PlushName, tcp://host:port, "
@@ -225,7 +225,7 @@ class DeviceListing:
 def list_devices(scan_s: float = SCAN_S, *, network: bool = True) -> DeviceListing:
     """Search for toys on all transports at once, for ``scan_s`` seconds.
 
-    Without ``network``, nothing is sent to it: LSL streams, which are found by multicast, are left out.
+    Without ``network``, nothing is sent by radio or network: only serial ports are listed.
 
     All serial ports and LSL streams are listed, and Bluetooth devices that advertise the Nordic UART service or have a
     name like a toy's. A missing package or adapter gives a note, not an error.
@@ -251,7 +251,7 @@ def list_devices(scan_s: float = SCAN_S, *, network: bool = True) -> DeviceListi
             message = f"{scheme} cannot be used: {' '.join(str(cause).split())}."
             results[scheme] = DeviceListing(notes=[Sentence(message, reason="search_failed", kind=scheme)])
 
-    searches = {scheme: search for scheme, search in SEARCHES.items() if network or scheme not in _BY_NETWORK}
+    searches = {scheme: search for scheme, search in SEARCHES.items() if network or scheme not in _SENDING}
     threads = [threading.Thread(target=look, args=item, daemon=True) for item in searches.items()]
     for thread in threads:
         thread.start()

@@ -80,7 +80,6 @@ def mark_scripts(templates: Environment, name: str) -> None:
     templates.loader = ChoiceLoader([DictLoader({name: marked}), templates.loader])
 
 
-
 def is_loopback(host: str) -> bool:
     """Return whether ``host`` is an address of this machine's loopback interface."""
     try:
@@ -234,7 +233,11 @@ def _is_upload(scope: Scope) -> bool:
 
 async def _to_start(send: Send, visitor: str) -> None:
     """Redirect to the home page, which removes the token from the address, and set the cookie ``visitor`` if given."""
-    headers = [(b"location", f"/?{WELCOME}".encode()), (b"cache-control", b"no-store"), *_security_headers(secrets.token_urlsafe(16))]
+    headers = [
+        (b"location", f"/?{WELCOME}".encode()),
+        (b"cache-control", b"no-store"),
+        *_security_headers(secrets.token_urlsafe(16)),
+    ]
     if visitor:
         headers.append((b"set-cookie", f"{COOKIE}={visitor}; Path=/; HttpOnly; SameSite=Strict".encode()))
     await send({"type": "http.response.start", "status": 303, "headers": headers})

@@ -35,7 +35,7 @@ class ToySection:
         self._update()
         on_change(toys.changed, self._update)
         if not toys.searched:
-            # Nobody has asked for it: the network must not notice.
+            # Nobody has asked for it: nothing may be sent.
             toys.search(network=False)
 
     def _use(self) -> None:
