@@ -93,7 +93,13 @@ def serving(limits: ConnectionLimits, app: Any) -> Iterator[int]:
 
 
 async def length(scope: Any, receive: Any, send: Any) -> None:
-    """Answer with the length of the body; ``/wait`` only when the client has gone."""
+    """Answer with the length of the body; ``/wait`` only when the client has gone; ``/much`` with 32 MB."""
+    if scope["path"] == "/much":
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        for _ in range(512):
+            await send({"type": "http.response.body", "body": bytes(65536), "more_body": True})
+        await send({"type": "http.response.body", "body": b""})
+        return
     body, more = b"", True
     while more or scope["path"] == "/wait":
         message = await receive()
@@ -120,7 +126,21 @@ def ended(connection: socket.socket) -> bool:
 
 
 def answered(connection: socket.socket) -> bool:
-    return connection.recv(65536).startswith(b"HTTP/1.1 200")
+    """Read the whole answer, which may come in pieces."""
+    answer = b""
+    while not answer.endswith(b"\r\n0\r\n\r\n") and (data := connection.recv(65536)):
+        answer += data
+    return answer.startswith(b"HTTP/1.1 200")
+
+
+def is_open(connection: socket.socket) -> bool:
+    connection.setblocking(False)
+    try:
+        return connection.recv(1) != b""
+    except BlockingIOError:
+        return True
+    except ConnectionError:
+        return False
 
 
 @pytest.mark.parametrize("data", [b"", HALF, WHOLE], ids=["nothing", "half a head", "an answered request"])
@@ -164,6 +184,26 @@ def test_a_body_that_does_not_arrive_ends_the_connection_and_one_that_does_is_re
         assert time.monotonic() - start > limits.body_s
 
 
+def test_an_answer_that_is_not_read_ends_the_connection_and_one_that_is_read_slowly_does_not() -> None:
+    request = b"GET /much HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    with serving(ConnectionLimits(head_s=0.1, body_s=0.5), length) as port, contextlib.ExitStack() as stack:
+        lazy, slow = connect(stack, port, request), connect(stack, port, request)
+        received = 0
+        for _ in range(8):
+            time.sleep(0.2)
+            while received % 4_000_000 < 3_900_000 and (data := slow.recv(100_000)):
+                received += len(data)
+            received += len(slow.recv(200_000))
+        while data := slow.recv(1_000_000):
+            received += len(data)
+        assert received > 512 * 65536
+        left = 0
+        with contextlib.suppress(ConnectionError):
+            while data := lazy.recv(1_000_000):
+                left += len(data)
+        assert left < 512 * 65536
+
+
 def test_a_new_connection_takes_the_place_of_the_one_that_waits_longest() -> None:
     with serving(ConnectionLimits(per_peer=4, head_s=600), length) as port, contextlib.ExitStack() as stack:
         busy = [connect(stack, port, b"GET /wait HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n") for _ in range(2)]
@@ -202,6 +242,21 @@ def test_peers_share_what_this_machine_leaves(monkeypatch: pytest.MonkeyPatch) -
         for _ in range(2):
             connect(stack, port, wait)
         assert answered(connect(stack, port, WHOLE))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has all addresses of 127.0.0.0/8")
+def test_two_hundred_clients_are_all_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each address asks and keeps its connection: no more than the limit stay open, and this computer is answered."""
+    monkeypatch.setattr(guard, "peer_of", lambda client, _server: "" if client == "127.0.0.1" else client)
+    limits = ConnectionLimits(total=40, per_peer=8, head_s=600, keep_alive_s=600)
+    with serving(limits, length) as port, contextlib.ExitStack() as stack:
+        clients = []
+        for peer in range(2, 202):
+            clients.append(connect(stack, port, WHOLE, f"127.0.0.{peer}"))
+            assert answered(clients[-1])
+        assert answered(connect(stack, port, WHOLE))
+        kept = limits.total - limits.per_peer
+        assert [is_open(client) for client in clients] == [False] * (200 - kept) + [True] * kept
 
 
 # Against the real server ------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import hmac
 import io
 import ipaddress
 import secrets
+import time
 import zipfile
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -275,7 +276,8 @@ class ConnectionLimits:
         total: maximum number of connections; ``per_peer`` of them are reserved for browsers on this computer.
         per_peer: maximum number of connections of one peer, see `peer_of`.
         head_s: maximum time from connecting, or from the previous response, until the head of a request is complete.
-        body_s: maximum time without new data while the body of a request is incomplete.
+        body_s: maximum time without new data while the body of a request is incomplete, or in which the client reads
+            nothing of a response.
         keep_alive_s: time after a response until a connection without a new request is closed.
         backlog: maximum number of connections waiting to be accepted; each is open briefly before it can be refused.
     """
@@ -334,12 +336,14 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
     class LimitedProtocol(H11Protocol):
         """An HTTP connection, until it is closed or upgraded to a websocket."""
 
+        # By time.monotonic, because the clock of uvloop counts whole milliseconds.
         _idle_since = _data_at = 0.0
+        _blocked_since: float | None = None
         _timer: Any = None
 
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
-            self._idle_since = self.loop.time()
+            self._idle_since = time.monotonic()
             if self._find_room():
                 self._timer = self.loop.call_later(limits.head_s, self._expire)
             else:
@@ -351,11 +355,19 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
             super().connection_lost(exc)
 
         def data_received(self, data: bytes) -> None:
-            self._data_at = self.loop.time()
+            self._data_at = time.monotonic()
             super().data_received(data)
 
+        def pause_writing(self) -> None:
+            self._blocked_since = time.monotonic()
+            super().pause_writing()
+
+        def resume_writing(self) -> None:
+            self._blocked_since = None
+            super().resume_writing()
+
         def on_response_complete(self) -> None:
-            self._idle_since = self.loop.time()
+            self._idle_since = time.monotonic()
             super().on_response_complete()
 
         @property
@@ -386,12 +398,14 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
             self.transport.abort()
 
         def _expire(self) -> None:
-            """Drop the connection if the rest of a request is overdue, else check again later."""
-            now = self.loop.time()
+            """Drop the connection if the rest of a request, or the reading of a response, is overdue, else check later."""
+            now = time.monotonic()
             if self not in self.connections:
                 return  # it is a websocket now
             left = limits.head_s
-            if self.conn.their_state is h11.SEND_BODY:
+            if self._blocked_since is not None:
+                left = self._blocked_since + limits.body_s - now
+            elif self.conn.their_state is h11.SEND_BODY:
                 if self.flow.read_paused:
                     self._data_at = now
                 left = self._data_at + limits.body_s - now
