@@ -13,6 +13,7 @@ import pytest
 
 from plushsense.studio.app import guard
 from plushsense.studio.app.guard import BODY_BYTES, CONTENT_POLICY, COOKIE, UPLOAD_BYTES, Guard, Visitors, is_loopback
+from plushsense.studio.app.shell import PAGES
 from support.browsing import Studio, alone, marked
 from support.requirements import missing
 
@@ -289,6 +290,14 @@ def test_at_home_every_answer_has_the_policy_and_nothing_is_given_away(nicegui: 
         assert get(one, path, host="evil.example")[0] == 400, path
         assert get(one, path, origin="http://evil.example")[0] == 400, path
     assert get(one, "/docs")[0] == get(one, "/openapi.json")[0] == 404
+    # What lies outside is neither opened nor an error of the program: the fixture looks for tracebacks.
+    for place in ("..%2f..%2fetc%2fpasswd", "/etc/passwd", "%00", "x" * 300):
+        words = "&".join(f"{key}={place}" for key in ("dataset", "model", "recording", "selection", "session", "name"))
+        for path in PAGES.values():
+            status, _, body = get(one, f"{path}?{words}")
+            assert status == 200 and b"root:" not in body, (path, place)
+        for kind in ("exports", "packages", "backups", "recordings", ".."):
+            assert get(one, f"/download/{kind}/{place}.zip")[0] == 404, (kind, place)
     assert websocket(one)
     assert websocket(one, origin=f"http://127.0.0.1:{one.port}")
     assert not websocket(one, origin="http://evil.example")
