@@ -83,7 +83,7 @@ def test_without_the_network_nothing_is_sent(monkeypatch: pytest.MonkeyPatch) ->
         return opening.DeviceListing()
 
     monkeypatch.setattr(
-        opening, "SEARCHES", {name: "support.nowhere:search" for name in ("LSL", "Bluetooth", "Serial ports")}
+        opening, "SEARCHES", dict.fromkeys(("LSL", "Bluetooth", "Serial ports"), "support.nowhere:search")
     )
     monkeypatch.setattr(opening.pkgutil, "resolve_name", lambda name: search)
     list_devices(0.1, network=False)

@@ -11,7 +11,8 @@ from support.waiting import until
 
 # An address in a traced call; sockets between the processes of a program have none, or a path.
 _ADDRESS = re.compile(
-    r'^\d+ +(?:<\.\.\. )?(\w+)\b.*\b(?:sin_addr=inet_addr\("([^"]+)"\)|inet_pton\(AF_INET6, "([^"]+)"|sun_path=@?"([^"]+)")'
+    r"^\d+ +(\w+)\(.*\b"
+    r'(?:sin_addr=inet_addr\("([^"]+)"\)|inet_pton\(AF_INET6, "([^"]+)"|sun_path=@?"([^"]+)")'
 )
 # With a family other than these, a socket is raw, of Bluetooth, or speaks with the kernel.
 _FAMILY = re.compile(r"^\d+ +socket\((?!AF_INET6?, SOCK_STREAM|AF_UNIX)(\w+, \w+)")
