@@ -398,7 +398,7 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
             self.transport.abort()
 
         def _expire(self) -> None:
-            """Drop the connection if the rest of a request or the reading of a response is overdue, else check later."""
+            """Drop the connection if the rest of a request or reading the response is overdue; else check later."""
             now = time.monotonic()
             if self not in self.connections:
                 return  # it is a websocket now
