@@ -14,6 +14,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 VERSIONS = ("3.11", "3.12", "3.13", "3.14")
+BEFORE = (
+    "simulate RECORDINGS --people 2 --repetitions 1 --dataset FIRST",
+    "train FIRST --epochs 1 --out model.plush",
+)
 COMMANDS = (
     "import RECORDINGS DS --layout plush-15",
     "check DS",
@@ -45,8 +49,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         plushsense = Path(sys.executable).parent / "plushsense"
-        call(plushsense, "simulate RECORDINGS --people 2 --repetitions 1 --dataset FIRST".split(), folder)
-        call(plushsense, "train FIRST --epochs 1 --out model.plush".split(), folder)
+        for command in BEFORE:
+            call(plushsense, command.split(), folder)
         for python in pythons or [sys.executable]:
             for made in ("venv", "DS", "OUT"):
                 shutil.rmtree(folder / made, ignore_errors=True)
