@@ -2,7 +2,7 @@
 
 ``formats`` holds what version 0.1.0 wrote: a session of the virtual toy (format 1), the backup (1) of the data set (1)
 that was imported from it, and a bundle (1) of a small network; backup and bundle are in base64. A new version of a
-format gets files of its own beside these. ``answers.json`` has the answers of that bundle to the frames of that session:
+format gets files of its own beside these. ``answers.json`` has its answers to the frames of that session:
 it may only change together with a line in the CHANGELOG (``PLUSHSENSE_ANSWERS=write`` writes it again).
 """
 
