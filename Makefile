@@ -3,6 +3,8 @@
 #   make test    install, then all tests
 #   make test-quick   install, then the tests that need no browser, compiler, emulator or cluster
 #   make check   formatting, lint, types, layers, rules of the code base
+#   make docs    the documentation as a site, in build/site
+#   make dist    wheel, source archive and list of components (SBOM), in dist; the wheel is tried in an empty environment
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -17,7 +19,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 # Tests start hundreds of processes, each of which would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-quick check setup clean
+.PHONY: demo test test-quick check docs dist setup clean
 
 $(VENV)/.python:
 	@$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'PlushSense needs Python 3.11 or newer, this is ' + sys.version.split()[0] + ': run  make PYTHON=/path/to/python3.11 ...')"
@@ -31,7 +33,7 @@ $(VENV)/.train: $(VENV)/.python pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/.dev: $(VENV)/.train
-	$(PIP) -e '.[train,baselines,ble,cluster,lsl,mlflow,onnx,publish,studio,tables,tflite,dev]'
+	$(PIP) -e '.[train,baselines,ble,cluster,lsl,mlflow,onnx,publish,studio,tables,tflite,dev,docs]'
 	@touch $@
 
 # The registry's plain `torch` brings gigabytes of CUDA; an exact version takes a CPU build where one is at hand.
@@ -54,6 +56,21 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest -p no:xdist tests/test_architecture.py
+
+# A warning is an error: a link that leads nowhere, a page that no other page lists.
+docs: $(VENV)/.dev
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/site
+	@echo "The documentation is build/site/index.html"
+
+$(VENV)/.dist: $(VENV)/.dev
+	$(PIP) -e '.[dist]'
+	@touch $@
+
+dist: $(VENV)/.dist
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --of JSON -o dist/plushsense-sbom.json $(BIN)/python
+	$(BIN)/python .ci/check_wheel.py dist/*.whl
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

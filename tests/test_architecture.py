@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ast
 import re
+import tomllib
 from collections import Counter, defaultdict
 from functools import cache
 from pathlib import Path
 
-SRC = Path(__file__).resolve().parents[1] / "src" / "plushsense"
+ROOT = Path(__file__).resolve().parents[1]
+SRC = ROOT / "src" / "plushsense"
 MODULES = sorted(SRC.rglob("*.py"))
 
 LONGEST = 600
@@ -92,3 +94,19 @@ def test_a_short_module_with_a_single_importer_belongs_into_it() -> None:
         and len(module.read_text(encoding="utf-8").splitlines()) < SHORT
     ]
     assert short == []
+
+
+def test_every_direct_dependency_is_explained() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    groups = {"": project["dependencies"], **project["optional-dependencies"]}
+    named = {(re.split(r"[\[<>=;]", need)[0], extra) for extra, needs in groups.items() for need in needs}
+    named = {(name, extra) for name, extra in named if name != "plushsense"}
+    rows = re.findall(r"^\| ([\w-]+) \|(.*)\|$", (ROOT / "docs" / "dependencies.md").read_text("utf-8"), re.M)
+    explained = {name: [cell.strip() for cell in rest.split("|")] for name, rest in rows if name != "package"}
+    always = {name for name, extra in named if extra == ""}
+    assert set(explained) == {name for name, _ in named}
+    for name, cells in explained.items():
+        extras = {extra for known, extra in named if known == name}
+        # Those that are always installed are named by extras again only for clarity.
+        assert name in always or set(cells[0].split(", ")) <= extras, name
+        assert cells[-1], name

@@ -1,5 +1,7 @@
 """PlushSense: recognise touch gestures on a soft toy, from recordings to C code for the toy.
 
+For example::
+
     import plushsense as ps
 
     ps.import_recordings("recordings/", "DS", layout="plush-15")

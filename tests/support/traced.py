@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
 from pathlib import Path
 
 from support.requirements import missing
@@ -38,15 +39,18 @@ class SocketTrace:
             str(self._log),
         ]
         strace = shutil.which("strace")
-        self.words = [strace, *options] if strace else []
+        self._missing = None if strace else ("strace", "strace is not installed")
+        if strace and subprocess.run([strace, *options, "true"], capture_output=True).returncode != 0:
+            self._missing = ("ptrace", "processes may not be traced here")
+        self.words = [strace, *options] if strace and not self._missing else []
 
     def used(self) -> set[str]:
         """Wait for the end of the program; return its addresses as "call address", and the unusual kinds of sockets.
 
-        Call this last: without strace, it skips the test.
+        Call this last: where nothing can be traced, it skips the test.
         """
-        if not self.words:
-            missing("strace", "strace is not installed")
+        if self._missing:
+            missing(*self._missing)
         until(lambda: self._log.is_file() and self._ended(), 60.0)
         used = set()
         for line in self._log.read_text().splitlines():

@@ -280,7 +280,7 @@ def _manifest_of(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
             raise ValueError("its manifest has another format")
         if table["version"] != VERSION:
             raise DatasetError(
-                f"The backup '{path}' has the version {table['version']!r}; this PlushSense reads {VERSION}.",
+                f"The backup '{path}' has version {table['version']!r}; this PlushSense reads {VERSION}: update it.",
                 reason="backup_version",
                 name=path.name,
             )

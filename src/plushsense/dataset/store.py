@@ -280,7 +280,7 @@ class DatasetHead:
         version = table.pop("format", None)
         if version != FORMAT_VERSION:
             raise DatasetError(
-                f"'{path}' has the format {version}; this version reads {FORMAT_VERSION}.",
+                f"'{path}' has the format {version}; this PlushSense reads {FORMAT_VERSION}: update PlushSense.",
                 reason="dataset_format",
                 folder=folder.name,
                 version=version,

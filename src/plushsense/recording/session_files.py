@@ -65,7 +65,7 @@ class SessionHead:
                 name=folder.name,
             ) from None
         if not isinstance(table, dict) or table.pop("format", None) != FORMAT_VERSION:
-            message = f"'{path}' is no session head of format {FORMAT_VERSION}: check which version wrote it."
+            message = f"'{path}' is no session head of format {FORMAT_VERSION}: update PlushSense, or restore the file."
             raise DatasetError(message, reason="session_damaged", name=folder.name)
         return load_table(table, cls, f"'{path}'", DatasetError)
 

@@ -1,0 +1,69 @@
+"""Install a wheel without extras into an empty environment of every Python found, and take recordings to C there.
+
+Usage: ``python .ci/check_wheel.py dist/plushsense-*.whl``. The network is trained beforehand by the Python that runs
+this, which needs the extra ``train``; everything is of the virtual toy.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+VERSIONS = ("3.11", "3.12", "3.13", "3.14")
+BEFORE = (
+    "simulate RECORDINGS --people 2 --repetitions 1 --dataset FIRST",
+    "train FIRST --epochs 1 --out model.plush",
+)
+COMMANDS = (
+    "import RECORDINGS DS --layout plush-15",
+    "check DS",
+    "info model.plush",
+    "live --device virtual://?speed=0&seconds=10 --model model.plush",
+    "export model.plush OUT",
+)
+FOUND = {"check": 1}  # the status of findings, which two simulated people have
+
+
+def call(program: Path | str, words: list[str], folder: Path, accepted: tuple[int, ...] = (0,)) -> str:
+    """Return what a program prints; end with its messages if its status is not accepted."""
+    done = subprocess.run([str(program), *words], cwd=folder, capture_output=True, text=True)
+    if done.returncode not in accepted:
+        sys.exit(f"{' '.join([str(program), *words])}: status {done.returncode}\n{done.stdout}{done.stderr}")
+    return done.stdout
+
+
+def runs(python: str) -> bool:
+    """Tell whether this program is a Python and not a shim of one that is not chosen."""
+    return subprocess.run([python, "--version"], capture_output=True).returncode == 0
+
+
+def main() -> None:
+    """Check the wheel that is named, or end with the command that failed."""
+    if len(sys.argv) != 2 or not (wheel := Path(sys.argv[1]).resolve()).is_file():
+        sys.exit("Give the wheel: python .ci/check_wheel.py dist/plushsense-VERSION-py3-none-any.whl")
+    pythons = [path for version in VERSIONS if (path := shutil.which(f"python{version}")) and runs(path)]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        plushsense = Path(sys.executable).parent / "plushsense"
+        for command in BEFORE:
+            call(plushsense, command.split(), folder)
+        for python in pythons or [sys.executable]:
+            for made in ("venv", "DS", "OUT"):
+                shutil.rmtree(folder / made, ignore_errors=True)
+            call(python, ["-m", "venv", "venv"], folder)
+            there = folder / "venv" / ("Scripts" if sys.platform == "win32" else "bin")
+            pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+            call(there / "python", [*pip, "-c", str(ROOT / "constraints.txt"), str(wheel)], folder)
+            for command in COMMANDS:
+                words = command.split()
+                call(there / "plushsense", words, folder, (0, FOUND.get(words[0], 0)))
+            version = call(there / "python", ["--version"], folder).strip()
+            print(f"{wheel.name} without extras on {version}: import, check, info, live and export work.")
+
+
+if __name__ == "__main__":
+    main()
