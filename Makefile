@@ -2,6 +2,7 @@
 #   make demo    install, then the whole path on a virtual toy (a simulation)
 #   make test    install, then all tests
 #   make test-quick   install, then the tests that need no browser, compiler, emulator or cluster
+#   make docs    write docs/reference anew from the code
 #   make check   formatting, lint, types, layers, rules of the code base
 
 PYTHON ?= python3
@@ -17,7 +18,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 # Tests start hundreds of processes, each of which would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-quick check setup clean
+.PHONY: demo test test-quick check docs setup clean
 
 $(VENV)/.python:
 	@$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'PlushSense needs Python 3.11 or newer, this is ' + sys.version.split()[0] + ': run  make PYTHON=/path/to/python3.11 ...')"
@@ -54,6 +55,9 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest -p no:xdist tests/test_architecture.py
+
+docs: $(VENV)/.dev
+	$(BIN)/python docs/reference/generate.py
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
