@@ -21,18 +21,20 @@ ROOT = Path(__file__).parents[2]
 PAGE, TUTORIAL = ROOT / "docs" / "paper.md", ROOT / "docs" / "tutorial.md"
 VERDICTS = ("better", "equal", "not possible here", "weaker")
 
-# What makes a command small: three people instead of 25, and one epoch.
+# What makes a command small: three people instead of 25, one epoch, and no processes that would each load PyTorch (those
+# of `stream-eval` and of `examples/paper.py` remain).
 SMALL = {
     "simulate": {"--people": "3", "--repetitions": "1"},
     "train": {"--epochs": "1"},
-    "evaluate": {"--epochs": "1"},
-    "baselines": {"--epochs": "1"},
+    "evaluate": {"--epochs": "1", "--workers": "1"},
+    "baselines": {"--epochs": "1", "--workers": "1"},
     "stream-eval": {"--epochs": "1"},
     "sweep": {
         "--architectures": "14d1_39d2_41d4,19d1_19d2_19d4_17d8",
         "--filters": "4/6/8/8",
         "--epochs": "1",
         "--batches": "64",
+        "--workers": "1",
     },
 }
 # A check has findings, which is no error; a network of one epoch is too bad to be adapted, which is refused.
