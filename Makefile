@@ -3,7 +3,7 @@
 #   make test    install, then all tests
 #   make test-quick   install, then the tests that need no browser, compiler, emulator or cluster
 #   make check   formatting, lint, types, layers, rules of the code base
-#   make docs    the documentation as a site, in build/site
+#   make docs    write docs/reference anew from the code, and build the documentation as a site, in build/site
 #   make dist    wheel, source archive and list of components (SBOM), in dist; the wheel is tried in an empty environment
 
 PYTHON ?= python3
@@ -59,6 +59,7 @@ check: $(VENV)/.dev
 
 # A warning is an error: a link that leads nowhere, a page that no other page lists.
 docs: $(VENV)/.dev
+	$(BIN)/python docs/reference/generate.py
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/site
 	@echo "The documentation is build/site/index.html"
 

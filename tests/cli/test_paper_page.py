@@ -1,4 +1,4 @@
-"""The page on the paper: every row has a verdict and a command, and every command runs, on small data."""
+"""Pages whose commands all run, on small data: the paper, every row of which has a verdict too, and the tutorial."""
 
 from __future__ import annotations
 
@@ -12,36 +12,44 @@ from pathlib import Path
 import pytest
 
 from plushsense.cli.main import main
+from plushsense.dataset.index import open_dataset
 from plushsense.deploy.proof.verify import Setting
 from plushsense.studio.app import serve
 from support.archive import make_archive
 
-PAGE = Path(__file__).parents[2] / "docs" / "paper.md"
+ROOT = Path(__file__).parents[2]
+PAGE, TUTORIAL = ROOT / "docs" / "paper.md", ROOT / "docs" / "tutorial.md"
 VERDICTS = ("better", "equal", "not possible here", "weaker")
 
-# What makes a command small: three people instead of 25, and one epoch.
+# What makes a command small: three people instead of 25, one epoch, and no processes that would each load PyTorch (those
+# of `stream-eval` and of `examples/paper.py` remain).
 SMALL = {
     "simulate": {"--people": "3", "--repetitions": "1"},
     "train": {"--epochs": "1"},
-    "evaluate": {"--epochs": "1"},
-    "baselines": {"--epochs": "1"},
+    "evaluate": {"--epochs": "1", "--workers": "1"},
+    "baselines": {"--epochs": "1", "--workers": "1"},
     "stream-eval": {"--epochs": "1"},
     "sweep": {
         "--architectures": "14d1_39d2_41d4,19d1_19d2_19d4_17d8",
         "--filters": "4/6/8/8",
         "--epochs": "1",
         "--batches": "64",
+        "--workers": "1",
     },
 }
 # A check has findings, which is no error; a network of one epoch is too bad to be adapted, which is refused.
 STATUS = {"check": (0, 1), "adapt": (0, 1)}
 
 
+def blocks(page: Path) -> list[str]:
+    """The commands in the blocks of a page, in order."""
+    text = page.read_text("utf-8")
+    return [line for block in re.findall(r"```sh\n(.*?)```", text, re.S) for line in block.splitlines()]
+
+
 def commands() -> list[str]:
-    """The commands of the page, in order, each once."""
-    text = PAGE.read_text("utf-8")
-    blocks = [line for block in re.findall(r"```sh\n(.*?)```", text, re.S) for line in block.splitlines()]
-    return list(dict.fromkeys([*blocks, *(cells[-1].strip("`") for cells in rows())]))
+    """The commands of the page on the paper, in order, each once."""
+    return list(dict.fromkeys([*blocks(PAGE), *(cells[-1].strip("`") for cells in rows())]))
 
 
 def rows() -> list[list[str]]:
@@ -64,11 +72,27 @@ def run(command: str) -> tuple[int, str]:
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         if program == "python":
-            examples = runpy.run_path(str(PAGE.parents[1] / words[0]), run_name="paper")
+            examples = runpy.run_path(str(ROOT / words[0]), run_name="example")
             return examples["main"](words[1:]), said.getvalue()
         small = SMALL.get(words[0], {})
         status = main([*words, *(part for option in small.items() if option[0] not in words for part in option)])
     return status, said.getvalue()
+
+
+@pytest.mark.usefixtures("c_compiler")
+def test_the_tutorial_ends_with_the_same_answers_in_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("plushsense.deploy.proof.verify.settings_of", lambda name: [Setting(name, "gcc", "-O2")])
+    said = ""
+    for command in blocks(TUTORIAL):
+        status, said = run(command)
+        assert status == 0, f"{command}: exit status {status}\n{said}"
+        if "--guess" in command:
+            guessed = "".join(re.findall(r"```toml\n(.*?)```", TUTORIAL.read_text("utf-8"), re.S))
+            assert guessed in Path("cushion.toml").read_text("utf-8")
+        if "--exclude" in command:
+            assert [r.id for r in open_dataset("DS").recordings if r.excluded] == ["P03/session1/squeeze_1580_80"]
+    assert "Every number of every answer is equal" in said
 
 
 @pytest.mark.usefixtures("publish_tools", "c_compiler")

@@ -25,12 +25,14 @@ class Gesture:
     """A gesture that people make on the toy; a class of a model.
 
     Attributes:
-        affect: one of `AFFECTS`; "none" if unknown.
-        family: name of a group of similar gestures; defaults to the label.
-        free_choice: whether each person chose what to do.
-        nobody: whether it is recorded without a person (the toy at rest).
-        idle: whether it means that nothing happens; it never starts an event.
-        energetic: whether it is so abrupt that the threshold rules of the gate can detect it before the network does.
+        label: name of the gesture, as recordings have it. Upper and lower case are the same, and ``_`` is a space.
+        affect: how the gesture is meant; ``none``: not known (one of `AFFECTS`).
+        family: name of a group of similar gestures, such as those of one part of the toy (default: the label).
+        free_choice: whether each person chose what to do. Such gestures are not among the shared classes.
+        nobody: whether it is recorded without a person, such as the toy at rest.
+        idle: whether it means that nothing happens. It never starts an event.
+        energetic: whether it is so abrupt that threshold rules may detect it before the network does.
+        description: what the person does; shown as the prompt of a session where the protocol has none.
         labels: further labels of recordings that are this gesture, as in a set of merged gestures.
     """
 
@@ -60,7 +62,10 @@ class Gesture:
 class GestureSet:
     """An ordered set of gestures; the position of a gesture is its class index.
 
-    A TOML file has ``name`` and ``gestures``, tables with the keys of `Gesture`. ``inferred``: made by `infer`.
+    Attributes:
+        name: name of the set.
+        gestures: the gestures in class order, which is that of the outputs of a model.
+        inferred: whether an import made the set from the labels of the recordings, because none was given.
     """
 
     name: str

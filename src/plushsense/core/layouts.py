@@ -23,6 +23,7 @@ GRAVITY_STATE_BITS = 10  # fraction bits of the running mean itself
 GRAVITY_S = 0.64  # time constant of the running mean; chosen on 14 people (bench/people.py)
 ACCELERATION = "acceleration"
 BINARY, COUNT = "binary", "count"
+DERIVED_KINDS = ("magnitude", "gravity")
 MOST_GAP_MS, MOST_GAP_SAMPLES = 60_000, 60_000
 _INT32 = (-2147483648.0, 2147483647.0)
 
@@ -41,9 +42,19 @@ def gravity_limit() -> int:
 class Channel:
     """A quantity that the toy measures and sends as a raw value.
 
-    The physical value, in ``unit``, is ``(raw - offset) * scale``; all computations use the integer
-    ``round(raw / step)``. Raw values outside ``[valid_min, valid_max]`` are invalid. The kinds ``binary`` (touched or
-    not) and ``count`` (a number of cells) are for channels that keep one value while nothing touches them.
+    Attributes:
+        name: name of the channel, which the other keys of the layout use.
+        unit: unit of the physical value ``(raw - offset) * scale``, such as ``N``; ``count`` for plain numbers.
+        kind: what is measured, such as ``capacitive``, ``force`` or ``proximity``. Three of the names have an effect:
+            ``acceleration`` (its axes show where down is), and ``binary`` (touched or not) and ``count`` (a number of
+            touched cells), which may keep one value for long.
+        offset: raw value that stands for zero.
+        scale: physical units for each unit of the raw value.
+        valid_min: smallest valid raw value; below it, the reading counts as sensor garbage, and the last valid one is
+            used in its place (default: every number that fits 32 bits after the division by ``step``).
+        valid_max: largest valid raw value (default: as for ``valid_min``).
+        step: smallest difference of raw values that counts; all computations use the whole number ``raw / step``, so
+            that readings with two decimals need 0.01 (above 0).
     """
 
     name: str
@@ -89,10 +100,13 @@ class Channel:
 
 @dataclass(frozen=True)
 class Derived:
-    """A channel computed from the channels ``of``, an integer with 4 fraction bits.
+    """A channel computed from others, an integer with 4 fraction bits (`plushsense.windows.features.RunningMean`).
 
-    The kind ``magnitude`` is √(Σ v²); ``gravity`` is the running mean of one axis of an accelerometer, whose direction
-    is that of gravity (`plushsense.windows.features.RunningMean`).
+    Attributes:
+        name: name of the computed channel, for ``inputs``.
+        kind: ``magnitude`` is the length √(x² + y² + …) of the channels ``of``; ``gravity`` is the running mean of one
+            axis of an accelerometer, which shows where down is (one of `DERIVED_KINDS`).
+        of: names of the channels that it is computed from: several for a magnitude, one for gravity.
     """
 
     name: str
@@ -102,7 +116,14 @@ class Derived:
 
 @dataclass(frozen=True)
 class CsvFormat:
-    """CSV format of the authors' recorder for a layout: column keys in file order, header texts and separator."""
+    """CSV format of the authors' recorder for a layout.
+
+    Attributes:
+        columns: what each column of a file holds, in order: a channel, ``device_ms`` (the toy's clock), ``delay_ms``,
+            ``host_ms`` (the computer's clock) or ``label`` (default: ``host_ms``, ``device_ms`` and all channels).
+        header: text of each column in the first line of a file (default: as ``columns``).
+        separator: text between two columns (default: a comma and a space).
+    """
 
     columns: tuple[str, ...]
     header: tuple[str, ...]
@@ -120,14 +141,20 @@ class StreamColumns(NamedTuple):
 class Layout:
     """The channels of a toy, their order on the wire and in files, and the inputs of a network.
 
-    The attributes are the keys of a TOML file. It may omit ``title`` (default: the name), ``derived`` (none),
-    ``inputs`` (all channels), ``vectors`` (none), ``gap_ms`` (100), and ``csv`` or any of its keys (default:
-    ``host_ms``, ``device_ms`` and the channels, separated by commas).
-
     Attributes:
-        wire: names of channels, ``device_ms`` (the toy's clock) and ``delay_ms`` (time since the previous frame).
-        gap_ms: longest time between two frames that is interpolated; a longer gap starts a new segment.
-        vectors: triples of channels that are the axes of one vector, such as an accelerometer.
+        name: name of the layout, which data sets and models store.
+        title: what the layout is, for people (default: the name).
+        rate_hz: samples for each second that a network reads; recordings are resampled to it (1 to 10000).
+        channels: what the toy measures, in the order of the computations.
+        wire: order of the numbers in a frame: names of all channels, and ``device_ms`` (the toy's clock) or
+            ``delay_ms`` (time since the frame before), or both.
+        derived: channels that are computed from others (default: none).
+        inputs: names of the channels, measured or computed, that a network reads (default: all measured channels).
+        csv: the form of the recording's files (default: as its own keys say).
+        gap_ms: longest time between two frames that is bridged by interpolation. After a longer gap the network starts
+            anew (1 to 60000, and at most 60000 samples).
+        vectors: the axes of each three-axis sensor as a list of three channels of one kind. With an acceleration among
+            them, the default network does not depend on how the toy is held.
     """
 
     name: str
@@ -184,7 +211,7 @@ class Layout:
                 yield f"the axes {', '.join(vector)} of a vector are of different kinds: give them one."
 
     def _problems_of(self, derived: Derived) -> Iterator[str]:
-        if derived.kind not in ("magnitude", "gravity"):
+        if derived.kind not in DERIVED_KINDS:
             yield (
                 f"derived channel '{derived.name}' has the kind '{derived.kind}'; accepted are magnitude and gravity."
             )

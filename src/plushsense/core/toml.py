@@ -186,15 +186,15 @@ _ONE = {int: "a whole number", float: "a number", str: "text", bool: "true or fa
 _MANY = {int: "whole numbers", float: "numbers", str: "texts", bool: "true and false"}
 
 
-def _describe(kind: Any, many: bool = False) -> str:
+def describe_type(kind: Any, many: bool = False) -> str:
     """Describe a type in words, such as "a list of whole numbers"; ``many`` asks for the plural."""
     origin = get_origin(kind)
     if origin in _UNIONS:
-        return " or ".join(filter(None, (_describe(one, many) for one in get_args(kind))))
+        return " or ".join(filter(None, (describe_type(one, many) for one in get_args(kind))))
     if origin is Literal:
         return " or ".join(f"'{value}'" for value in get_args(kind))
     if origin is tuple:
-        return f"{'lists' if many else 'a list'} of {_describe(get_args(kind)[0], many=True)}"
+        return f"{'lists' if many else 'a list'} of {describe_type(get_args(kind)[0], many=True)}"
     return (_MANY if many else _ONE).get(kind, "tables" if many else "a table")
 
 
@@ -216,7 +216,7 @@ def _message(table: object, steps: Steps, cause: Exception, expected: Any, where
     except LookupError:
         return f"In {where}, the key {path} is missing: add it."
     subject = path or "what was given"
-    return f"In {where}, {subject} is {value!r}: accepted is {_describe(expected)}."
+    return f"In {where}, {subject} is {value!r}: accepted is {describe_type(expected)}."
 
 
 def _value(table: object, steps: Steps) -> Any:

@@ -1,4 +1,4 @@
-"""Description, authors and contact of a data set: the table ``[about]`` of ``dataset.toml``, needed to publish it.
+"""Keys of ``dataset.toml``, and its table ``[about]``: description, authors and contact, needed to publish.
 
     [about]
     title = "Touch on a plush companion"
@@ -12,7 +12,7 @@ Every key is optional; older data sets have no such table.
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from plushsense.core.errors import DatasetError
@@ -24,8 +24,41 @@ _CONTACT = re.compile(r"\s*(?P<name>[^<>]*?)\s*<\s*(?P<email>[^<>]+?)\s*>\s*")
 
 
 @dataclass(frozen=True)
+class HeadFile:
+    """The keys of ``dataset.toml``, besides ``format``, the version of the data set's form.
+
+    Attributes:
+        name: name of the data set.
+        layout: table with the keys of a layout file.
+        gesture_set: table with the keys of a gesture set file.
+        version: version of the data set.
+        licence: SPDX name of the licence, such as ``CC-BY-4.0``; needed to publish.
+        consent: statement on the consent of the people; needed to publish.
+        source: where the recordings came from; the import writes it.
+        simulated: whether the people are virtual; every page that shows a score of theirs says so.
+        about: description, authors and contact, which is needed to publish.
+    """
+
+    name: str
+    layout: dict[str, Any]
+    gesture_set: dict[str, Any]
+    version: str = "1.0.0"
+    licence: str = ""
+    consent: str = ""
+    source: str = ""
+    simulated: bool = False
+    about: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Creator:
-    """Author to be cited; ``name`` is "Family, Given", or the name of an organisation."""
+    """Author to be cited.
+
+    Attributes:
+        name: ``Family, Given``, or the name of an organisation.
+        orcid: ORCID iD, such as ``0000-0002-1825-0097``.
+        affiliation: organisation that the author works for.
+    """
 
     name: str
     orcid: str = ""
@@ -44,7 +77,12 @@ class Creator:
 
 @dataclass(frozen=True)
 class Contact:
-    """Person who answers questions about the data set; false if the name or the address is missing."""
+    """Person who answers questions about the data set; false if the name or the address is missing.
+
+    Attributes:
+        name: name of the person.
+        email: e-mail address.
+    """
 
     name: str = ""
     email: str = ""
@@ -71,7 +109,12 @@ class Contact:
 
 @dataclass(frozen=True)
 class Funding:
-    """Funder of the data set, and the number of the award."""
+    """Funder of the data set.
+
+    Attributes:
+        funder: name of the funder.
+        award: number of the award.
+    """
 
     funder: str
     award: str = ""
@@ -81,8 +124,20 @@ class Funding:
 class About:
     """Description of a data set for its users.
 
-    ``doi`` is that of the data set, ``paper`` that of the publication that describes it. ``collected`` states how the
-    recordings were made, ``limits`` what they should not be used for, ``language`` is a code such as ``en``.
+    Attributes:
+        title: title of the data set.
+        description: what it contains, in a few sentences.
+        keywords: words to find it by.
+        creators: authors to be cited, in order.
+        contact: person who answers questions about it.
+        publisher: organisation that publishes it.
+        doi: DOI of the data set, without ``https://doi.org/``.
+        homepage: web address of the data set or project.
+        paper: DOI of the publication that describes it.
+        funding: funders.
+        collected: how the recordings were made.
+        limits: what the data should not be used for.
+        language: code of the language of the texts.
     """
 
     title: str = ""

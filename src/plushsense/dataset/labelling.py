@@ -35,7 +35,12 @@ from plushsense.dataset.quality.checking import author_name
 from plushsense.dataset.store import Dataset, StreamInfo, read_csv_rows
 from plushsense.dataset.trimming import row_times_s
 
-COLUMNS = ("stream", "start_s", "stop_s", "label")
+COLUMNS = {
+    "stream": "id of the stream, such as P01/fulldatastream; must be there, as the others",
+    "start_s": "first second of the stretch, counted from the first frame of the stream",
+    "stop_s": "second at which it ends",
+    "label": "what happens: practice:GESTURE, handling (the toy is picked up, turned, put down) or rest",
+}
 
 
 @dataclass(frozen=True)

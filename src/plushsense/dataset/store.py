@@ -34,7 +34,7 @@ from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames, ReadResult, read_recording, read_stream
 from plushsense.core.toml import load_table, read_toml
-from plushsense.dataset.about import About
+from plushsense.dataset.about import About, HeadFile
 from plushsense.dataset.marks import MARKS, LabelledStretch, Mark, MarkState, append_marks, read_marks
 
 FORMAT_VERSION = 1
@@ -48,7 +48,12 @@ UNDER_WAY = "forgetting.json"
 LOCK = MARKS + ".lock"
 # Much longer than it takes to delete a large cache on a slow disk.
 _LOCK_S = 600.0
-_PEOPLE_COLUMNS = ("subject", "age_group", "gender", "consent")
+PEOPLE_COLUMNS = {
+    "subject": "code of the person, never a name; must be there, each code once",
+    "age_group": "age group, such as child",
+    "gender": "gender",
+    "consent": "reference of the signed consent",
+}
 
 Progress = Callable[[int, int], None]
 """Called with the work done and its total."""
@@ -285,7 +290,7 @@ class DatasetHead:
                 folder=folder.name,
                 version=version,
             )
-        file = load_table(table, _HeadFile, f"'{path}'", DatasetError, "head_broken")
+        file = load_table(table, HeadFile, f"'{path}'", DatasetError, "head_broken")
         values = vars(file) | {
             "layout": Layout.from_dict(file.layout, f"layout in '{path}'"),
             "gestures": GestureSet.from_dict(file.gesture_set, f"gesture set in '{path}'"),
@@ -293,21 +298,6 @@ class DatasetHead:
         }
         del values["gesture_set"]
         return cls(**values)
-
-
-@dataclass(frozen=True)
-class _HeadFile:
-    """The keys of ``dataset.toml``."""
-
-    name: str
-    layout: dict[str, Any]
-    gesture_set: dict[str, Any]
-    version: str = "1.0.0"
-    licence: str = ""
-    consent: str = ""
-    source: str = ""
-    simulated: bool = False
-    about: dict[str, Any] = field(default_factory=dict)
 
 
 class Dataset:
@@ -531,7 +521,7 @@ def read_people(path: Path) -> dict[str, PersonInfo]:
     if "subject" not in columns or len(set(columns)) != len(columns):
         raise DatasetError(
             f"The people's file '{path}' has the columns {', '.join(columns) or 'nothing'}; it needs 'subject', "
-            f"accepted besides are {', '.join(_PEOPLE_COLUMNS[1:])} and others of your own, each once."
+            f"accepted besides are {', '.join([*PEOPLE_COLUMNS][1:])} and others of your own, each once."
         )
     for line, cells in rows:
         code = cells.pop("subject")
@@ -540,7 +530,7 @@ def read_people(path: Path) -> dict[str, PersonInfo]:
                 f"names '{code}' again: give one line per person" if code else "names no subject: fill in the code"
             )
             raise DatasetError(f"The people's file '{path}' line {line} {problem}.")
-        known = {key: cells.pop(key, "") for key in _PEOPLE_COLUMNS[1:]}
+        known = {key: cells.pop(key, "") for key in [*PEOPLE_COLUMNS][1:]}
         people[code] = PersonInfo(code, **known, more=cells)
     return people
 
@@ -576,8 +566,8 @@ def write_people(folder: Path, people: Iterable[PersonInfo]) -> None:
     by_code = sorted(people, key=lambda p: p.subject)
     more = list(dict.fromkeys(key for p in by_code for key in p.more))
     out = io.StringIO()
-    writer = csv.DictWriter(out, [*_PEOPLE_COLUMNS, *more], lineterminator="\n", restval="")
+    writer = csv.DictWriter(out, [*PEOPLE_COLUMNS, *more], lineterminator="\n", restval="")
     writer.writeheader()
     for p in by_code:
-        writer.writerow(p.more | {key: getattr(p, key) for key in _PEOPLE_COLUMNS})
+        writer.writerow(p.more | {key: getattr(p, key) for key in PEOPLE_COLUMNS})
     write_file(folder / PEOPLE, out.getvalue())

@@ -25,13 +25,16 @@ class ReactionRule:
     """A rule for the reaction to events of one affect or one gesture.
 
     Attributes:
-        affect, gesture: one of the two is set; the rule of a gesture takes precedence over that of its affect.
-        eyes: one of `EYES`.
-        sound: name of a sound stored in the toy; empty: none.
-        seconds: duration of eyes and sound.
-        refractory_s: time after the reaction in which events of the same affect get no reaction.
-        quiet_s: time after the reaction in which events of other affects get none, as when the eyes shall stay off.
-        when: react when the event has ``begun`` (its affect is sure), is ``named`` (its gesture is), or has ``ended``.
+        affect: react to events of this affect; either this or ``gesture`` is given (one of `AFFECTS`).
+        gesture: react to this gesture. Its rule takes precedence over that of its affect.
+        eyes: colour of the eyes (one of `EYES`).
+        sound: name of a sound stored in the toy, up to 40 letters, digits, ``-`` and ``_``; empty: none.
+        seconds: duration of eyes and sound in seconds; above 0 if there are any (0 to 60).
+        refractory_s: time after the reaction in which events of the same affect get no reaction (0 to 3600).
+        quiet_s: time after the reaction in which events of other affects get none, as when the eyes shall stay off
+            (0 to 3600).
+        when: react when the event has ``begun`` (its affect is sure), is ``named`` (its gesture is), or has ``ended``
+            (one of `MOMENTS`).
     """
 
     affect: str = ""
@@ -84,7 +87,7 @@ class Reactions:
         Raises:
             ConfigError: for an unknown key, an invalid value, or two rules for one affect or gesture.
         """
-        profile = load_table(table, _ReactionsFile, where, ConfigError)
+        profile = load_table(table, ReactionsFile, where, ConfigError)
         lines = profile.reactions
         keys = [line.affect or plain_label(line.gesture) for line in lines]
         doubled = next((line for n, line in enumerate(lines) if keys[n] in keys[:n]), None)
@@ -103,8 +106,14 @@ class Reactions:
 
 
 @dataclass(frozen=True)
-class _ReactionsFile:
-    """Keys of a profile in a TOML file."""
+class ReactionsFile:
+    """Keys of a profile in a TOML file.
+
+    Attributes:
+        reactions: the rules, at most one for an affect or a gesture. Events without a rule get no reaction.
+        name: name of the profile.
+        title: what the profile does, for people.
+    """
 
     reactions: tuple[ReactionRule, ...]
     name: str = "own"

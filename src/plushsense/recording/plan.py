@@ -44,12 +44,9 @@ class Step:
 
 @dataclass(frozen=True)
 class Protocol:
-    """The plan of a session.
+    """The plan of a session; `ProtocolFile` describes the keys, which here have their values.
 
-    ``gestures`` are labels in recording order, ``prompts`` maps each to the text shown to the person, ``words`` is the
-    chosen wording of the prompts, ``order`` one of `ORDERS`, ``seed`` that of a random order, and ``nobody`` the
-    gestures recorded without a person. ``countdown_s`` is the time from the first press of the space bar to the first
-    row. The second press stops the recording, but not within ``shortest_s``; it ends automatically after ``longest_s``.
+    ``prompts`` has one text for each gesture: that of the wording ``words``.
     """
 
     name: str
@@ -104,7 +101,7 @@ class Protocol:
             ConfigError: for an unknown key or an invalid value.
             GestureError: for a gesture that is not in the set.
         """
-        file = load_table(table, _ProtocolFile, where, ConfigError)
+        file = load_table(table, ProtocolFile, where, ConfigError)
         if not file.name.strip():
             raise ConfigError(f"The {where} has an empty name: give it one.")
         if file.order not in ORDERS:
@@ -125,8 +122,28 @@ class Protocol:
 
 
 @dataclass(frozen=True)
-class _ProtocolFile:
-    """Keys of a protocol file, and of `Protocol.to_dict`, in which ``prompts`` has one text for each gesture."""
+class ProtocolFile:
+    """Keys of a protocol file, and of `Protocol.to_dict`, in which ``prompts`` has one text for each gesture.
+
+    Attributes:
+        name: name of the protocol, which sessions store.
+        gesture_set: name of a built-in gesture set, or path of a gesture set file beside the protocol.
+        title: what the protocol is, for people (default: the name).
+        gestures: labels of the gestures to record, in this order (default: all of the set that need a person).
+        prompts: text shown to the person for each gesture: a text, or a table of texts by wording, of which
+            ``default`` is used where the chosen one is missing. A gesture without an entry has the prompt of the
+            built-in protocols, else its description.
+        repetitions: how often each gesture is recorded (1 to 1000).
+        order: order of the recordings: ``gesture``: all repetitions of a gesture one after another, as in the paper;
+            ``round``: every gesture once, then every gesture again; ``random``: drawn for each session (one of
+            `ORDERS`).
+        countdown_s: time from the first press of the space bar to the first row of the recording (0 to 60).
+        shortest_s: time within which the second press does not stop the recording; below ``longest_s`` (0 to 60).
+        longest_s: time after which the recording ends by itself (1 to 36000).
+        words: wording of the prompts to use, such as ``lv`` where prompts have an entry of that name.
+        nobody: labels of the gestures recorded without a person; a session stores it (default: by the gesture set).
+        seed: number that a random order is drawn from; a session stores it.
+    """
 
     name: str
     gesture_set: str
@@ -143,7 +160,7 @@ class _ProtocolFile:
     seed: int = 0
 
 
-def _resolved(file: _ProtocolFile, where: str, words: str, beside: Path | None) -> dict[str, Any]:
+def _resolved(file: ProtocolFile, where: str, words: str, beside: Path | None) -> dict[str, Any]:
     """Return the fields of `Protocol` that depend on the gesture set and the wording."""
     title = file.title or file.name
     file_prompts, labels = file.prompts, file.gestures or ()

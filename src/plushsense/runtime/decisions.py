@@ -33,20 +33,24 @@ class DecideSpec:
 
     Attributes:
         smoothing_s: time constant of the exponential mean of the probabilities, after which the mean has followed 63 %
-            of a change; 0 means no smoothing.
-        enter, leave: smoothed probability from which a gesture may begin, and below which it may end.
-        enter_affect, leave_affect: the same for the sum over an affect; above 1, no event begins with only an affect.
-        sure: smoothed probability from which a class is in the conformal set of a step.
-        known_margin: smoothed known score (`plushsense.runtime.fixed.known_score`), in logits, below which a touch is
-            no known gesture; None: every touch is one.
-        least_s: how long a gesture or affect must be the candidate before its event begins (minimum duration).
-        switch_s: how long another candidate must last before it ends the event and begins the next one.
-        end_s: how long the gesture or affect must be below its threshold before the event ends.
-        hold_s, rest_s: minimum duration of an event, and minimum time after it until the next begins (refractory time).
-        wait_s: how long an event of the gate waits for the network to name a gesture.
-        gate: signals and rules of the gate; without rules there is no gate.
+            of a change; 0 means no smoothing (0 to 60).
+        enter: smoothed probability from which a gesture may begin (0 to 1).
+        leave: smoothed probability below which it may end (0 to 1).
+        enter_affect: smoothed probability of an affect, the sum over its gestures, from which an event may begin before
+            its gesture is clear; above 1, none does (0 to 2).
+        leave_affect: smoothed probability of an affect below which such an event may end (0 to 1).
+        sure: smoothed probability from which a class is among the plausible ones of a step, its conformal set (0 to 1).
+        known_margin: how far the best gesture must stand above the third best, in logits, for a touch to be a known
+            gesture (0 to 64; default: every touch is one).
+        least_s: how long a gesture or affect must be the candidate before its event begins (0 to 60).
+        switch_s: how long another candidate must last before it ends the event and begins the next one (0 to 60).
+        end_s: how long the gesture or affect must be below its threshold before the event ends (0 to 60).
+        hold_s: minimum duration of an event (0 to 60).
+        rest_s: minimum time after an event until the next begins, the refractory time (0 to 60).
+        wait_s: how long an event of the gate waits for the network to name a gesture (0 to 60).
+        gate: threshold rules that detect abrupt gestures before the network does; without rules there is no gate.
         health: settings for detecting suspect and faulty sensors.
-        fitted: description of the data on which the settings were fitted, for people to read.
+        fitted: description of the data on which the settings were fitted, for people to read; it has no effect.
     """
 
     smoothing_s: float = 0.3

@@ -40,7 +40,17 @@ MOST_SIGNALS, MOST_RULES, MOST_TERMS, MOST_LAG = 32, 16, 8, 16
 
 @dataclass(frozen=True)
 class Signal:
-    """A signal of the gate: ``kind`` (`LEVEL` or `JERK`) of ``inputs`` (indices), and its constants; see the module."""
+    """A signal of the gate; the docstring of the module has its formulas.
+
+    Attributes:
+        kind: 0: the level, the input itself; 1: the jerk, the sum of the changes of its inputs (0 to 1).
+        inputs: numbers of the network's inputs, counted from 0; a level has one.
+        lag: samples since which a change is measured (1 to 16).
+        shift: bits by which the inputs are shifted to the right before all else (0 to 24).
+        baseline: binary logarithm of the samples over which the signal's baseline is averaged (1 to 15).
+        noise: binary logarithm of the samples over which its noise is averaged (1 to 15).
+        floor: what is added to the noise before the deviation is divided by it (1 to 1048576).
+    """
 
     kind: int
     inputs: tuple[int, ...]
@@ -53,7 +63,14 @@ class Signal:
 
 @dataclass(frozen=True)
 class Term:
-    """A condition of a rule: the size of ``signal`` (an index) is at least ``threshold``; see the module."""
+    """A condition of a rule: a signal deviates from its baseline.
+
+    Attributes:
+        signal: number of the signal, counted from 0.
+        threshold: smallest size, 16 times the deviation divided by the noise (1 to 33554432).
+        sign: 1: only above the baseline; -1: only below it; 0: both (-1 to 1).
+        times: samples in a row with that size (1 to 255).
+    """
 
     signal: int
     threshold: int
@@ -63,9 +80,14 @@ class Term:
 
 @dataclass(frozen=True)
 class Rule:
-    """A rule of the gate, which fires when all ``terms`` hold within ``within`` samples.
+    """A rule of the gate, which fires when all its terms hold within some samples.
 
-    It then reports ``affect`` (a code) and ``gesture`` (a class index; 255: none).
+    Attributes:
+        terms: conditions, 1 to 8.
+        affect: affect that it reports: 0 none, 1 positive, 2 neutral, 3 negative (0 to 3).
+        gesture: number of the class that it reports, counted from 0; 255: none (0 to 255).
+        within: samples for which a term still counts after it held (0 to 255).
+        deaf: samples after it fires in which no rule does (0 to 65535).
     """
 
     terms: tuple[Term, ...]
@@ -78,6 +100,10 @@ class Rule:
 @dataclass(frozen=True)
 class GateSettings:
     """Signals and rules of a `Gate`; without rules, it never fires.
+
+    Attributes:
+        signals: what the rules look at, at most 32 signals.
+        rules: at most 16 rules; the first that fires is reported.
 
     Raises:
         BundleError: for a number outside the range of the toy, or an unknown signal.

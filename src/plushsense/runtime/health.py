@@ -28,8 +28,13 @@ _INT32 = -(1 << 31), (1 << 31) - 1
 class HealthSettings:
     """Settings of `Health`.
 
-    ``low`` and ``high`` (C,) are for the measured channels; empty: unknown, so that only valid ranges are checked. A
-    ``fault_ms`` or ``still_ms`` of 0 disables its rule; with a ``recover_ms`` of 0 the first good frame ends a fault.
+    Attributes:
+        low: smallest value of each measured channel in the recordings, in integer steps; a value below it that
+            repeats is a saturated sensor (default: not known, so that only the layout's valid ranges are checked).
+        high: largest value of each measured channel, as many as ``low`` (default: not known).
+        fault_ms: time for which every frame has a wrong channel until a fault is reported; 0: never (0 to 60000).
+        still_ms: time for which all channels repeat the frame before until a fault is reported; 0: never (0 to 60000).
+        recover_ms: time without suspect frames after which a fault ends; 0: with the first good frame (0 to 60000).
 
     Raises:
         BundleError: for a value out of its range.

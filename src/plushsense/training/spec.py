@@ -27,15 +27,26 @@ def _at_least(name: str, value: object, low: int) -> None:
 class TrainSpec:
     """Settings of a training run: Adam with a stepwise falling learning rate, and when to stop.
 
-    The learning rate is halved every ``halve_every`` epochs (None: constant). Training stops
-    after ``patience`` epochs without a better validation loss (``stop_on`` "accuracy": a better accuracy) and returns
-    the best weights; None: it runs all epochs and returns the last weights.
-    ``scaling`` of the inputs is "z-score", by mean and standard deviation of each channel over the training windows, or
-    "none", as in the authors' script: the network reads integers.
-    ``augment`` names the augmentations of the training windows (see `training.augment`).
-    ``device`` "auto" is CUDA if it is available. ``threads`` is for the CPU. More than one rarely helps: a batch is
-    divided among them in chunks of 64 windows, and PyTorch's own threads gain little on networks as small as these (on
-    a busy machine a second one made an epoch 25 times slower). Train folds in parallel instead.
+    More than one thread rarely helps: a batch is divided among them in chunks of 64 windows, and PyTorch's own threads
+    gain little on networks as small as these (on a busy machine a second one made an epoch 25 times slower). Train
+    folds in parallel instead.
+
+    Attributes:
+        epochs: how often all training windows are read, at most (from 1; default: by the preset).
+        batch: windows for each step of the optimiser (from 2).
+        learning_rate: step size of the optimiser, Adam (above 0 to 1; default: by the preset).
+        halve_every: epochs after which the learning rate is halved (from 1; default: by the preset).
+        patience: training stops after this many epochs without a better result on the validation people, and the best
+            weights are kept; without it, all epochs run and the last weights are kept (from 1; default: by the preset).
+        stop_on: result that ``patience`` watches (one of `STOP_ON`).
+        augment: changes of the training windows, each with its strength, such as ``random-rotation:45`` (degrees; the
+            toy is held differently), ``random-gain:0.3`` (stronger or weaker movement), ``random-tilt:8`` (degrees;
+            down is not exactly known) and ``random-speed:0.2`` (faster or slower movement) (default: by the preset).
+        scaling: ``z-score`` scales each channel by its mean and standard deviation over the training windows; ``none``
+            lets the network read the integers, as in the authors' script (one of `SCALINGS`).
+        seed: number that all random choices of the training are drawn from (from 0).
+        device: what computes; ``auto``: a graphics card with CUDA if there is one (one of `DEVICES`).
+        threads: threads of the processor for one training (from 1).
     """
 
     epochs: int = 150

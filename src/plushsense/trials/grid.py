@@ -49,10 +49,36 @@ _OF_TRAINING = ("learning_rate", "halve_every", "patience", "augment", "turn_deg
 class GridSpec:
     """Settings of a grid. The constructor checks nothing; `problems` reports all errors at once.
 
-    A network of n layers uses the first n numbers of each set of ``filters``. ``seeds`` are those of the trainings;
-    ``split_seed`` gives all of them the same folds. ``classes`` is "all", "shared", labels joined by commas, or merged
-    gestures (`GestureSet.merged_by`). ``threads`` is part of a training's id, because the order of sums in PyTorch's
-    layers depends on it.
+    ``threads`` is part of a training's id, because the order of sums in PyTorch's layers depends on it.
+
+    Attributes:
+        name: name of the grid, and of its folder: letters, digits, ``.``, ``_`` and ``-`` (default: that of the file).
+        architectures: networks, each written as in ``14d1_39d2_41d4``: kernel lengths in samples, dilations after
+            ``d`` (default: the paper's 13).
+        filters: sets of filters, ``[[4, 6, 8, 8], [8, 12, 16, 16]]``; a network of n layers uses the first n numbers of
+            each set (default: the paper's 4).
+        epochs: numbers of epochs after which a training is scored, ascending, each from 1.
+        batches: windows for each step of the optimiser, each from 2; ``full``: all windows.
+        seeds: numbers that the random choices of a training are drawn from, each from 0; one training for each.
+        split: which recordings are scored and which are learned from, as in a configuration file.
+        split_seed: number that the folds are drawn from, the same for all trainings (from 0).
+        preset: training settings to begin with (one of `PRESETS`).
+        padding: what a network reads before the start of a window, as in a configuration file (one of `PADDINGS`).
+        norm: normalisation after each layer (one of `NORMS`).
+        context: what fills the windows of short recordings: ``stream``: the session before; ``loop``: the recording
+            again (one of `CONTEXTS`).
+        classes: ``all``, ``shared``, labels as a list or joined by commas, or merged gestures, as in a configuration
+            file.
+        window_s: length of the windows (above 0 to 60).
+        step_s: time from the start of a window to that of the next one in the same recording (above 0 to 60).
+        learning_rate: step size of the optimiser, Adam (above 0 to 1; default: by the preset).
+        halve_every: epochs after which the learning rate is halved (from 1; default: by the preset).
+        patience: epochs without a better result after which a training stops (from 1; default: by the preset).
+        augment: changes of the training windows, as in a configuration file (default: by the preset).
+        turn_deg: the same as ``augment = ["random-rotation:…"]``, in degrees; only one of the two may be given
+            (0 to 180; default: by the preset).
+        device: what computes; ``auto``: a graphics card with CUDA if there is one (one of `DEVICES`).
+        threads: threads of the processor for one training (from 1).
     """
 
     name: str = "grid"

@@ -54,7 +54,20 @@ NOTHING, FREE, IDLE = -1, -2, -3
 
 @dataclass(frozen=True)
 class AnywhereSpec:
-    """Settings for choosing positions, in seconds and shares; the docstring of the module explains them."""
+    """Settings for choosing positions; the docstring of the module explains how they work together.
+
+    Attributes:
+        every_s: time between the positions in a stream at which windows may end (above 0 to 60).
+        onset_s: time after the start of a recording from which a window that ends there has the gesture's label
+            (0 to 60).
+        after_s: time after the end of a recording until which it still has (0 to 60).
+        settle_s: time after the end of a recording from which nothing happens; not below ``after_s`` (0 to 60).
+        idle_share: share of idle windows among all windows (0 to below 1).
+        busy_share: share of the positions outside recordings, those with the most movement, that is left out because
+            people may practise there (0 to 1).
+        hard_share: idle windows that a first network takes for a gesture are added, at most this share of the windows;
+            0: none is, and no first network is trained (0 to 1).
+    """
 
     every_s: float = 0.4
     onset_s: float = 0.3

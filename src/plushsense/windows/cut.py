@@ -38,8 +38,15 @@ TRAIN_CONTEXTS = (*CONTEXTS, ANYWHERE)
 class WindowSpec:
     """Settings for cutting windows; durations in seconds.
 
-    ``span_s`` lengthens windows for networks that need more samples than ``window_s``. Recordings longer than
-    ``longest_factor`` times the median of their gesture are left out (0: never).
+    Attributes:
+        window_s: length of the windows (above 0 to 60).
+        step_s: time from the start of a window to that of the next one in the same recording (above 0 to 60).
+        context: where the samples come from that a recording shorter than a window lacks. ``stream``: from the
+            session before the recording; ``loop``: the recording is repeated; ``anywhere``: for live use, windows are
+            cut all along the sessions, also while nothing happens (one of `TRAIN_CONTEXTS`; default: by the preset).
+        span_s: Not in a file: it follows from the network. It lengthens windows for networks that need more samples.
+        longest_factor: recordings longer than this many times the median of their gesture are left out; 0: none is
+            (0 or from 1).
     """
 
     window_s: float = 2.5

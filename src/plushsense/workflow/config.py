@@ -1,13 +1,6 @@
 """Settings of one run, which a TOML file can contain: network, training, windows and split.
 
-    [windows]     window_s, step_s, context, longest_factor
-    [anywhere]    every_s, onset_s, after_s, settle_s, idle_share, busy_share, hard_share
-    [model]       arch, filters, padding, norm, step_s, pool_s
-    [training]    preset, epochs, batch, learning_rate, halve_every, patience, stop_on, augment, scaling, seed, device,
-                  threads
-    [evaluation]  split, classes, train_context, workers, seed
-    [live]        smoothing_s
-
+`TABLES` has the tables of the file by name; their keys are the attributes of the classes.
 Options of the command line override the file. An unknown key is an error that names the most similar known key.
 """
 
@@ -19,12 +12,14 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import ConfigError, check_known
+from plushsense.core.errors import ArchError, ConfigError, check_known
 from plushsense.core.layouts import Layout
 from plushsense.core.toml import check_table, read_toml, refuse_unknown
 from plushsense.models.arch import (
     DEFAULT_FILTERS,
     DEFAULT_SYMBOL,
+    NORMS,
+    PADDINGS,
     VECTOR_FILTERS,
     VECTOR_SYMBOL,
     Arch,
@@ -43,10 +38,19 @@ SHARED, ALL = "shared", "all"
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """Settings of the network, times in seconds.
+    """Settings of the network.
 
-    ``arch`` None: the default for the layout and the preset; ``filters`` None: the default of that network; ``padding``
-    None: the preset's; ``pool_s`` None: the whole window.
+    Attributes:
+        arch: the layers, joined by ``_``: each has its kernel length in samples, and after ``d`` its dilation, as in
+            ``14d1_39d2_41d4``; ``v`` before the first is a vector layer (default: by layout and preset).
+        filters: number of filters of each layer; also as text, ``8,12,16`` (default: those of the network).
+        padding: what a network reads before the start of a window. ``stream``: nothing, so that it can read a live
+            signal sample by sample; ``causal``: zeros; ``mirror``: the window in reverse, as the paper (one of
+            `PADDINGS`; default: by the preset).
+        norm: normalisation after each layer (one of `NORMS`).
+        step_s: time between two live decisions (above 0 to 60).
+        pool_s: time over which a decision averages, with the padding ``stream`` (above 0 to 60; default: what fills the
+            window).
     """
 
     arch: str | None = None
@@ -60,6 +64,9 @@ class ModelSpec:
         for name, seconds in (("step_s", self.step_s), ("pool_s", self.pool_s)):
             if seconds is not None and not 0.0 < seconds <= 60.0:
                 raise ConfigError(f"{name} is {seconds}: accepted is above 0 and up to 60 seconds.")
+        if self.padding is not None:
+            check_known(self.padding, PADDINGS, "padding", ArchError)
+        check_known(self.norm, NORMS, "norm", ArchError)
 
     def build(self, layout: Layout, classes: int, window_s: float, padding: str) -> Arch:
         """Build the network for the inputs of a layout and a number of classes."""
@@ -88,10 +95,16 @@ class EvaluationSpec:
     """Settings of an evaluation.
 
     Attributes:
-        classes: "shared" (gestures that at least 90 % of the people made, without free choice), "all", labels, or
-            merged gestures (see `plushsense.core.gestures.GestureSet.merged_by`).
-        train_context: context of the training windows; None: that of the scored windows.
-        workers: number of processes; 0: one for each processor.
+        split: which recordings are scored and which are learned from: ``leave-one-subject-out``, ``by-subject:5`` (by
+            people), ``by-recording:5``, ``recordings:holdout``, ``recordings:random``; leaky, as in the paper:
+            ``windows:5``, ``windows:holdout``. The numbers are those of the folds.
+        classes: ``shared`` (gestures that at least 90 % of the people made, without free choice), ``all``, a list of
+            labels, or merged gestures: ``family``, ``affect``, the name of a built-in merge or the path of a gesture
+            set file.
+        train_context: context of the training windows, if it is not that of the scored ones (one of `TRAIN_CONTEXTS`;
+            default: as ``context``).
+        workers: number of processes; 0: one for each processor (from 0).
+        seed: number that the folds are drawn from (from 0).
     """
 
     split: str = "leave-one-subject-out"
@@ -186,11 +199,21 @@ class RunConfig:
 
 @dataclass(frozen=True)
 class _TrainingTable(TrainSpec):
+    """The keys of the table ``training``.
+
+    Attributes:
+        preset: the settings to begin with, which the other keys change: ``people`` (ours, for people whom the network
+            never met), ``loso`` and ``search`` (the paper's schedules), ``paper`` (the paper's, also in the windows and
+            the padding) (one of `PRESETS`).
+        turn_deg: the same as ``augment = ["random-rotation:…"]``, in degrees; only one of the two may be given
+            (0 to 180).
+    """
+
     preset: str = "people"
     turn_deg: float = 0.0
 
 
-_TABLES: dict[str, type[Any]] = {
+TABLES: dict[str, type[Any]] = {
     "windows": WindowSpec,
     "model": ModelSpec,
     "training": _TrainingTable,
@@ -208,7 +231,7 @@ def _checked(name: str, given: Mapping[str, Any], source: str) -> dict[str, Any]
         )
     if name == "model" and isinstance(given.get("filters"), str):
         given = {**given, "filters": parse_filters(given["filters"])}
-    values, problems = check_table(given, _TABLES[name], f"[{name}]{source}")
+    values, problems = check_table(given, TABLES[name], f"[{name}]{source}")
     if problems:
         raise ConfigError(problems[0])
     return values
@@ -224,19 +247,19 @@ def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunCo
     Raises:
         ConfigError: for an unknown table or key (the message suggests the nearest known one) or an invalid value.
     """
-    tables: dict[str, dict[str, Any]] = {name: {} for name in _TABLES}
+    tables: dict[str, dict[str, Any]] = {name: {} for name in TABLES}
     if path is not None:
         content = read_toml(Path(path), "configuration", ConfigError)
-        refuse_unknown(content, _TABLES, f"'{path}'", ConfigError)
+        refuse_unknown(content, TABLES, f"'{path}'", ConfigError)
         for name, table in content.items():
             if not isinstance(table, dict):
                 raise ConfigError(f"'{name}' in '{path}' is a single value, but must be a table: write  [{name}]")
             tables[name].update(_checked(name, table, f" of '{path}'"))
-    refuse_unknown(flags, _TABLES, "the settings", ConfigError)
+    refuse_unknown(flags, TABLES, "the settings", ConfigError)
     for name, given in flags.items():
         tables[name].update(_checked(name, {key: value for key, value in given.items() if value is not None}, ""))
     name = tables["training"].pop("preset", "people")
-    make: dict[str, Callable[..., Any]] = {**_TABLES, "training": preset(name).changed}
+    make: dict[str, Callable[..., Any]] = {**TABLES, "training": preset(name).changed}
     tables["windows"].setdefault("context", CONTEXT[name])
     return RunConfig(name, **{table: make[table](**values) for table, values in tables.items()})
 

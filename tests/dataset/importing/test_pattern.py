@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import tomllib
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -249,12 +247,6 @@ def test_what_is_wrong_in_a_toml_is_named_with_its_line(tmp_path: Path, text: st
     (tmp_path / "p.toml").write_text(text)
     with pytest.raises(BadInput, match=said):
         read_pattern(tmp_path / "p.toml")
-
-
-def test_every_key_is_in_the_documentation() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "importing.md").read_text(encoding="utf-8")
-    table = page.partition("| key | meaning | default |")[2].partition("\n\n")[0]
-    assert re.findall(r"^\| `(\w+)`", table, re.MULTILINE) == [field.name for field in fields(ImportPattern)]
 
 
 def test_the_line_of_a_key() -> None:

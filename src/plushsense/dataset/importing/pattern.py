@@ -77,25 +77,36 @@ class ImportPattern:
     They say where person, session, label, take and channels are found in paths and columns.
 
     Attributes:
-        layout: name of a built-in layout, path of a layout file beside this file, or a table with the keys of a layout;
-            ``name`` and ``wire`` may be omitted there.
-        gestures: name of a built-in gesture set, path of a file, or a table; by default the labels are the gestures.
-        paths: patterns of the files to import, below the source; the first that matches counts. See `path_expression`.
+        layout: name of a built-in layout, path of a layout file beside this file, or a table with the keys of a layout
+            file, where ``name`` and ``wire`` may be omitted (default: the built-in layout whose channels the header
+            names).
+        gestures: name of a built-in gesture set, path of a gesture set file beside this file, or a table with its keys,
+            where ``name`` may be omitted (default: the labels are the gestures).
+        paths: patterns of the files to import, below the source; the first that fits counts. ``{subject}``,
+            ``{session}``, ``{label}`` and ``{recording}`` (the take) stand for a part of one name, as long as possible;
+            ``{subject:EXPRESSION}`` limits a part by a regular expression. ``*`` and ``?`` stand for any characters
+            within a name, ``**`` also for folders (default: all files).
         exclude: patterns of files that are left out all the same.
-        format: ``csv`` for tables of text, ``json`` for JSON lines, ``parquet``; "" decides by the ending.
-        encoding: encoding of text files.
-        skip_before: lines before the line of column names.
-        skip_after: lines after it, such as units.
+        format: ``csv`` for tables of text, ``json`` for JSON lines or a list of objects, ``parquet`` (default: by the
+            ending of the file).
+        encoding: encoding of text files, such as ``utf-16`` or ``latin-1``. A byte order mark is never read as text.
+        skip_before: lines before the line of column names (from 0).
+        skip_after: lines after it, such as units (from 0).
         names: names of the columns of files that have no line of column names, or a wrong one in ``skip_before``.
-        separator: separator of columns; " " is any white space, "" finds it in the first line.
+        separator: one character between two columns; a space is any white space (default: found in the first line).
         decimal: sign before the decimals.
-        missing: words in place of a value, such as "OL" or "". The row stays, and the value counts as invalid.
-        bits: columns whose characters, joined in this order, are one digit for each channel without its own column.
-        row_rate_hz: rows for each second, for files without a clock; 0 if there is a column of times.
-        time_unit: unit of times; "iso" for dates; "" finds it in the column's name or by the rate.
-        columns: column of each role (subject, session, recording, label, time, host_ms) or channel: its name, ``x#2``
-            for the second column ``x``, ``#3`` for the third column; ``a.b`` for a value within a JSON object.
-        aliases: for each label, the other spellings of it in the source.
+        missing: words in place of a value, such as ``OL``, or an empty text for an empty cell. The row stays, and the
+            value counts as invalid, so that readers repeat the last valid one (default: such rows are left out).
+        bits: columns whose characters, joined in this order, are one digit for each channel without its own column,
+            such as ``00101100``.
+        row_rate_hz: rows for each second, for files without a clock. Rows that are left out take their time, too; 0:
+            there is a column of times (from 0).
+        time_unit: unit of times; ``iso`` for dates (default: by the name of the column, else by the rate).
+        columns: column of each channel, and of ``subject``, ``session``, ``recording``, ``label``, ``time`` and
+            ``host_ms``: its name, ``x#2`` for the second column ``x``, ``#3`` for the third column, ``a.b`` for a value
+            within a JSON object (default: the columns of those names, as for one table).
+        aliases: for each label, a list of other spellings of it in the source. Case, ``_`` and spaces never make a
+            difference.
     """
 
     layout: str | dict[str, Any] = ""

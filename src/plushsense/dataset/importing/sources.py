@@ -303,6 +303,12 @@ def classify_files(
     return classified
 
 
+MAPPING_COLUMNS = {
+    "file": "name of a recording's file, or its path below the source; must be the first column",
+    "subject": "code of the person; must be the second column",
+}
+
+
 def read_mapping(path: Path) -> dict[str, str]:
     """Read a mapping from file name to person, a CSV with the columns ``file`` and ``subject``."""
     mapping: dict[str, str] = {}
@@ -310,7 +316,7 @@ def read_mapping(path: Path) -> dict[str, str]:
         columns, rows = read_csv_rows(path, "mapping file")
     except FileNotFoundError:
         raise DatasetError(f"There is no mapping file '{path}': check the path.") from None
-    if columns[:2] != ["file", "subject"]:
+    if columns[:2] != [*MAPPING_COLUMNS]:
         raise DatasetError(
             f"The mapping file '{path}' has the columns {', '.join(columns) or 'nothing'}; it needs  file,subject"
         )

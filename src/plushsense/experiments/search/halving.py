@@ -45,15 +45,17 @@ LIMITS: dict[str, tuple[str, str]] = {
 class SearchSpec:
     """Settings of a search. The constructor checks nothing; `problems` reports all errors at once.
 
-    Args:
-        rungs: numbers of epochs after which networks are compared; the last is the length of a complete training.
-        folds: number of folds for each rung but the last; empty: all folds in every rung.
-        share: limit on the cost, as a share of the whole grid's (all allowed networks, folds and seeds, to the last
-            rung). None: a quarter, or if that cannot pay for one complete training, the cost of the first rung and of
-            training two networks to the end.
-        eta: one in ``eta`` networks of a rung continues, but at least two, if the cost allows.
-        max_parameters, max_state_bytes, max_macs_per_step: networks above a limit are left out before anything runs.
-            The state is that of int8 streaming; a step is 50 ms.
+    Attributes:
+        rungs: numbers of epochs after which networks are compared, ascending, each from 1; the last is the length of a
+            complete training.
+        folds: number of folds for each rung but the last, not falling, each from 1 (default: all folds in every rung).
+        share: limit on the cost, as a share of the whole grid's: all allowed networks, folds and seeds, to the last
+            rung (above 0 to 1; default: a quarter, or if that cannot pay for one complete training, the cost of the
+            first rung and of training two networks to the end).
+        eta: one in this many networks of a rung continues, but at least two, if the cost allows (above 1).
+        max_parameters: networks with more parameters are left out before anything runs (from 1; default: no limit).
+        max_state_bytes: the same for the bytes of state of streaming in 8 bits (from 1; default: no limit).
+        max_macs_per_step: the same for the multiplications in a step of 50 ms (from 1; default: no limit).
     """
 
     rungs: tuple[int, ...] = (4, 15, 60)
@@ -312,9 +314,14 @@ _TRIES = 2000
 class Space:
     """A space of networks to draw from.
 
-    Numbers of layers, kernel sizes and dilations are drawn from ``layers``, ``kernels`` and ``dilations``; dilations
-    never decrease from layer to layer, as in all of the paper's networks. ``receptive_field`` is the shortest and the
-    longest accepted one, in samples (the paper's window has 250). ``networks`` different ones are drawn with ``seed``.
+    Attributes:
+        layers: numbers of layers to draw from, each from 1.
+        kernels: lengths of kernels to draw from, in samples, each from 1.
+        dilations: dilations to draw from, each from 1; they never decrease from layer to layer, as in all networks of
+            the paper.
+        receptive_field: shortest and longest receptive field that is accepted, in samples (the paper's window has 250).
+        networks: number of different networks to draw (from 2).
+        seed: number that they are drawn from (from 0).
     """
 
     layers: tuple[int, ...] = (2, 3, 4)

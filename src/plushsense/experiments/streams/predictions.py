@@ -35,8 +35,17 @@ from plushsense.experiments.streams.replay import StreamEvents, StreamTruth
 from plushsense.runtime.events import AFFECT_CODES, AFFECTS, CNN, NO_GESTURE
 from plushsense.runtime.trace import ReportedEvent
 
-DECISION_COLUMNS = ("t", "label", "score", "stream", "subject")
-EVENT_COLUMNS = ("t", "stop", "label", "score", "stream", "subject", "affect", "named")
+EVENT_COLUMNS = {
+    "t": "time of the decision, or of the beginning of the event, in seconds since the first frame; must be there",
+    "stop": "time of the end of the event; with this column each row is an event, otherwise a decision",
+    "label": "the best gesture; empty: nothing happens; must be there",
+    "score": "how sure the system is, 0 to 1; without it, 1",
+    "stream": "id of the stream; needed if several streams are scored",
+    "subject": "instead of stream: the person, who has one stream",
+    "affect": "only for events: affect, if it is not that of the label",
+    "named": "only for events: time at which the label is reported, if it is later than t",
+}
+DECISION_COLUMNS = tuple(name for name in EVENT_COLUMNS if name not in ("stop", "affect", "named"))
 _THRESHOLDS = 21
 # Times may exceed the end of the stream by this, as systems round them.
 _ROUNDING_S = 0.1
