@@ -31,7 +31,13 @@ from plushsense.dataset.importing.build import (
 )
 from plushsense.dataset.importing.pattern import STREAM_ROLE, ImportPattern, check_roles, read_pattern
 from plushsense.dataset.importing.preview import ImportPreview, preview
-from plushsense.dataset.importing.proposals import adopt, matching_layouts, propose_settings, readable_layouts
+from plushsense.dataset.importing.proposals import (
+    adopt,
+    find_sensors,
+    matching_layouts,
+    propose_settings,
+    readable_layouts,
+)
 from plushsense.dataset.importing.saved_windows import read_windows, windows_layout, write_windows
 from plushsense.dataset.importing.sources import (
     LEFT_OUT,
@@ -363,7 +369,9 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
 
 def _propose(done: ImportSummary, adopting: bool) -> None:
     """Measure a new data set; add what fits it better to the summary, and to its layout if ``adopting``."""
-    found = propose_settings(done.dataset)
+    sensors = find_sensors(done.dataset)
+    done.sensors = [sensor.to_dict() for sensor in sensors]
+    found = propose_settings(done.dataset, sensors)
     done.proposals = [{**p.to_dict(), "advice": p.advice(adopted=adopting)} for p in found]
     head = done.dataset.head
     layout = adopt(head.layout, found) if adopting else head.layout
