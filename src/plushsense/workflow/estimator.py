@@ -551,6 +551,13 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
                 stacklevel=3,
             )
         if padding != "stream":
+            if made.receptive_field > samples:
+                warnings.warn(
+                    f"X has windows of {samples} samples, fewer than the {made.receptive_field} that the kernels of "
+                    f"{made.symbol} read: the rest is made up by the padding '{padding}'. Give longer windows or a "
+                    "shorter network (arch=None makes one that fits).",
+                    stacklevel=3,
+                )
             return replace(made, step=min(5, samples))
         if made.receptive_field > samples:
             raise ArrayError(

@@ -34,8 +34,9 @@ Program = tuple[str, str, Pca]
 def program_table(result: Mapping[str, Any]) -> Table:
     """Return one row for each program, ordered by accuracy under the first split, the best first.
 
-    A row has the span that it reads, in seconds, accuracy and macro-F1 of each split, with those pooled over all windows as a note; the gap in accuracy
-    between the first leaky split and the first split by person; and the costs measured under the first split.
+    A row has the span that it reads, in seconds; accuracy and macro-F1 of each split, with those pooled over all
+    windows as a note; the gap in accuracy between the first leaky split and the first split by person; and the costs
+    measured under the first split.
     """
     splits = [split["split"] for split in result["splits"]]
     by_program: dict[Program, dict[str, Mapping[str, Any]]] = {}
