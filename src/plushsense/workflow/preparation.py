@@ -209,7 +209,7 @@ def warn_of_long_windows(
     elif reads_s > window_s:
         advice.append("a shorter --pool-s")
     if window_s > usual_s:
-        advice.append(f"[windows] window_s = {max(0.5, round(usual_s, 1)):g} in a --config file")
+        advice.append(f"window_s = {max(0.5, round(usual_s, 1)):g} in [windows] of a --config file, or in a grid")
     looped = spec.context == "loop"
     effect = "repeat their gesture" if looped else "begin before their gesture"
     sentence = (

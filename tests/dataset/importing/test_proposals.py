@@ -63,9 +63,11 @@ def test_a_zero_that_cannot_be_known_is_not_proposed(tmp_path: Path) -> None:
 
 
 def test_two_references_of_an_analogue_converter_are_named(tmp_path: Path, cli: Callable[..., Any]) -> None:
-    source = analogue(analogue(tmp_path / "R", 330, 68), 511, 102, people=range(3, 5))
-    ran = cli("import", source, tmp_path / "DS", "--layout", "accel-3")
-    assert "differ in zero or scale: 1 g is about 68" in ran.err and "for P0, P1, P2; 1 g is about 10" in ran.err
+    source = analogue(tmp_path / "R", 330, 68)
+    assert "offset: x 3" in cli("import", source, tmp_path / "DS", "--layout", "accel-3").err
+    ran = cli("import", analogue(source, 511, 102, people=range(3, 5)), tmp_path / "DS", "--add")
+    assert "suggestion: the accelerometers of the sessions differ in zero or scale: 1 g is about 68" in ran.err
+    assert "for P0, P1, P2; 1 g is about 10" in ran.err
     assert 'give a layout with self_calibration = ["x", "y", "z"]' in ran.err
     adopted = import_recordings(source, tmp_path / "DS2", layout="accel-3", adopt_proposals=True)
     assert [c.offset for c in adopted.dataset.layout.channels] == [0, 0, 0], "no zero fits both"
