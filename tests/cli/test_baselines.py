@@ -34,6 +34,7 @@ def test_one_table_of_two_splits_and_what_is_left_behind(cli: Cli, dataset: Data
     for row in found["models"]:
         assert 0 <= row["accuracy"]["mean"] <= 1 and 0 <= row["macro_f1"]["mean"] <= 1
         assert row["features"] == "statistics" and row["size_bytes"] > 1000 and row["predict_ms"] > 0
+        assert row["span_s"] == 2.47  # 247 samples, as the default network reads
     assert {g["name"] for g in found["gaps"]} == {"knn", "tree"} and len(found["gaps"]) == 4
     assert found["simulated"] is False and found["jobs"] == 4 * (2 + 3) and found["resumed"] == 0
     assert sorted(p.name for p in (tmp_path / "OUT").iterdir()) == [
@@ -47,7 +48,7 @@ def test_one_table_of_two_splits_and_what_is_left_behind(cli: Cli, dataset: Data
     assert "http" not in page.replace("http-equiv", "")
     ran = cli(*words)
     assert ran.status == 0 and "(leaky)" in ran.out and "Only the number by person counts" in ran.out
-    assert "macro-F1 (leaky)" in ran.out
+    assert "macro-F1 (leaky)" in ran.out and "span s" in ran.out
     assert "20 of 20 fits (20 from before)" in ran.err
     other = cli("baselines", dataset.path, "--split", "windows:3", *QUICK, "--out", tmp_path / "OUT")
     assert other.status == 2 and "holds a comparison of other settings" in other.err and other.out == ""
@@ -70,6 +71,7 @@ def test_our_network_is_the_one_that_evaluate_scores(cli: Cli, dataset: Dataset,
     assert list(titles) == ["lstm", "lstm:units=8:dropout=0.5"] and titles["lstm"][0] == "LSTM (32)"
     assert titles["lstm:units=8:dropout=0.5"][0] == "LSTM (8, dropout 0.5)"
     assert titles["lstm:units=8:dropout=0.5"][1] < titles["lstm"][1] / 2
+    assert len({r["span_s"] for r in found["models"]}) == 1
     assert "LSTM (8, dropout 0.5)" in (tmp_path / "B" / "baselines.html").read_text(encoding="utf-8")
 
 
@@ -77,7 +79,7 @@ def test_refusals_are_sentences(cli: Cli, dataset: Dataset, tmp_path: Path) -> N
     place = ("--out", tmp_path / "OUT")
     for words, said in (
         (("--models", "forests"), "Unknown model 'forests': accepted are quick,"),
-        (("--features", "raw"), "Unknown features 'raw': accepted are statistics, flattened."),
+        (("--features", "raw"), "Unknown features 'raw': accepted are statistics, paper-statistics, flattened."),
         (("--models", "lstm:128"), "Did you mean 'lstm:units=128'?"),
         (("--pca", "maybe"), "Unknown choice 'maybe' for PCA: accepted are both, no, yes, unscaled, all."),
         (("--split", "windows"), "needs a number of folds"),

@@ -63,7 +63,7 @@ def test_only_where_validation_stops_are_trials_trained_apart() -> None:
         ({"threads": 0}, "threads is 0"),
         ({"name": "../up"}, "cannot be a folder's"),
         ({"window_s": -1.0}, "out of range"),
-        ({"architectures": ("100_300",)}, "receptive field of 399 samples, longer than the window of 250"),
+        ({"architectures": ("100_300",)}, "receptive field of 399 samples (4 s), longer than the window of 250"),
         ({"architectures": ("100_300",), "padding": "stream"}, "receptive field of 399"),
         ({"architectures": ("100d4",), "padding": "stream", "context": "stream"}, "sees 646 samples"),
     ],
@@ -73,6 +73,14 @@ def test_each_problem_is_one_sentence(changes: dict[str, object], said: str) -> 
     assert len(found) == 1, found
     assert said in found[0] and "\n" not in found[0]
     assert problems(SMALL, PLUSH, past=600, windows=300) == []
+
+
+def test_at_another_rate_kernels_that_fit_the_window_are_named() -> None:
+    grid = GridSpec(name="g", architectures=("14d1_39d2_41d4",), filters=((4, 4, 4),), batches=(64,))
+    (found,) = problems(grid, replace(PLUSH, rate_hz=20.0), past=600, windows=300)
+    assert "250 samples (12 s)" in found and "longer than the window of 50" in found
+    symbol = found.partition("such as ")[2].partition(",")[0]
+    assert problems(replace(grid, architectures=(symbol,)), replace(PLUSH, rate_hz=20.0), windows=300) == []
 
 
 def test_all_problems_come_at_once() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import BadInput
-from plushsense.windows.features import NAMES, statistic_names, statistics
+from plushsense.windows.features import NAMES, statistic_names, statistics, statistics_in_order
 
 RATE = 100.0
 
@@ -66,6 +66,18 @@ def test_eleven_channels_give_88_in_a_stated_order_and_an_integer_is_as_good_as_
     assert found[1, names.index("c4 max")] == x[1, 4].max()
     assert found[2, names.index("c10 rms")] == pytest.approx(np.sqrt((x[2, 10].astype(float) ** 2).mean()))
     assert np.array_equal(found, statistics(x.astype(np.float64), RATE))
+
+
+def test_only_the_quarters_tell_a_rise_from_a_fall() -> None:
+    rise = np.stack([np.arange(250), np.full(250, 3)])[None]
+    fall = rise[:, :, ::-1]
+    assert np.allclose(statistics(rise, RATE), statistics(fall, RATE))
+    found = [statistics_in_order(x, RATE)[0] for x in (rise, fall)]
+    assert found[0].shape == (32 * 2,) and np.array_equal(found[0][:16], statistics(rise, RATE)[0])
+    quarters = found[0][16:].reshape(4, 6, 2)
+    assert quarters[:, 0, 0] == pytest.approx([31, 94, 156.5, 218.5]) and (quarters[:, 0, 1] == 3).all()
+    assert found[1][16:].reshape(4, 6, 2)[:, 0, 0] == pytest.approx(quarters[::-1, 0, 0], abs=2)
+    assert statistics_in_order(rise[:, :, :2], RATE).shape == (1, (8 + 2 * 6) * 2)
 
 
 def test_windows_of_nothing_are_refused() -> None:

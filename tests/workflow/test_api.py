@@ -183,7 +183,9 @@ def test_the_toy_at_rest_does_not_flatter_a_training(tmp_path: Path) -> None:
 def test_a_file_under_two_labels_and_a_long_window_are_named(
     dataset: Dataset, make_session: Callable[[Path, int], None], tmp_path: Path
 ) -> None:
+    from plushsense.dataset.importing.proposals import median_gesture_s
     from plushsense.models.arch import Arch
+    from plushsense.windows.cut import WindowSpec
     from plushsense.workflow.preparation import warn_of_files_twice, warn_of_long_windows
 
     said: list[str] = []
@@ -196,11 +198,22 @@ def test_a_file_under_two_labels_and_a_long_window_are_named(
     warn_of_files_twice(twice, twice.gestures, said.append)
     assert len(said) == 1 and "as two gestures" in said[0] and "P1/Slow_" in said[0] and "P1/Fast_" in said[0]
 
-    arch = Arch.parse("14d1", (4,), channels=3, classes=3, window=250)
-    warn_of_long_windows(dataset, arch, 1.0, dataset.gestures, said.append)
-    assert len(said) == 2 and "shorter kernels" in said[1]  # the network reads 2.5 s
-    warn_of_long_windows(dataset, arch, 2.5, dataset.gestures, said.append)
-    assert len(said) == 3 and "window_s" in said[2]
+    def of(symbol: str, window_s: float, context: str = "stream", padding: str = "stream") -> str:
+        spec, found = WindowSpec(window_s=window_s, context=context), list[str]()
+        window = dataset.layout.samples(window_s)
+        arch = Arch.parse(symbol, (4,) * 3, channels=3, classes=3, window=window, padding=padding)
+        warn_of_long_windows(dataset, arch, spec, dataset.gestures, found.append)
+        return "".join(found)
+
+    usual_s = median_gesture_s(dataset)
+    assert usual_s == 2.325
+    assert of("14d1", 1.0) == ""
+    window = of("14d1", 2.5)
+    assert "window 2.5 s" in window and "begin before" in window and "try window_s = 2.3 in [windows]" in window
+    assert "--arch" not in window and "repeat their gesture" in of("14d1", 2.5, "loop")
+    kernels = of("14d1_39d2_41d4", 1.0, padding="mirror")
+    assert "kernels 2.5 s, window 1 s" in kernels and "try --arch " in kernels and "window_s" not in kernels
+    assert of(kernels.rpartition(" ")[2], 1.0) == ""
 
 
 def test_a_gesture_of_one_person_is_named(dataset: Dataset) -> None:

@@ -144,6 +144,8 @@ def test_short_windows_get_a_shorter_default_network_and_are_told_so() -> None:
         with pytest.raises(ArrayError, match=f"{samples} samples, but 80 with padding 'stream' needs at least 80:"):
             small(arch="80", epochs=1).fit(long[:, :, :samples], y)
     assert small(arch="80", epochs=1).fit(long[:, :, :80], y).bundle_.arch.span == 80
+    with pytest.warns(UserWarning, match="60 samples, but 80 with padding 'mirror' needs at least 80:"):
+        small(arch="80", padding="mirror", epochs=1).fit(x, y)
 
 
 def test_weights_count_windows_and_their_order_does_not_matter() -> None:

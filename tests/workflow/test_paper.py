@@ -102,7 +102,7 @@ def test_the_table_is_made_and_goes_on_where_it_stood(
     assert [row["paper"] for row in chosen.values()] == ["75.0 %", "75.0 %"]
     assert sorted("leaky" in what for what in chosen) == [False, True]
     assert "compare the paper's 75.0 %" in said
-    forest = next(row for what, row in by_what.items() if what.startswith("random forest (200) on statistics ("))
+    forest = next(row for what, row in by_what.items() if what.startswith("random forest (200) on paper-statistics ("))
     assert forest["paper"] == "95.9 %" and "leaky" in forest["what"] and forest["n"].startswith("5 folds, ")
     page = (tmp_path / "paper.html").read_text(encoding="utf-8")
     assert "SIMULATION" in page
@@ -127,13 +127,13 @@ def test_the_papers_result_with_pca_stands_beside_pca_without_scaling(
     monkeypatch.setitem(BASELINES, "forest", BASELINES["tree"])
     rows = script.Paper(made / "archive", None, tmp_path, seeds=1, quick=False).baselines()
     assert asked == [
-        ("forest", ("statistics",), "all", ("windows:5",)),
+        ("forest", ("paper-statistics",), "all", ("windows:5",)),
         ("cubic-svm", "forest", "subspace-knn", ("flattened",), "no", ("windows:5",)),
     ]
     assert [(row.what.partition(" (leaky")[0], row.paper) for row in rows] == [
-        ("decision tree on statistics", "95.9 %"),
-        ("decision tree on statistics, PCA unscaled", "66.3 %"),
-        ("decision tree on statistics, PCA", "-"),
+        ("decision tree on paper-statistics", "95.9 %"),
+        ("decision tree on paper-statistics, PCA unscaled", "66.3 %"),
+        ("decision tree on paper-statistics, PCA", "-"),
         ("decision tree on flattened", "89.7 %"),
     ]
 

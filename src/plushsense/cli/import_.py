@@ -29,6 +29,8 @@ def _report(result: dict[str, Any], names: str) -> None:
         say(f"warning: {line}")
     if len(result["warnings"]) > _MOST_WARNINGS:
         say(f"... and {len(result['warnings']) - _MOST_WARNINGS} more warnings{names}")
+    for sensor in result.get("sensors", ()):
+        say(f"accelerometer {', '.join(sensor['axes'])}: {sensor['summary']}")
     for proposal in result.get("proposals", ()):
         say(f"suggestion: {proposal['reason']}: {proposal['advice']}")
     for status in ("left_out", "rejected"):

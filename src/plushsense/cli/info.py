@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, table
+from plushsense.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from plushsense.dataset.statistics import Duration, SummaryStatistics
@@ -106,21 +107,24 @@ def run_arch(args: argparse.Namespace) -> int:
     from plushsense.models.arch import Arch
     from plushsense.workflow.reporting import card
 
+    if not 0 < args.rate < float("inf"):
+        raise ConfigError(f"--rate is {args.rate:g}: accepted are samples a second, above 0.")
     arch = Arch.parse(
         args.spec,
         args.filters,
         **options(args, "channels", "classes", "padding", "norm", "window", "step", "pool", "vectors"),
     )
     printed = f" (the paper's Table 3 prints {arch.table3})" if arch.table3 else ""
+    seconds = arch.receptive_field / args.rate
     again = "" if arch.padding == "stream" else "; this padding recomputes the window at every step"
     emit(
         args,
-        card(arch),
+        card(arch, rate_hz=args.rate),
         [
             f"{arch.symbol}  filters {','.join(map(str, arch.filters))}  padding {arch.padding}  norm {arch.norm}",
             f"  parameters        {arch.parameters:,}{printed}",
-            f"  receptive field   {arch.receptive_field} samples",
-            f"  span              {arch.span} samples seen by a decision",
+            f"  receptive field   {arch.receptive_field} samples, {seconds:.2f} s at {args.rate:g} Hz",
+            f"  span              {arch.span} samples seen by a decision, {arch.span / args.rate:.2f} s",
             f"  MACs a window     {arch.macs_per_window:,}",
             f"  MACs a step       {arch.macs_per_step:,} (every {arch.step} samples{again})",
             f"  state, int8       {arch.state_bytes_int8:,} bytes",

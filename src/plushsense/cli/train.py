@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, warn
 from plushsense.cli.settings import report_epochs, settings
 from plushsense.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from plushsense.models.bundle import Bundle
 
 
 def run(args: argparse.Namespace) -> int:
@@ -36,6 +39,7 @@ def run(args: argparse.Namespace) -> int:
         [
             f"{bundle}: {done.bundle.arch.symbol}, {done.bundle.arch.parameters:,} parameters, "
             f"epoch {scores['best_epoch']} of {len(done.history)} kept{mark}",
+            _reads(done.bundle),
             f"accuracy {figure(scores['accuracy'])}, macro-F1 {figure(scores['macro_f1'])} on {scores['windows']} "
             f"windows of {scores['said']}{_counted(scores)}.",
             *(
@@ -50,6 +54,15 @@ def run(args: argparse.Namespace) -> int:
         ],
     )
     return 0
+
+
+def _reads(bundle: Bundle) -> str:
+    """Format what a decision reads, in seconds and samples, as text."""
+    arch, rate = bundle.arch, bundle.layout.rate_hz
+    return (
+        f"A decision reads the last {arch.span / rate:.2f} s ({arch.span} samples at {rate:g} Hz), through kernels of "
+        f"{arch.receptive_field / rate:.2f} s ({arch.receptive_field})."
+    )
 
 
 def _counted(scores: Mapping[str, Any]) -> str:

@@ -29,6 +29,8 @@ from plushsense.models.arch import (
     parse_filters,
     parse_symbol,
     slashed,
+    symbol_at_rate,
+    symbol_within,
 )
 from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import DEVICES, PRESETS, TrainSpec
@@ -319,9 +321,11 @@ def _too_long(grid: GridSpec, symbol: str, layout: Layout, past: int | None) -> 
     if field - window < max(layer.dilation for layer in arch.layers):
         return []
     real = "only padding 'stream' with context 'stream' reads more"
+    # The networks of grids are mostly made for 100 Hz.
+    fitting = symbol_within(symbol_at_rate(symbol, layout.rate_hz), window)
     return [
-        f"{symbol} has a receptive field of {field} samples, longer than the window of {window} ({real}): take "
-        f"shorter kernels, or a window_s of {field / layout.rate_hz:g}."
+        f"{symbol} has a receptive field of {field} samples ({field / layout.rate_hz:.2g} s), longer than the window "
+        f"of {window} ({real}): take shorter kernels, such as {fitting}, or a window_s of {field / layout.rate_hz:g}."
     ]
 
 

@@ -57,7 +57,6 @@ from plushsense.workflow.preparation import (
     outside_streams,
     silent,
     warn_of_files_twice,
-    warn_of_long_windows,
     warn_of_single_people,
     windows_for,
 )
@@ -226,7 +225,6 @@ def train(
     if quantize_aware:
         refuse_undeployable(network)
     warn_of_files_twice(dataset, gestures, warn)
-    warn_of_long_windows(dataset, network, config.windows.window_s, gestures, warn)
     windows = windows_for(dataset, network, config.windows, gestures, warn, config.anywhere)
     scored = windows
     if config.scored_on != config.windows:
@@ -401,7 +399,6 @@ def evaluate(
     if int8:
         refuse_undeployable(network)
     warn_of_files_twice(dataset, gestures, warn)
-    warn_of_long_windows(dataset, network, config.windows.window_s, gestures, warn)
     score = fit_on = windows_for(dataset, network, config.scored_on, gestures, warn)
     if parse_split(config.evaluation.split).apart:
         warn_of_single_people(score, warn)

@@ -70,7 +70,7 @@ class ModelSpec:
 
     def build(self, layout: Layout, classes: int, window_s: float, padding: str) -> Arch:
         """Build the network for the inputs of a layout and a number of classes."""
-        arch = self.arch or DEFAULT_SYMBOL
+        arch = self.arch or symbol_at_rate(DEFAULT_SYMBOL, layout.rate_hz)
         return Arch.parse(
             arch,
             self.filters or default_filters(arch),
@@ -164,14 +164,13 @@ class RunConfig:
 
         With the preset ``people`` and a layout of vectors alone, one of them an acceleration, that is a network with a
         vector layer. Beside other sensors it was no better (on the virtual toy; no real recordings were at hand).
-        Kernels of default networks that stream last as long at any rate.
+        Kernels of default networks last as long at any rate.
         """
         axes = {axis for vector in layout.vectors for axis in vector}
         turns = layout.has_gravity and set(layout.inputs) <= axes
         fits = self.preset == "people" and self.padding == "stream"
-        arch = self.model.arch or (VECTOR_SYMBOL if turns and fits else DEFAULT_SYMBOL)
-        if self.model.arch is None and self.padding == "stream":
-            arch = symbol_at_rate(arch, layout.rate_hz)
+        default = VECTOR_SYMBOL if turns and fits else DEFAULT_SYMBOL
+        arch = self.model.arch or symbol_at_rate(default, layout.rate_hz)
         model = replace(self.model, arch=arch, filters=self.model.filters or default_filters(arch))
         training = self.training
         if parse_symbol(arch).vector is not None and training.augment == PRESETS["people"].augment:

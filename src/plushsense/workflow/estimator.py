@@ -550,14 +550,16 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
                 f"to {made.symbol}. With arch='{made.symbol}' there is no warning.",
                 stacklevel=3,
             )
+        if made.receptive_field > samples:
+            problem = (
+                f"X has windows of {samples} samples, but {made.symbol} with padding '{padding}' needs at least "
+                f"{made.receptive_field}: give longer windows or a shorter network (arch=None makes one that fits)"
+            )
+            if padding == "stream":
+                raise ArrayError(f"{problem}, or padding='mirror'.")
+            warnings.warn(f"{problem}.", stacklevel=3)
         if padding != "stream":
             return replace(made, step=min(5, samples))
-        if made.receptive_field > samples:
-            raise ArrayError(
-                f"X has windows of {samples} samples, but {made.symbol} with padding 'stream' needs at least "
-                f"{made.receptive_field}: give longer windows, a shorter network (arch=None makes one that fits), or "
-                "padding='mirror'."
-            )
         return replace(made, step=min(5, samples - made.receptive_field + 1), pool=None)
 
     def _settings(self) -> dict[str, Any]:

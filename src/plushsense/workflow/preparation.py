@@ -15,7 +15,7 @@ from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.proposals import median_gesture_s
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
 from plushsense.evaluation.crossval import fold_windows
-from plushsense.models.arch import Arch, parse_symbol
+from plushsense.models.arch import Arch, parse_symbol, symbol_within
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere, idle_candidates
@@ -99,7 +99,11 @@ def windows_for(
     warn: Warn = silent,
     anywhere: AnywhereSpec | None = None,
 ) -> WindowSet:
-    """Cut windows for a network, which are as long as the span that its decisions depend on."""
+    """Cut windows for a network, which are as long as the span that its decisions depend on.
+
+    ``warn`` gets a sentence if that is longer than most recordings, and for everything that is left out.
+    """
+    warn_of_long_windows(dataset, arch, spec, gestures, warn)
     span_s = arch.span / dataset.layout.rate_hz
     spec = replace(spec, span_s=span_s if span_s > spec.window_s else 0.0)
     if spec.context == ANYWHERE:
@@ -188,20 +192,32 @@ def warn_of_files_twice(dataset: Dataset, gestures: GestureSet, warn: Warn) -> N
             warn(Sentence(sentence, "same_file", first=first.id, second=other.id))
 
 
-def warn_of_long_windows(dataset: Dataset, arch: Arch, window_s: float, gestures: GestureSet, warn: Warn) -> None:
-    """Warn if a window, or the span of the network, is longer than half of the recordings of the gestures."""
+def warn_of_long_windows(
+    dataset: Dataset, arch: Arch, spec: WindowSpec, gestures: GestureSet, warn: Warn = silent
+) -> None:
+    """Warn if the window, or what the network reads, is longer than half of the recordings of the gestures."""
     usual_s = median_gesture_s(dataset, gestures.labels)
-    span_s = max(window_s, arch.span / dataset.layout.rate_hz)
-    if usual_s is not None and span_s > usual_s:
-        if span_s > window_s:
-            advice = f"shorter kernels (--arch), as the layout has {dataset.layout.rate_hz:g} samples a second"
-        else:
-            advice = f"[windows] window_s = {max(0.5, round(usual_s, 1)):g} in a --config file"
-        sentence = (
-            f"a decision reads {span_s:.1f} s, but half of the recordings last less than {usual_s:.1f} s, so most "
-            f"windows begin before their gesture: try {advice}"
-        )
-        warn(Sentence(sentence, "long_windows", reads=float(span_s), usual=float(usual_s)))
+    rate_hz, window_s = dataset.layout.rate_hz, spec.window_s
+    field_s = arch.receptive_field / rate_hz
+    reads_s = max(window_s, arch.span / rate_hz, field_s)
+    if usual_s is None or reads_s <= usual_s:
+        return
+    advice = []
+    fitting = dataset.layout.samples(min(window_s, usual_s))
+    if arch.receptive_field > fitting:
+        advice.append(f"--arch {symbol_within(arch.symbol, max(1, fitting // 2))}")
+    elif reads_s > window_s:
+        advice.append("a shorter --pool-s")
+    if window_s > usual_s:
+        advice.append(f"window_s = {max(0.5, round(usual_s, 1)):g} in [windows] of a --config file, or in a grid")
+    looped = spec.context == "loop"
+    effect = "repeat their gesture" if looped else "begin before their gesture"
+    sentence = (
+        f"a decision reads {reads_s:.1f} s (kernels {field_s:.1f} s, window {window_s:g} s), but half of the "
+        f"recordings last less than {usual_s:.1f} s, so most windows {effect}: try {' and '.join(advice)}"
+    )
+    reason = "looped_windows" if looped else "long_windows"
+    warn(Sentence(sentence, reason, reads=float(reads_s), usual=float(usual_s)))
 
 
 def outside_streams(windows: WindowSet, dataset: Dataset, people: Collection[str]) -> NDArray[np.bool_]:

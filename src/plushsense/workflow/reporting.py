@@ -160,12 +160,18 @@ def evaluation_title(result: Evaluation, arch: Arch, config: RunConfig) -> str:
 
 
 def card(arch: Arch, **more: Any) -> dict[str, Any]:
-    """Return the symbol and the counts of a network for a model card and the command line."""
+    """Return the symbol and the counts of a network for a model card and the command line.
+
+    With ``rate_hz`` among ``more``, receptive field and span are also given in seconds.
+    """
+    rate = more.get("rate_hz")
+    seconds = {"receptive_field_s": arch.receptive_field / rate, "span_s": arch.span / rate} if rate else {}
     return {
         **arch.to_dict(),
         "parameters": arch.parameters,
         "receptive_field": arch.receptive_field,
         "span": arch.span,
+        **seconds,
         "macs_per_window": arch.macs_per_window,
         "macs_per_step": arch.macs_per_step,
         "state_bytes_int8": arch.state_bytes_int8,

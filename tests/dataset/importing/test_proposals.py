@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +14,18 @@ from plushsense.core.errors import ConfigError
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, write_recording
 from plushsense.dataset.importing.importers import import_recordings
-from plushsense.dataset.importing.proposals import readable_layouts
+from plushsense.dataset.importing.proposals import Sensor, find_sensors, readable_layouts
 from plushsense.dataset.index import open_dataset
 
 ACCEL = load_layout("accel-3")
 
 
-def analogue(folder: Path, zero: float, one_g: float, period_ms: int = 10, turned: bool = True) -> Path:
+def analogue(
+    folder: Path, zero: float, one_g: float, period_ms: int = 10, turned: bool = True, people: range = range(3)
+) -> Path:
     """Recordings of an accelerometer of 10 bits, held in many directions for a while and moved in between."""
-    rng = np.random.default_rng(0)
-    for p in range(3):
+    rng = np.random.default_rng(people.start)
+    for p in people:
         (folder / f"P{p}").mkdir(parents=True)
         for take in range(6):
             up = rng.normal(size=3) if turned else np.array([0.0, 0.0, 1.0])
@@ -59,6 +62,50 @@ def test_a_zero_that_cannot_be_known_is_not_proposed(tmp_path: Path) -> None:
     assert "offset" not in {p["key"] for p in right.proposals}
 
 
+def test_two_references_of_an_analogue_converter_are_named(tmp_path: Path, cli: Callable[..., Any]) -> None:
+    source = analogue(tmp_path / "R", 330, 68)
+    assert "offset: x 3" in cli("import", source, tmp_path / "DS", "--layout", "accel-3").err
+    ran = cli("import", analogue(source, 511, 102, people=range(3, 5)), tmp_path / "DS", "--add")
+    assert "suggestion: the accelerometers of the sessions differ in zero or scale: 1 g is about 68" in ran.err
+    assert "for P0, P1, P2; 1 g is about 10" in ran.err
+    assert 'give a layout with self_calibration = ["x", "y", "z"]' in ran.err
+    adopted = import_recordings(source, tmp_path / "DS2", layout="accel-3", adopt_proposals=True)
+    assert [c.offset for c in adopted.dataset.layout.channels] == [0, 0, 0], "no zero fits both"
+    (found,) = (p for p in adopted.to_dict()["proposals"] if p["key"] in ("offset", "self_calibration"))
+    assert found["value"] == ["x", "y", "z"] and list(found["groups"]) == adopted.sensors
+    for group, zero, one_g, people in zip(
+        found["groups"], (330, 511), (68, 102), (["P0", "P1", "P2"], ["P3", "P4"]), strict=True
+    ):
+        assert [s["subject"] for s in group["sessions"]] == people and group["recognised"] == ""
+        for at in (group, *(s for s in group["sessions"] if s["zero"])):
+            assert at["one_g"] == pytest.approx(one_g, rel=0.1)
+            assert list(at["zero"].values()) == pytest.approx([zero] * 3, abs=0.1 * one_g)
+    assert any(s["zero"] for s in found["groups"][1]["sessions"])
+
+
+def test_each_session_of_a_person_has_its_own_sensor(tmp_path: Path) -> None:
+    source = analogue(analogue(tmp_path / "R", 330, 68), 511, 102, people=range(3, 6))
+    dataset = import_recordings(source, tmp_path / "DS", layout="accel-3").dataset
+    dataset.recordings = [
+        replace(r, subject=f"Q{int(r.subject[1]) % 3}", session=r.subject) for r in dataset.recordings
+    ]
+    groups = [[(s["subject"], s["session"]) for s in sensor.sessions] for sensor in find_sensors(dataset)]
+    assert groups == [[("Q0", "P0"), ("Q1", "P1"), ("Q2", "P2")], [("Q0", "P3"), ("Q1", "P4"), ("Q2", "P5")]]
+
+
+@pytest.mark.parametrize(
+    ("one_g", "unit"),
+    [(1.02, "g"), (9.7, "m/s²"), (1003, "mg"), (1020, "1024 counts a g"), (16100, "16384 counts a g"), (1012, ""),
+     (68, ""), (102, ""), (5000, "")],
+)  # fmt: skip
+def test_the_unit_is_recognised_where_it_is_plain(one_g: float, unit: str) -> None:
+    sphere = (np.zeros(3), one_g / 0.01)
+    layout = replace(ACCEL, channels=tuple(replace(c, step=0.01, unit="g") for c in ACCEL.channels))
+    sensor = Sensor.of(layout, ("x", "y", "z"), np.full(3, 0.01), sphere, {("P1", ""): None})
+    assert sensor.recognised == unit and sensor.one_g == one_g
+    assert ("but the layout says g" in sensor.summary) == (unit not in ("", "g"))
+
+
 def test_rate_gap_and_window_are_measured(tmp_path: Path) -> None:
     done = import_recordings(analogue(tmp_path / "R", 0, 8000, period_ms=80), tmp_path / "DS", layout="accel-3")
     found = {p["key"]: p["value"] for p in done.proposals}
@@ -73,6 +120,9 @@ def test_the_real_recordings_need_nothing_but_a_window(real_data: Path, tmp_path
         done = import_recordings(real_data / source, tmp_path / layout)
         assert done.dataset.layout.name == layout and f"'{layout}'" in done.notes[0]
         assert [p["key"] for p in done.proposals] == ["window_s"]
+        (sensor,) = done.sensors
+        assert sensor["recognised"] == {"accel-3": "8192 counts a g", "phone-6": "m/s²"}[layout]
+        assert len({s["subject"] for s in sensor["sessions"]}) == len(done.dataset.subjects)
 
 
 def test_headers_that_fit_no_layout_or_several(tmp_path: Path, cli: Callable[..., Any]) -> None:

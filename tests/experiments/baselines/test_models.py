@@ -105,7 +105,8 @@ def test_classical_programs_read_the_end_of_a_longer_window() -> None:
     reader = fitted("rbf-svm")
     assert np.array_equal(reader(long), reader(other))
     assert FEATURES["flattened"](long, SAMPLES).shape == (30, 2 * SAMPLES)
-    assert FEATURES["statistics"](long, SAMPLES).shape == (30, 16)
+    assert FEATURES["paper-statistics"](long, SAMPLES).shape == (30, 16)
+    assert FEATURES["statistics"](long, SAMPLES).shape == (30, 64)
 
 
 def test_a_size_is_what_the_program_holds() -> None:

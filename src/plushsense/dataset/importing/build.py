@@ -221,6 +221,7 @@ class ImportSummary:
     added: dict[str, int] = field(default_factory=dict)
     already_there: int = 0
     proposals: list[dict[str, Any]] = field(default_factory=list)
+    sensors: list[dict[str, Any]] = field(default_factory=list)
     trimmed: int = 0
 
     def to_dict(self) -> dict[str, Any]:

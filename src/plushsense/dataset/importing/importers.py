@@ -31,7 +31,14 @@ from plushsense.dataset.importing.build import (
 )
 from plushsense.dataset.importing.pattern import STREAM_ROLE, ImportPattern, check_roles, read_pattern
 from plushsense.dataset.importing.preview import ImportPreview, preview
-from plushsense.dataset.importing.proposals import adopt, matching_layouts, propose_settings, readable_layouts
+from plushsense.dataset.importing.proposals import (
+    SELF_CALIBRATION,
+    adopt,
+    find_sensors,
+    matching_layouts,
+    propose_settings,
+    readable_layouts,
+)
 from plushsense.dataset.importing.saved_windows import read_windows, windows_layout, write_windows
 from plushsense.dataset.importing.sources import (
     LEFT_OUT,
@@ -361,9 +368,14 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
     return search
 
 
-def _propose(done: ImportSummary, adopting: bool) -> None:
-    """Measure a new data set; add what fits it better to the summary, and to its layout if ``adopting``."""
-    found = propose_settings(done.dataset)
+def _propose(done: ImportSummary, adopting: bool = False, added: bool = False) -> None:
+    """Measure a data set; add what fits it better to the summary, and to its layout if ``adopting``.
+
+    If recordings were ``added``, only sensors that differ are proposed on: the layout has been chosen.
+    """
+    sensors = find_sensors(done.dataset)
+    done.sensors = [sensor.to_dict() for sensor in sensors]
+    found = [p for p in propose_settings(done.dataset, sensors) if not added or p.key == SELF_CALIBRATION]
     done.proposals = [{**p.to_dict(), "advice": p.advice(adopted=adopting)} for p in found]
     head = done.dataset.head
     layout = adopt(head.layout, found) if adopting else head.layout
@@ -523,5 +535,6 @@ def import_recordings(
                     f"'{dest}' cannot be written ({cause.strerror or cause}, {cause.filename}), but is as valid as "
                     "before: check the disk and import again."
                 ) from None
+            _propose(done, added=True)
     done.seconds = time.perf_counter() - began
     return done

@@ -1,10 +1,15 @@
-"""Propose settings that fit the recordings: layout by the header of the files; rate, gap, zeros and window by data."""
+"""Propose settings that fit the recordings: layout by the header of the files; rate, gap, zeros and window by data.
+
+Zero, scale and unit of accelerometers are measured for each session.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import json
+import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,32 +21,60 @@ from plushsense.core.errors import FileFormatError
 from plushsense.core.layouts import ACCELERATION, DEVICE_MS, Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import read_recording
 from plushsense.dataset.quality.measurements import zeroing_limit
-from plushsense.dataset.store import Dataset
+from plushsense.dataset.store import Dataset, RecordingInfo
 
 DEFAULT_WINDOW_S = 2.5
 # A rate is proposed if the measured one differs by this factor, a zero if it is this share of the radius away.
 _RATE_FACTOR = 1.25
 _ZERO_SHARE = 0.15
-# Zeros are fitted to the stillest blocks of some recordings, if their standard error is small.
+# Zeros are fitted to the stillest blocks of some recordings, at least of so many of each session, if their standard
+# error is small.
 _RECORDINGS = 400
+_LEAST_RECORDINGS = 6
 _BLOCK_S = 0.3
 _STILLEST = 0.2
 _LEAST_BLOCKS = 12
 _STANDARD_ERROR = 0.05
+# A session lies on a sphere if half of its still blocks are at most this share of the radius away; it needs so many.
+_ON_SPHERE = 0.1
+_LEAST_POINTS = 3
+# Sensors are different if their zeros are this share of 1 g apart, or their scales differ by this factor.
+_OTHER_ZERO = 0.5
+_OTHER_SCALE = 1.25
+# 1 g in units and in steps of usual digital sensors, recognised within 5 % if no other is nearly as close.
+_UNITS = {
+    "g": 1.0,
+    "m/s²": 9.80665,
+    "mg": 1000.0,
+    **{f"{counts} counts a g": float(counts) for counts in (256, 512, 1024, 2048, 4096, 8192, 16384)},
+}
+_UNIT_SHARE = 0.05
+_NAMED = 8
+
+SELF_CALIBRATION = "self_calibration"
 
 Floats = NDArray[np.float64]
+Sphere = tuple[Floats, float]
+"""Centre (3,) and radius, in steps of the layout."""
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A setting that fits the recordings better: the ``key`` of a layout or of window settings, and the reason."""
+    """A setting that fits the recordings better: the ``key`` of a layout or of window settings, and the reason.
+
+    ``groups`` are the sensors (`Sensor.to_dict`) that differ, if that is the reason.
+    """
 
     key: str
     value: Any
     reason: str
+    groups: tuple[dict[str, Any], ...] = ()
 
     def advice(self, adopted: bool) -> str:
         """Say what to do, or what was done if the layout ``adopted`` the proposal."""
+        if self.key == SELF_CALIBRATION:
+            # No zero fits all sessions, so that there is nothing to adopt.
+            return f"give a layout with {self.key} = {json.dumps(self.value, ensure_ascii=False)}"
         many = isinstance(self.value, dict)
         value = ", ".join(f"{k} {v:g}" for k, v in self.value.items()) if many else format(self.value, "g")
         if self.key == "window_s":
@@ -50,8 +83,93 @@ class Proposal:
         return f"adopted {setting}" if adopted else f"import with --adopt, or give a layout with {setting}"
 
     def to_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON; ``groups`` only if there are any."""
+        return {key: value for key, value in asdict(self).items() if key != "groups" or value}
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """The accelerometer of some sessions: the values in the files that stand for zero, and 1 g in the unit ``unit``.
+
+    ``recognised`` is the unit that 1 g tells, "" if it is not plain. ``radius`` is 1 g in the values of the files.
+    ``sessions`` have ``subject``, ``session``, and ``zero`` and ``one_g`` of their own, None where the sensor was not
+    turned enough to tell.
+    """
+
+    axes: tuple[str, ...]
+    zero: dict[str, float]
+    radius: float
+    one_g: float
+    unit: str
+    recognised: str
+    sessions: tuple[dict[str, Any], ...]
+
+    @classmethod
+    def of(
+        cls,
+        layout: Layout,
+        axes: tuple[str, ...],
+        steps: Floats,
+        fit: Sphere,
+        sessions: Mapping[tuple[str, str], Sphere | None],
+    ) -> Sensor:
+        """Describe a fitted sphere, and those of single sessions, in the units of the layout."""
+        channel = layout.channels[layout.index(axes[0])]
+
+        def zero(fit: Sphere) -> dict[str, float]:
+            return {n: float(f"{c * step:.4g}") for n, c, step in zip(axes, fit[0], steps, strict=True)}
+
+        def one_g(fit: Sphere) -> float:
+            return float(f"{fit[1] * steps[0] * channel.scale:.4g}")
+
+        known = tuple(
+            {"subject": subject, "session": session, "zero": own and zero(own), "one_g": own and one_g(own)}
+            for (subject, session), own in sorted(sessions.items())
+        )
+        radius = float(fit[1] * steps[0])
+        return cls(axes, zero(fit), radius, one_g(fit), channel.unit, _recognised(one_g(fit)), known)
+
+    @property
+    def sphere(self) -> str:
+        """1 g and zero in words."""
+        zero = ", ".join(f"{name} {value:g}" for name, value in self.zero.items())
+        return f"1 g is about {self.one_g:g} {self.unit}".rstrip() + f" away from {zero}"
+
+    @property
+    def people(self) -> str:
+        """The people, the first of many, and the number of sessions if it is another."""
+        names = list(dict.fromkeys(s["subject"] for s in self.sessions))
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        total = f" ({len(self.sessions)} sessions)" if len(self.sessions) > len(names) else ""
+        return ", ".join(names[:_NAMED]) + more + total
+
+    @property
+    def summary(self) -> str:
+        """What is known in one sentence."""
+        text = f"{self.sphere}, for {self.people}"
+        if self.recognised:
+            text += f"; that is {self.recognised}"
+            if self.unit in _UNITS and self.recognised in _UNITS and self.unit != self.recognised:
+                text += f", but the layout says {self.unit}"
+        own = [s["zero"] for s in self.sessions if s["zero"]]
+        if own and len(self.sessions) > 1:
+            away = max(math.dist(zero.values(), self.zero.values()) for zero in own) / self.radius
+            text += (
+                f"; the zeros of {len(own)} of {len(self.sessions)} sessions are known, at most {away:.2f} g from it"
+            )
+        return text
+
+    def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
-        return asdict(self)
+        kept = {key: value for key, value in vars(self).items() if key != "radius"}
+        return {**kept, "axes": list(self.axes), "sessions": list(self.sessions), "summary": self.summary}
+
+
+def _recognised(one_g: float) -> str:
+    """Return the unit in which 1 g is about ``one_g``, "" if none or several come close."""
+    off = sorted((abs(math.log(one_g / value)), unit) for unit, value in _UNITS.items())
+    plain = off[0][0] <= _UNIT_SHARE and 2 * off[0][0] <= off[1][0]
+    return off[0][1] if plain else ""
 
 
 def matching_layouts(files: Iterable[Path]) -> list[Layout]:
@@ -100,9 +218,13 @@ def readable_layouts(files: Iterable[Path], names: Sequence[str] = ()) -> list[L
     return [load_layout(name) for _, _, name in sorted(ranked)]
 
 
-def propose_settings(dataset: Dataset) -> list[Proposal]:
-    """Measure the recordings, and return what fits them better than the layout and the default window."""
-    return [*_rate_and_gap(dataset), *_zeros(dataset), *_window(dataset)]
+def propose_settings(dataset: Dataset, sensors: Sequence[Sensor] | None = None) -> list[Proposal]:
+    """Measure the recordings, and return what fits them better than the layout and the default window.
+
+    ``sensors`` are those of `find_sensors`, if they are known.
+    """
+    sensors = find_sensors(dataset) if sensors is None else sensors
+    return [*_rate_and_gap(dataset), *_zeros(dataset.layout, sensors), *_window(dataset)]
 
 
 def adopt(layout: Layout, proposals: Sequence[Proposal]) -> Layout:
@@ -135,55 +257,138 @@ def _rate_and_gap(dataset: Dataset) -> Iterator[Proposal]:
         )
 
 
-def _zeros(dataset: Dataset) -> Iterator[Proposal]:
-    """Propose offsets for the axes of an acceleration: the centre of the sphere on which it lies when held still."""
+def find_sensors(dataset: Dataset) -> list[Sensor]:
+    """Measure the zero and 1 g of each session's accelerometer; return one `Sensor` for each group of like sessions.
+
+    Held still in different directions, an acceleration lies on a sphere of 1 g around its zero. Spheres are fitted to
+    the stillest blocks of each session, and of all of them; the one that most sessions lie on is a group, then the one
+    that most of the others lie on, if it is clearly another. Nothing is found where no sphere is determined.
+    """
     layout = dataset.layout
     kinds = {c.name: c.kind for c in layout.channels}
-    for vector in layout.vectors:
-        if kinds[vector[0]] != ACCELERATION:
-            continue
-        axes = [layout.index(name) for name in vector]
-        still = _still_means(dataset, axes)
-        fitted = None if still is None else _sphere(still)
-        if fitted is None:
-            continue
-        centre, radius = fitted
-        if np.linalg.norm(centre - layout.zero_int[axes]) > _ZERO_SHARE * radius:
-            steps = [layout.channels[axis].step for axis in axes]
-            offset = {n: float(f"{c * step:.4g}") for n, c, step in zip(vector, centre, steps, strict=True)}
-            text = ", ".join(f"{name} {value:g}" for name, value in offset.items())
-            given = ", ".join(f"{layout.channels[axis].offset:g}" for axis in axes)
-            unit = layout.channels[axes[0]].unit
-            yield Proposal(
-                "offset",
-                offset,
-                f"held still, the acceleration is about {radius * steps[0]:.3g} {unit} away from {text}, which stands "
-                f"for zero; the layout says {given}",
-            )
+    vectors = [vector for vector in layout.vectors if kinds[vector[0]] == ACCELERATION]
+    return [sensor for vector in vectors for sensor in _sensors_of(dataset, vector)]
 
 
-def _still_means(dataset: Dataset, axes: list[int]) -> Floats | None:
-    """Return the means (n, 3) of the stillest blocks of 0.3 s, in steps of the layout; None for too few."""
-    layout, blocks = dataset.layout, []
+def _sensors_of(dataset: Dataset, vector: tuple[str, ...]) -> Iterator[Sensor]:
+    layout = dataset.layout
+    axes = [layout.index(name) for name in vector]
+    sessions, blocks, owner = _blocks(dataset, axes)
+    if not sessions:
+        return
+    stillest = np.zeros(len(blocks), dtype=np.bool_)
+    for k in range(len(sessions)):
+        mine = np.flatnonzero(owner == k)
+        stillest[mine[blocks[mine, 3] <= np.quantile(blocks[mine, 3], _STILLEST)]] = True
+    points, at = blocks[stillest, :3], owner[stillest]
+    own = [_sphere(points[at == k]) for k in range(len(sessions))]
+    for k, fit in enumerate(own):
+        # Blocks of a session that is never still are not on a sphere.
+        if fit is not None and np.median(blocks[stillest, 3][at == k]) > _ON_SPHERE * fit[1]:
+            own[k] = None
+    people = {subject: [k for k, session in enumerate(sessions) if session[0] == subject] for subject, _ in sessions}
+    pooled = [_sphere(points[np.isin(at, mine)]) for mine in people.values() if len(mine) > 1]
+    everything = _sphere(blocks[blocks[:, 3] <= np.quantile(blocks[:, 3], _STILLEST), :3])
+    enough = np.bincount(at, minlength=len(sessions)) >= _LEAST_POINTS
+    groups: list[Sphere] = []
+    left = enough.copy()
+    fits = [fit for fit in (everything, *pooled, *own) if fit is not None]
+    on = np.array([_errors(fit, points, at, len(sessions)) <= _ON_SPHERE for fit in fits])
+    while fits and (on & left).any():
+        best = int((on & left).sum(axis=1).argmax())
+        fit = _sphere(points[(on[best] & left)[at]]) or fits[best]
+        left &= ~on[best]
+        if all(_differ(fit, other) for other in groups):
+            groups.append(fit)
+    if not groups:
+        return
+    errors = np.array([_errors(fit, points, at, len(sessions)) for fit in groups])
+    nearest = np.where(enough & (errors.min(axis=0) <= _ON_SPHERE), errors.argmin(axis=0), -1)
+    # Spheres that most sessions do not lie on are chance.
+    if 2 * (nearest >= 0).sum() < enough.sum():
+        return
+    steps = np.array([layout.channels[axis].step for axis in axes])
+    for n, fit in enumerate(groups):
+        if len(members := np.flatnonzero(nearest == n)):
+            yield Sensor.of(layout, vector, steps, fit, {sessions[k]: own[k] for k in members.tolist()})
+
+
+def _errors(fit: Sphere, points: Floats, owner: NDArray[np.int64], sessions: int) -> Floats:
+    """Return the median distance of each session's points from a sphere as a share of its radius (inf: no points)."""
+    centre, radius = fit
+    # Half a step is the error of a sensor with coarse steps.
+    error = np.maximum(np.abs(np.linalg.norm(points - centre, axis=1) - radius) - 0.5, 0.0) / radius
+    order = np.lexsort((error, owner))
+    counts = np.bincount(owner, minlength=sessions)
+    middle = np.cumsum(counts) - counts + np.maximum(counts - 1, 0) // 2
+    return np.where(counts > 0, error[order][np.minimum(middle, len(error) - 1)], np.inf)
+
+
+def _differ(one: Sphere, other: Sphere) -> bool:
+    """Return whether two spheres are clearly those of different sensors."""
+    least, most = sorted((one[1], other[1]))
+    return bool(np.linalg.norm(one[0] - other[0]) > _OTHER_ZERO * least or most > _OTHER_SCALE * least)
+
+
+def _zeros(layout: Layout, sensors: Sequence[Sensor]) -> Iterator[Proposal]:
+    """Propose an offset of the axes of each accelerometer with one zero, and self-calibration of those with several."""
+    offset: dict[str, float] = {}
+    reasons, several = [], []
+    different: list[Sensor] = []
+    for vector in dict.fromkeys(sensor.axes for sensor in sensors):
+        found = [sensor for sensor in sensors if sensor.axes == vector]
+        if len(found) > 1:
+            different += found
+            several.append("; ".join(f"{sensor.sphere}, for {sensor.people}" for sensor in found))
+            continue
+        (sensor,) = found
+        away = [sensor.zero[name] - layout.channels[layout.index(name)].offset for name in vector]
+        if float(np.linalg.norm(away)) > _ZERO_SHARE * sensor.radius:
+            offset |= sensor.zero
+            given = ", ".join(f"{layout.channels[layout.index(name)].offset:g}" for name in vector)
+            reasons.append(f"{sensor.sphere}, which stands for zero; the layout says {given}")
+    if offset:
+        yield Proposal("offset", offset, f"held still, {'; '.join(reasons)}")
+    if different:
+        axes = list(dict.fromkeys(name for sensor in different for name in sensor.axes))
+        groups = tuple(sensor.to_dict() for sensor in different)
+        reason = f"the accelerometers of the sessions differ in zero or scale: {'; '.join(several)}"
+        yield Proposal(SELF_CALIBRATION, axes, reason, groups)
+
+
+def _blocks(dataset: Dataset, axes: list[int]) -> tuple[list[tuple[str, str]], Floats, NDArray[np.int64]]:
+    """Cut some recordings of each session into blocks of 0.3 s.
+
+    Returns:
+        The person and session of each session with blocks; the mean of each axis and the largest standard deviation of
+        each block (n, 4), in steps of the layout; and the index of its session (n,).
+    """
+    layout = dataset.layout
     replaced = zeroing_limit(layout) is not None
-    used = dataset.used
-    for recording in used[:: max(1, len(used) // _RECORDINGS)]:
-        values = np.clip(dataset.read(recording).values, layout.valid_min_int, layout.valid_max_int)[:, axes]
-        rows = max(3, round(_BLOCK_S * (recording.rate_hz or layout.rate_hz)))
-        if n := len(values) // rows:
+    by_session: dict[tuple[str, str], list[RecordingInfo]] = {}
+    for recording in dataset.used:
+        by_session.setdefault((recording.subject, recording.session), []).append(recording)
+    most = max(_LEAST_RECORDINGS, _RECORDINGS // max(1, len(by_session)))
+    found: dict[tuple[str, str], Floats] = {}
+    for session, recordings in by_session.items():
+        blocks = []
+        for recording in recordings[:: math.ceil(len(recordings) / most)]:
+            values = np.clip(dataset.read(recording).values, layout.valid_min_int, layout.valid_max_int)[:, axes]
+            rows = max(3, round(_BLOCK_S * (recording.rate_hz or layout.rate_hz)))
+            n = len(values) // rows
             cut = values[: n * rows].reshape(n, rows, 3).astype(np.float64)
             if replaced:
                 # An axis that stays at 0 probably had values that the authors' recorder replaced.
                 cut = cut[(cut != 0).any(axis=1).all(axis=1)]
             blocks.append(np.concatenate([cut.mean(axis=1), cut.std(axis=1).max(axis=1)[:, None]], axis=1))
-    if not blocks:
-        return None
-    found = np.concatenate(blocks)
-    still = found[found[:, 3] <= np.quantile(found[:, 3], _STILLEST), :3]
-    return still if len(still) >= _LEAST_BLOCKS else None
+        joined = np.concatenate(blocks)
+        if len(joined):
+            found[session] = joined
+    owner = np.repeat(np.arange(len(found)), [len(blocks) for blocks in found.values()])
+    return list(found), np.concatenate([*found.values()]) if found else np.zeros((0, 4)), owner
 
 
-def _sphere(points: Floats) -> tuple[Floats, float] | None:
+def _sphere(points: Floats) -> Sphere | None:
     """Fit a sphere to points (n, 3) by least squares without outliers; None if they do not determine its centre."""
     keep = np.ones(len(points), dtype=np.bool_)
     centre, radius, error = np.zeros(3), 0.0, np.zeros(len(points))

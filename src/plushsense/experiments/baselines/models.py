@@ -22,12 +22,12 @@ from plushsense.core.errors import BadInput, ConfigError, check_known, need
 from plushsense.experiments.baselines.score import UNSCALED, Contender, Pca, Reader
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
-from plushsense.windows.features import Scaler, statistics
+from plushsense.windows.features import Scaler, statistics, statistics_in_order
 
 Floats = NDArray[np.float64]
 
 # Part of every job's id: increase it when a name comes to mean another program or other settings.
-BASELINES_VERSION = 1
+BASELINES_VERSION = 2
 # The share of the variance that PCA keeps.
 PCA_VARIANCE = 0.95
 TREES = 200
@@ -81,6 +81,10 @@ BASELINES: dict[str, Baseline] = {
 
 
 def _statistics(windows: WindowSet, samples: int) -> Floats:
+    return statistics_in_order(windows.x[:, :, -samples:], windows.rate_hz)
+
+
+def _paper_statistics(windows: WindowSet, samples: int) -> Floats:
     return statistics(windows.x[:, :, -samples:], windows.rate_hz)
 
 
@@ -92,7 +96,12 @@ def _flattened(windows: WindowSet, samples: int) -> Floats:
 TOO_LONG = (("boosting", "flattened", False),)
 
 # Functions that compute a classifier's input (N, values) from the last ``samples`` samples of the windows.
-FEATURES: dict[str, Callable[[WindowSet, int], Floats]] = {"statistics": _statistics, "flattened": _flattened}
+FEATURES: dict[str, Callable[[WindowSet, int], Floats]] = {
+    "statistics": _statistics,
+    "paper-statistics": _paper_statistics,
+    "flattened": _flattened,
+}
+DEFAULT_FEATURES = ("statistics", "flattened")
 
 
 @dataclass(frozen=True)
@@ -182,7 +191,13 @@ def classical(
     key = {"version": BASELINES_VERSION, "library": library, "samples": samples, "seed": seed}
     return [
         Contender(
-            name, BASELINES[name].title, view, reduced, ClassicalFit(name, view, reduced, samples, seed), dict(key)
+            name,
+            BASELINES[name].title,
+            view,
+            reduced,
+            ClassicalFit(name, view, reduced, samples, seed),
+            dict(key),
+            samples,
         )
         for view in features
         for reduced in pca
@@ -307,7 +322,7 @@ def recurrent(names: Sequence[str], samples: int, spec: TrainSpec, vectors: Sequ
         key = {"version": RECURRENT_VERSION, "units": network.units, "samples": samples, "vectors": vectors}
         key |= {"training": spec.key(), **network.changes()}
         fit = RecurrentFit(network, spec, samples)
-        made.append(Contender(network.name, network.title, "windows", False, fit, key))
+        made.append(Contender(network.name, network.title, "windows", False, fit, key, samples))
     return made
 
 
@@ -378,5 +393,6 @@ def rockets(names: Sequence[str], samples: int, seed: int) -> list[Contender]:
         need("torch", extra=EXTRA_ROCKETS)
     key = {"version": ROCKETS_VERSION, "library": library, "samples": samples, "seed": seed}
     return [
-        Contender(name, ROCKETS[name][0], "windows", False, RocketFit(name, samples, seed), dict(key)) for name in names
+        Contender(name, ROCKETS[name][0], "windows", False, RocketFit(name, samples, seed), dict(key), samples)
+        for name in names
     ]

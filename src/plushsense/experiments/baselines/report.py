@@ -34,8 +34,9 @@ Program = tuple[str, str, Pca]
 def program_table(result: Mapping[str, Any]) -> Table:
     """Return one row for each program, ordered by accuracy under the first split, the best first.
 
-    A row has accuracy and macro-F1 of each split, with those pooled over all windows as a note; the gap in accuracy
-    between the first leaky split and the first split by person; and the costs measured under the first split.
+    A row has the span that it reads, in seconds; accuracy and macro-F1 of each split, with those pooled over all
+    windows as a note; the gap in accuracy between the first leaky split and the first split by person; and the costs
+    measured under the first split.
     """
     splits = [split["split"] for split in result["splits"]]
     by_program: dict[Program, dict[str, Mapping[str, Any]]] = {}
@@ -51,6 +52,7 @@ def program_table(result: Mapping[str, Any]) -> Table:
         row = {
             "title": first["title"],
             "reads": reads(first["features"], first["pca"]),
+            "span": f"{first['span_s']:.2f}",
             "gap": f"{gaps[program]:+.3f}" if program in gaps else "",
             "size": size(first["size_bytes"]),
             "predict": milliseconds(first["predict_ms"]),
@@ -65,6 +67,7 @@ def program_table(result: Mapping[str, Any]) -> Table:
             row[f"accuracy {split}"] = (mean_sd(scores["accuracy"]), note)
         rows.append(row)
     columns = [Column("title", "Program", plain="program"), Column("reads", "Reads", plain="reads")]
+    columns.append(Column("span", "Span, s", "right", plain="span s"))
     for split in result["splits"]:
         name, leaky, group = split["split"], split["leaky"], f"{split['split']}, {split['folds']} folds"
         for key, metric in column_metrics().items():
@@ -87,7 +90,7 @@ def score_table(result: Mapping[str, Any]) -> Table:
     for row in result["models"]:
         scores = {f"{m}_{part}": row[m][part] for m in column_metrics() for part in ("mean", "sd")}
         rows.append(row | scores | {f"{m}_pooled": row["pooled"][m] for m in column_metrics()})
-    names = ["name", "title", "features", "pca", "split", "leaky", "over", "folds"]
+    names = ["name", "title", "features", "pca", "span_s", "split", "leaky", "over", "folds"]
     names += [f"{m}_{part}" for m in column_metrics() for part in ("mean", "sd", "pooled")]
     names += ["size_bytes", "predict_ms", "predict_batch_ms", "train_s", "train_s_in_all"]
     return Table("baselines", "Every program and split", tuple(Column(name, name) for name in names), tuple(rows))

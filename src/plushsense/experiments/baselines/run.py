@@ -23,7 +23,7 @@ from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.baselines.models import (
     BASELINES,
-    FEATURES,
+    DEFAULT_FEATURES,
     RECURRENT,
     ROCKETS,
     TOO_LONG,
@@ -165,9 +165,9 @@ def contenders(
 ) -> list[Contender]:
     """Return the requested programs for `compare`; all use the seed of ``config.training``.
 
-    Only our own network reads inputs that are not in ``inputs``.
+    All read as many samples as our network; only it reads inputs that are not in ``inputs``.
     """
-    spec, samples = config.training, layout.samples(config.windows.window_s)
+    spec, samples = config.training, arch.span
     made = classical([m for m in models if m in BASELINES], features, pca, samples, spec.seed)
     made += rockets([m for m in models if m in ROCKETS], samples, spec.seed)
     recurrent_names = [m for m in models if _kind(m) in RECURRENT]
@@ -184,7 +184,7 @@ def contenders(
         key = {"arch": arch.to_dict(), "training": spec.key(), "vectors": vectors}
         title = f"{arch.title} {arch.padding} (ours)"
         network = NetworkFit(arch, spec, layout, gestures)
-        made.append(Contender(NETWORK, title, "windows", False, network, key))
+        made.append(Contender(NETWORK, title, "windows", False, network, key, samples))
     return made
 
 
@@ -194,7 +194,7 @@ def baselines(
     *,
     splits: Sequence[str] = SPLITS,
     models: str | Sequence[str] = "all",
-    features: Sequence[str] = tuple(FEATURES),
+    features: Sequence[str] = DEFAULT_FEATURES,
     pca: str = "both",
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
@@ -205,8 +205,9 @@ def baselines(
 ) -> dict[str, Any]:
     """Compare classical programs, recurrent networks and our own network on the same windows, under several splits.
 
-    Windows are cut as for the network; other programs use their last ``window_s`` seconds. Finished folds are kept in
-    the data set's ``cache`` folder, so that a stopped comparison can be continued.
+    Windows are cut as for the network, and every program reads the span that the network reads: ``window_s`` seconds or
+    little less, and more if its receptive field is too long for that. Finished folds are kept in the data set's
+    ``cache`` folder, so that a stopped comparison can be continued.
 
     Args:
         config, settings: as for `evaluate`; its split is not used.
@@ -273,7 +274,7 @@ def comparison_id(
     config: RunConfig,
     splits: Sequence[str] = SPLITS,
     models: str | Sequence[str] = "all",
-    features: Sequence[str] = tuple(FEATURES),
+    features: Sequence[str] = DEFAULT_FEATURES,
     pca: str = "both",
 ) -> str:
     """Return an identifier of 20 hexadecimal digits, equal for equal settings and data.

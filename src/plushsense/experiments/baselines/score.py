@@ -66,7 +66,8 @@ process, such as compiling; that method is not timed.
 class Contender:
     """A program in the comparison: its name, its input features, and the function that fits it.
 
-    ``key`` holds everything that ``fit`` depends on besides name, features and PCA.
+    ``key`` holds everything that ``fit`` depends on besides name, features and PCA. The program reads the last
+    ``samples`` of each window; None: all of them.
     """
 
     name: str
@@ -75,6 +76,7 @@ class Contender:
     pca: Pca
     fit: Fit
     key: Mapping[str, Any]
+    samples: int | None = None
 
     @property
     def words(self) -> str:
@@ -250,6 +252,7 @@ def _row(
         "title": contender.title,
         "features": contender.features,
         "pca": contender.pca,
+        "span_s": (contender.samples or windows.x.shape[2]) / windows.rate_hz,
         "split": split.text,
         "leaky": split.leaky,
         "apart": split.apart,

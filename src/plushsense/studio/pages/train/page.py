@@ -48,7 +48,7 @@ _ADVANCED: dict[str, tuple[str, ...]] = {
     SEARCH: ("architectures", "filters", "batches", "padding", "context", "classes", "device", "share"),
 }
 _PLACEHOLDERS = {
-    "arch": f"{DEFAULT_SYMBOL} / {VECTOR_SYMBOL}",
+    "arch": f"{DEFAULT_SYMBOL} / {VECTOR_SYMBOL} (100 Hz)",
     "filters": " / ".join(",".join(map(str, counts)) for counts in (DEFAULT_FILTERS, VECTOR_FILTERS)),
     "classes": "shared",
     "batch": "64",
