@@ -13,7 +13,7 @@ import numpy as np
 
 from plushsense.core.errors import PlushSenseError, printable
 from plushsense.core.gestures import load_gestures
-from plushsense.deploy.emit import IMAGE, _facts, code_files
+from plushsense.deploy.emit import IMAGE, code_files, facts_of
 from plushsense.deploy.golden import answers_of, golden_frames
 from plushsense.deploy.package import firmware, handbook
 from plushsense.deploy.quantize import classifier_of, integer_model
@@ -81,7 +81,7 @@ def changed(content: dict[str, Any], weights: dict[str, Any], rng: random.Random
         weights = mutated_weights(weights, rng)
     else:
         content = mutated(content, rng)
-    if rng.random() < 0.8:
+    if rng.random() < 0.8 and isinstance(content.get("arch"), dict):
         try:
             arch, layout = Arch.from_dict(content["arch"]), content["layout"]
             rate, gap = layout["rate_hz"], layout["gap_ms"]
@@ -115,7 +115,7 @@ def use(data: bytes, frames: np.ndarray[Any, Any], golden: bool) -> None:
     model, given = integer_model(bundle), bundle.without_people()
     memory_bytes(model)
     code = code_files(model, given)
-    facts = _facts(model, given, code[IMAGE])
+    facts = facts_of(model, given, code[IMAGE])
     firmware(layout, given.scaler, facts)
     handbook(given, facts)
     if golden and model.network.arch.span < 1000:

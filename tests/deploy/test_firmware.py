@@ -23,7 +23,6 @@ from plushsense.deploy.package import (
     IDF,
     IDF_TASKS,
     SKETCH,
-    changed_copies,
     copies,
     firmware,
     package,
@@ -133,7 +132,6 @@ def test_a_damaged_model_blinks_and_the_lines_go_on(packages: Packages, tmp_path
         text = (tmp_path / "out" / copy).read_text(encoding="utf-8")
         at = text.rindex("128,")
         (tmp_path / "out" / copy).write_text(text[:at] + "129," + text[at + 4 :], encoding="utf-8")
-    assert len(changed_copies(tmp_path / "out")) == 2
     sent, pins = play(BUILDS[board](tmp_path / "out", tmp_path), seconds=3)
     assert len(frames_of(model.layout, sent)) > 280
     red = [value for _, pin, value in pins if value == 255]

@@ -22,7 +22,7 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from plushsense.core.errors import BadInput, BundleError
-from plushsense.core.files import write_file
+from plushsense.core.files import read_bytes, write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.core.toml import check_table
@@ -201,8 +201,7 @@ class Bundle:
         """
         path = Path(path)
         try:
-            with path.open("rb") as file:
-                data = file.read(_MOST_BYTES + 1)
+            data = read_bytes(path, _MOST_BYTES)
         except FileNotFoundError:
             raise BundleError(
                 f"There is no bundle '{path}': check the path, or make one with plushsense train."
@@ -211,10 +210,6 @@ class Bundle:
             if path.is_dir():
                 raise BundleError(f"'{path}' is a folder: give a *.plush file made by plushsense train.") from None
             raise BundleError(f"The bundle '{path}' cannot be read ({cause}).") from None
-        if len(data) > _MOST_BYTES:
-            raise BundleError(
-                f"'{path}' has more than {_MOST_BYTES >> 20} MiB, which no bundle has: give another file."
-            )
         return cls.from_bytes(data, path)
 
     @classmethod
