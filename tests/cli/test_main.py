@@ -17,8 +17,10 @@ import pytest
 from plushsense.cli.main import load_verb
 from plushsense.cli.options import VERBS
 from plushsense.cli.settings import report_epochs
+from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.dataset.store import Dataset
 from plushsense.models.bundle import Bundle
+from support.bundles import odd_bundle
 
 Cli = Callable[..., Any]
 
@@ -67,6 +69,19 @@ def test_light_verbs_load_nothing_heavy(words: list[str]) -> None:
 def test_import_plushsense_loads_not_even_numpy() -> None:
     code = "import sys, plushsense; sys.exit(1 if {'numpy', 'torch'} & set(sys.modules) else 0)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_control_characters_in_files_do_not_reach_the_terminal(cli: Cli, tmp_path: Path) -> None:
+    gestures = GestureSet("any", (Gesture("wave\x1b[2J\x9b"), Gesture("tap\nplushsense: all is well")))
+    path = odd_bundle(tmp_path / "m.plush", gestures=gestures)
+    shown, table = cli("info", path).out, cli("info", path, "--json")
+    assert "\x1b" not in shown and r"\x1b[2J" in shown
+    assert "\x9b" not in table.out and table.json["gestures"] == list(gestures.labels)
+    (tmp_path / "layout.toml").write_text(
+        'name = "a"\nrate_hz = 1\nwire = ["x\\u001b[2J\\nplushsense: fine"]\nchannels = []'
+    )
+    refused = cli("toy", "--tcp", "0", "--layout", tmp_path / "layout.toml").err
+    assert "\x1b" not in refused and refused.count("\n") == 1 and r"\u001b[2J\u000aplushsense: fine" in refused
 
 
 def test_arch_counts_the_papers_network(cli: Cli) -> None:

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import json
+import os
+import random
 import subprocess
 import sys
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import pytest
+import tomli_w
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from plushsense.core.errors import ConfigError, LayoutError
-from plushsense.core.toml import check_table, load_table, loads_json
+from plushsense.core.errors import BadInput, ConfigError, LayoutError, printable
+from plushsense.core.gestures import GestureSet, gesture_set_names, load_gestures
+from plushsense.core.layouts import Layout, layout_names, load_layout
+from plushsense.core.toml import check_table, load_table, loads_json, read_toml
+from support.bundles import mutated
 
 
 @dataclass(frozen=True)
@@ -121,3 +131,43 @@ def test_the_library_is_imported_when_it_is_needed() -> None:
 )
 def test_half_characters_of_json_are_replaced(text: str, value: object) -> None:
     assert loads_json(text) == value
+
+
+FUZZ = int(os.environ.get("PLUSHSENSE_FUZZ", "1"))
+TABLES: list[tuple[type[Any], dict[str, Any]]] = [
+    *((Layout, json.loads(json.dumps(load_layout(name).to_dict()))) for name in layout_names()),
+    *((GestureSet, json.loads(json.dumps(load_gestures(name).to_dict()))) for name in gesture_set_names()),
+]
+
+
+@settings(max_examples=100 * FUZZ, database=None)
+@given(st.sampled_from(TABLES), st.randoms(use_true_random=False))
+def test_any_layout_and_gesture_set_is_read_or_refused(
+    given_table: tuple[type[Any], dict[str, Any]], rng: random.Random
+) -> None:
+    kind, table = given_table
+    try:
+        made = kind.from_dict(mutated(table, rng))
+    except BadInput as error:
+        assert str(error) == printable(str(error))
+    else:
+        assert kind.from_dict(made.to_dict()) == made
+        if isinstance(made, Layout):
+            assert made.period_us >= 100 and (made.valid_min_int <= made.valid_max_int).all()
+            assert made.input_kinds and made.gravity_shift < 32
+
+
+@settings(max_examples=100 * FUZZ, database=None)
+@given(st.sampled_from(TABLES), st.lists(st.tuples(st.integers(0, 1 << 20), st.binary(max_size=4)), max_size=4))
+def test_any_file_is_toml_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, table: tuple[type[Any], dict[str, Any]], cuts: list[tuple[int, bytes]]
+) -> None:
+    data = tomli_w.dumps({"table": table[1]}).encode()
+    for at, new in cuts:
+        data = data[: at % len(data)] + new + data[at % len(data) + len(new) :]
+    path = tmp_path_factory.getbasetemp() / "any.toml"
+    path.write_bytes(data)
+    try:
+        assert read_toml(path, "any", BadInput) == tomllib.loads(data.decode("utf-8-sig"))
+    except BadInput as error:
+        assert str(error) == printable(str(error)) and path.name in str(error)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import re
 import shutil
 from collections.abc import Callable
@@ -23,7 +24,6 @@ from plushsense.deploy.package import (
     IDF,
     IDF_TASKS,
     SKETCH,
-    changed_copies,
     copies,
     firmware,
     package,
@@ -133,7 +133,6 @@ def test_a_damaged_model_blinks_and_the_lines_go_on(packages: Packages, tmp_path
         text = (tmp_path / "out" / copy).read_text(encoding="utf-8")
         at = text.rindex("128,")
         (tmp_path / "out" / copy).write_text(text[:at] + "129," + text[at + 4 :], encoding="utf-8")
-    assert len(changed_copies(tmp_path / "out")) == 2
     sent, pins = play(BUILDS[board](tmp_path / "out", tmp_path), seconds=3)
     assert len(frames_of(model.layout, sent)) > 280
     red = [value for _, pin, value in pins if value == 255]
@@ -235,28 +234,34 @@ def read_as_python(wire: ctypes.CDLL, layout: Layout, lines: list[bytes]) -> int
 
 
 def test_computer_and_toy_read_one_grammar(packages: Packages, tmp_path: Path, c_compiler: str) -> None:
-    """Odd numbers at every place of a line, odd separators and long lines: both find the same frames."""
-    rng = np.random.default_rng(7)
+    """Odd numbers at every place of a line, odd separators, broken and long lines: both find the same frames.
+
+    The grammar is in docs/record.md. ``PLUSHSENSE_FUZZ=100`` reads 200 000 lines of each layout.
+    """
+    rng, count = np.random.default_rng(7), 2000 * int(os.environ.get("PLUSHSENSE_FUZZ", "1"))
     for layout in LAYOUTS:
         out, model = packages[layout]
         library = tmp_path / f"{layout}.so"
         run(c_compiler, "-shared", "-fPIC", out / ARDUINO / "src" / "plush_wire.c", "-o", library)
         wire = ctypes.CDLL(str(library))
         channels, lines = model.layout.n_channels, [b""]
-        for k in range(2000):
+        for k in range(count):
             row = [*rng.integers(-3000, 3000, channels).tolist()]
             fields = format_line(model.layout, row, 10 * k, 10).split()
             gaps = [b" "] * (len(fields) - 1)
-            if k % 4 == 1:
+            if k % 5 == 1:
                 fields[rng.integers(len(fields))] = ODD_NUMBERS[rng.integers(len(ODD_NUMBERS))]
-            elif k % 4 == 2:
+            elif k % 5 == 2:
                 gaps[rng.integers(len(gaps))] = ODD_GAPS[rng.integers(len(ODD_GAPS))]
-            elif k % 4 == 3:
+            elif k % 5 == 3:
                 at = rng.integers(len(fields))
                 fields[at] = bytes(rng.choice(list(b"0123456789+-.eE \t\v"), rng.integers(1, 8)).tolist())
-            lines.append(b"".join(part for pair in zip(fields, [*gaps, b""], strict=True) for part in pair))
+            line = bytearray(b"".join(part for pair in zip(fields, [*gaps, b""], strict=True) for part in pair))
+            for _ in range(rng.integers(1, 4) if k % 5 == 4 else 0):
+                line[rng.integers(len(line))] = int(rng.choice(list(b" -+.;,\t\v\f\r\n\0xe0123456789\xff")))
+            lines.append(bytes(line))
         found = read_as_python(wire, model.layout, lines)
-        assert 700 < found < 1800
+        assert 0.3 * count < found < 0.9 * count
 
 
 def test_decimals_of_any_length_are_read_as_the_computer_reads_them(

@@ -14,7 +14,7 @@ import pytest
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.deploy.emit import BUNDLE, code_files, emit, prefixed, read_facts, without_prefix
 from plushsense.deploy.golden import ANSWER, read_golden
-from plushsense.deploy.package import changed_copies, package
+from plushsense.deploy.package import package
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.quantize import integer_model
 from support.exports import bundle_of
@@ -119,7 +119,7 @@ def test_no_name_of_the_library_stays_without_the_prefix(named: dict[str, Path],
             assert re.findall(r"(?<!\w)plushsense\.[ch]\b", text) == [], path
             assert path.name.startswith(f"{name}_") or path.suffix == ".ino" or path.name == "main.c"
         assert (folder / "plush_model.bin").is_file() and f"`{name}_plush_push()`" in (folder / "README.md").read_text()
-        assert changed_copies(folder) == []
+        assert Export(folder).changed == Export(folder).edited == ()
         assert (folder / "arduino" / f"{name}_plush" / "src" / f"{name}_plushsense.h").is_file()
 
 

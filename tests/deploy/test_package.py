@@ -14,7 +14,7 @@ import pytest
 
 from plushsense.core.errors import ConfigError
 from plushsense.deploy.emit import read_facts
-from plushsense.deploy.package import ARDUINO, IDF, IDF_EXAMPLE, changed_copies
+from plushsense.deploy.package import ARDUINO, IDF, IDF_EXAMPLE
 from plushsense.deploy.proof.vectors import Export
 from plushsense.runtime.image import IntegerModel, image_check
 from plushsense.workflow.export import export
@@ -167,7 +167,7 @@ def test_the_model_s_own_version_and_page_stand_in_every_manifest_and_in_c(tmp_p
     page = "https://example.org/toy"
     out = export(bundle, tmp_path / "out", model_version="2.10.0-beta.1", url=page, name="owl").folder
     library = out / "arduino" / "owl_plush"
-    assert broken_rules(library) == [] and changed_copies(out) == []
+    assert broken_rules(library) == [] and Export(out).changed == ()
     properties = (library / "library.properties").read_text(encoding="utf-8")
     assert (
         f"url={page}\n" in properties and "version=2.10.0-beta.1\n" in properties and "name=owl_plush\n" in properties
@@ -247,5 +247,5 @@ def test_what_the_manifests_name_exists(packages: Packages) -> None:
         for path in (p for p in out.rglob("*") if p.is_file() and p.suffix not in (".bin", ".plush")):
             text = path.read_text(encoding="utf-8")
             assert not re.search(r"@\w+@|@if |@end|TODO|(?<!\$)(?<!ENV){\w+}", text), path
-        assert changed_copies(out) == []
+        assert Export(out).changed == Export(out).edited == ()
         assert (out / "LICENSE").read_text() == (REPO / "LICENSE").read_text()

@@ -132,7 +132,7 @@ BAD = [
 def test_errors_show_the_symbol_and_a_caret_at_the_place(spec: str, place: int, why: str) -> None:
     with pytest.raises(ArchError) as caught:
         Arch.parse(spec, (8, 12, 16))
-    sentence, shown, caret = str(caught.value).split("\n")
+    sentence, (shown, caret) = str(caught.value), caught.value.__notes__[0].split("\n")
     assert why in sentence
     assert f"place {place}:" in sentence
     assert shown == "    " + spec.replace("\n", "?")

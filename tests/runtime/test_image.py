@@ -179,7 +179,7 @@ def test_what_a_toy_cannot_hold() -> None:
         with pytest.raises(BundleError, match="rename it"):
             other(model, gestures=wrong)
     for rules, words in (
-        (Rules(health=HealthSettings((0,), (1,))), "limits are of 1 channels, layout 'plain' has 4"),
+        (Rules(health=HealthSettings((0,), (1,))), "limits are of 1 channels, the layout has 4"),
         (Rules(gate=GateSettings((Signal(LEVEL, (2,)),), (PULL,))), "an unknown input: the model has 2"),
         (
             Rules(gate=GateSettings((Signal(LEVEL, (1,)),), (replace(PULL, gesture=3),))),

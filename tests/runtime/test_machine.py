@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import BundleError, ConfigError
 from plushsense.core.layouts import load_layout
 from plushsense.devices.base import Frame
 from plushsense.runtime.classifier import StreamClassifier, check_layout
@@ -140,6 +140,18 @@ def test_the_bundle_settles_the_smoothing_unless_told_otherwise(bundle):
     assert StreamClassifier(bundle(smoothing_s=1.5), OFF).spec.smoothing_s == 0
     with pytest.raises(ConfigError, match="smoothing_s"):
         StreamClassifier(bundle(smoothing=1.5))
+
+
+def test_rules_of_another_model_are_refused(bundle):
+    signals = [{"kind": 0, "inputs": [200]}]
+    rules = [{"terms": [{"signal": 0, "threshold": 9}], "affect": 1, "gesture": 255}]
+    for settings, why in (
+        ({"gate": {"signals": signals, "rules": rules}}, "unknown input"),
+        ({"gate": {"signals": [{**signals[0], "inputs": [0]}], "rules": [{**rules[0], "gesture": 90}]}}, "gesture"),
+        ({"health": {"low": [0], "high": [9]}}, "limits are of 1 channels"),
+    ):
+        with pytest.raises(BundleError, match=why):
+            StreamClassifier(bundle(**settings))
 
 
 def test_a_line_is_plain_json(bundle, frames):

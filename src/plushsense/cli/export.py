@@ -92,7 +92,6 @@ def _patch(args: argparse.Namespace) -> int:
 
 def run_verify(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
-    from plushsense.deploy.package import changed_copies
     from plushsense.deploy.proof.device import verify_device
     from plushsense.deploy.proof.vectors import Export
     from plushsense.deploy.proof.verify import verify
@@ -106,8 +105,6 @@ def run_verify(args: argparse.Namespace) -> int:
             message = f"--{option} is for programs that are compiled here: leave it out, or leave out --device."
             raise ConfigError(message)
     export = Export(args.export)
-    if changed := changed_copies(export.folder):
-        warn(f"only the originals are verified; these copies of them were changed: {', '.join(changed)}")
     if args.dataset:
         vectors = export.recorded(open_dataset(args.dataset), listed(*args.subject), args.samples or _SAMPLES)
         if args.samples and sum(v.samples for v in vectors) < args.samples:
@@ -158,12 +155,14 @@ def verification_lines(done: VerificationReport) -> list[str]:
         lines += ["", "Nothing is proven: the toy was still warming up in all answers. Export the model again."]
     else:
         lines += ["", "A mutant was not detected: the golden vectors of this export are too weak for it."]
-    if not done.own:
+    if done.own is None:
+        lines += ["", "Which program the chip runs cannot be seen from here: it reports the model and its answers."]
+    elif not done.own:
         lines += [
             "",
             f"NOT OURS: {', '.join(done.changed)} {'is' if len(done.changed) == 1 else 'are'} not what this PlushSense "
-            "writes for the bundle in the folder. It was run because of --trust; equal "
-            "answers say nothing about what else it does. Export again to be sure.",
+            "writes for the bundle in the folder; equal answers say nothing about what else its code does. Export it "
+            "again to be sure.",
         ]
     return lines
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from plushsense.cli.output import say
+from plushsense.cli.output import say, write_line
 
 if TYPE_CHECKING:
     from plushsense.live.reactions import Reaction
@@ -62,8 +61,8 @@ def run(args: argparse.Namespace) -> int:
                     if decision.state == "no signal" and device.mismatch:
                         more["mismatch"] = device.mismatch
                     lines = [json.dumps(decision.to_dict() | more, ensure_ascii=False)]
-                sys.stdout.write("".join(f"{line}\n" for line in lines))
-                sys.stdout.flush()
+                if lines:
+                    write_line("\n".join(lines))
         except KeyboardInterrupt:
             pass
         finally:

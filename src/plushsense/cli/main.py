@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 
 from plushsense.cli.options import VERBS, add_options
 from plushsense.cli.output import Parser, say, utf8
-from plushsense.core.errors import BadInput, PlushSenseError, check_known
+from plushsense.core.errors import BadInput, PlushSenseError, check_known, printable
 from plushsense.core.version import __version__
 from plushsense.jobs.progress import close_active
 
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.add_argument("--json", action="store_true", help=json_help)
         return int(run(parser.parse_args(words[1:])))
     except PlushSenseError as error:
-        say(f"plushsense: {error}")
+        say("\n".join([f"plushsense: {error}", *getattr(error, "__notes__", ())]))
         return 2
     except KeyboardInterrupt:
         say(f"plushsense: stopped; {left}." if (left := VERBS[verb].get("stopped")) else "plushsense: stopped.")
@@ -79,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             with contextlib.suppress(OSError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0
-        say(f"plushsense: {_sentence(error)}")
+        say(f"plushsense: {printable(_sentence(error))}")
         return 2
     finally:
         close_active()

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
 
-from plushsense.core.errors import ConfigError, nearest
+from plushsense.core.errors import ConfigError, nearest, printable
 from plushsense.jobs.progress import close_active
 from plushsense.reports.table import Table
 
@@ -48,24 +48,29 @@ def utf8() -> None:
 
 
 def say(text: str) -> None:
-    """Print a message on standard error; ignore errors, such as a closed terminal."""
+    """Print a message on standard error, with control characters escaped; ignore errors, such as a closed terminal."""
     with contextlib.suppress(OSError):
-        sys.stderr.write(text + "\n")
+        sys.stderr.write(printable(text, lines=True) + "\n")
         sys.stderr.flush()
 
 
 def warn(sentence: str) -> None:
     """Print a warning on standard error."""
-    say(f"warning: {sentence}")
+    say(f"warning: {printable(sentence)}")
 
 
 def emit(args: argparse.Namespace, result: dict[str, Any], text: str | Iterable[str]) -> None:
     """Print the result on standard output: ``result`` as a JSON object with ``--json``, otherwise ``text``."""
     close_active()
     if args.json:
-        sys.stdout.write(json.dumps(result, ensure_ascii=False, allow_nan=False) + "\n")
+        write_line(json.dumps(result, ensure_ascii=False, allow_nan=False))
     else:
-        sys.stdout.write((text if isinstance(text, str) else "\n".join(text)).rstrip("\n") + "\n")
+        write_line((text if isinstance(text, str) else "\n".join(text)).rstrip("\n"))
+
+
+def write_line(text: str) -> None:
+    """Print a text or JSON on standard output, with control characters, which a file may contain, escaped."""
+    sys.stdout.write(printable(text, lines=True) + "\n")
     sys.stdout.flush()
 
 

@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from queue import SimpleQueue
 from typing import Protocol
 
+from plushsense.core.errors import printable
 from plushsense.recording.recorder import Recorder
 from plushsense.recording.states import RecorderStatus
 
@@ -244,7 +245,7 @@ def lines(
     out: list[tuple[int, str]] = []
 
     def put(rank: int, text: str, colour: str = "", indent: str = "") -> None:
-        for line in textwrap.wrap(text, max(1, width - len(indent))) or [""]:
+        for line in textwrap.wrap(printable(text, lines=True), max(1, width - len(indent))) or [""]:
             out.append((rank, f"{indent}{colour}{line}{_OFF if colour else ''}"))
 
     rule = "─" * width
@@ -256,7 +257,7 @@ def lines(
     put(8, "")
     if s.state not in ("finished", "stopped"):
         again = "   (recorded before; this one replaces it)" if s.existing else ""
-        name = f"{_BOLD}{s.step.gesture[: max(1, width - 2)]}{_OFF}"
+        name = f"{_BOLD}{printable(s.step.gesture)[: max(1, width - 2)]}{_OFF}"
         out.append((0, f"  {name}   {s.step.repetition} of {s.repetitions}{again}"))
         put(8, "")
         put(1, s.step.prompt, _BOLD, "  ")
@@ -336,7 +337,7 @@ class Screen:
     def _write_messages(self) -> None:
         if not self._messages.empty():
             while not self._messages.empty():
-                sys.stderr.write(self._messages.get())
+                sys.stderr.write(printable(self._messages.get(), lines=True))
             sys.stderr.flush()
 
     def close(self) -> None:

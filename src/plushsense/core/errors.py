@@ -27,12 +27,30 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import re
 from collections.abc import Iterable
 from types import ModuleType
+
+# Control characters, with which a text could command a terminal, and line separators and marks that reverse the order
+# of what follows.
+_CONTROLS = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+_LONGEST_COMPARED = 200
+
+
+def printable(text: str, *, lines: bool = False) -> str:
+    """Return a text with control characters escaped, as ``\\u001b``; ``lines``: line ends and tabs are kept.
+
+    The escapes are valid inside the strings of a JSON text, too.
+    """
+    plain = _CONTROLS.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
+    return plain if lines else plain.replace("\n", "\\u000a").replace("\t", "\\u0009")
 
 
 class PlushSenseError(Exception):
     """An error of PlushSense, whose message is one sentence for the user.
+
+    Control characters and line ends in the sentence, which may come from a file, are escaped. Lines to print below it,
+    such as a caret under the place, are notes (`add_note`).
 
     Args:
         message: the sentence.
@@ -41,7 +59,7 @@ class PlushSenseError(Exception):
     """
 
     def __init__(self, message: str = "", *, reason: str = "", **values: object) -> None:
-        super().__init__(message)
+        super().__init__(printable(message))
         self.reason, self.values = reason, values
 
 
@@ -120,7 +138,10 @@ class MissingExtraError(PlushSenseError):
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """Return the suggestion of a similar word to append to an error message, or "" if there is none."""
-    lowered = {k.lower(): k for k in known}
+    # Comparing takes time proportional to the product of the lengths.
+    lowered = {k.lower(): k for k in known if len(k) <= _LONGEST_COMPARED}
+    if len(word) > _LONGEST_COMPARED:
+        return ""
     matches = difflib.get_close_matches(word.lower(), list(lowered), n=1, cutoff=0.6)
     return f" Did you mean '{lowered[matches[0]]}'?" if matches else ""
 

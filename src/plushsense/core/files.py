@@ -90,6 +90,19 @@ def temporary_folder() -> Iterator[Path]:
         yield folder
 
 
+def read_bytes(path: Path, most: int) -> bytes:
+    """Read a file of at most ``most`` bytes, so that a huge one, or an endless device, does not fill the memory.
+
+    Raises:
+        OSError: if the file cannot be read, or is longer.
+    """
+    with path.open("rb") as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"it has more than {most:,} bytes", str(path))
+    return data
+
+
 def write_file(path: Path, content: str | bytes, *, private: bool = False) -> None:
     """Write a file atomically (see `replacing_file`); text is encoded as UTF-8, with line ends unchanged."""
     with replacing_file(path, private=private) as part:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -74,8 +75,8 @@ class GestureSet:
 
     def __post_init__(self) -> None:
         names = [(label, plain_label(label)) for g in self.gestures for label in (g.label, *g.labels)]
-        plain = [name for _, name in names]
-        doubled = sorted({label for label, name in names if plain.count(name) > 1})
+        counts = Counter(name for _, name in names)
+        doubled = sorted({label for label, name in names if counts[name] > 1})
         if doubled:
             raise GestureError(f"Gesture set '{self.name}' has '{doubled[0]}' twice: labels must differ.")
 

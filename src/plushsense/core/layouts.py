@@ -24,7 +24,9 @@ GRAVITY_S = 0.64  # time constant of the running mean; chosen on 14 people (benc
 ACCELERATION = "acceleration"
 BINARY, COUNT = "binary", "count"
 DERIVED_KINDS = ("magnitude", "gravity")
-MOST_GAP_MS, MOST_GAP_SAMPLES = 60_000, 60_000
+MOST_GAP_MS, MOST_GAP_SAMPLES, MOST_GAP_VALUES = 60_000, 60_000, 2_000_000
+MOST_CHANNELS = 4096  # as many as a network may read; also of the entries of every other list
+_SIZES = (1e-15, 1e15)  # of a step, and of a scale, which may be negative
 _INT32 = (-2147483648.0, 2147483647.0)
 
 
@@ -67,8 +69,17 @@ class Channel:
     step: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.step <= 0:
-            raise LayoutError(f"Channel '{self.name}': step is {self.step}; it must be above 0.")
+        for key, size in (("step", self.step), ("scale", abs(self.scale))):
+            if not _SIZES[0] <= size <= _SIZES[1]:
+                raise LayoutError(
+                    f"Channel '{self.name}': {key} is {getattr(self, key):g}; accepted are sizes from {_SIZES[0]:g} to "
+                    f"{_SIZES[1]:g}."
+                )
+        if abs(self.offset) > 2.0**32 * self.step:
+            raise LayoutError(
+                f"Channel '{self.name}': the offset {self.offset:g} is more than 2³² steps of {self.step:g}: take a "
+                "larger step."
+            )
         # By default, every number of steps is valid that fits 32 bits, also as a distance from the offset.
         zero = round(self.offset / self.step)
         if self.valid_min == _INT32[0]:
@@ -173,6 +184,7 @@ class Layout:
             raise LayoutError(f"Layout '{self.name}': {problem}")
 
     def _problems(self) -> Iterator[str]:
+        yield from self._problems_of_size()
         names = [c.name for c in self.channels] + [d.name for d in self.derived]
         if len(set(names)) != len(names):
             yield f"channel names must differ: {', '.join(names)}."
@@ -185,22 +197,17 @@ class Layout:
             ("csv.columns", columns, (DEVICE_MS, DELAY_MS, HOST_MS, "label")),
         ):
             known = (*self.names, *extra)
+            unknown = set(used) - set(known)
             for name in used:
-                if name not in known:
+                if name in unknown:
                     yield f"{where} names '{name}'; known are {', '.join(known)}.{nearest(name, known)}"
-        if missing := [name for name in self.names if name not in self.wire]:
+        unsent = set(self.names) - set(self.wire)
+        if missing := [name for name in self.names if name in unsent]:
             yield f"wire lacks the channels {', '.join(missing)}: add them."
         if DEVICE_MS not in self.wire and DELAY_MS not in self.wire:
             yield f"wire has no clock: add {DEVICE_MS} or {DELAY_MS}."
         if not self.inputs:
             yield "a network needs inputs: fill in inputs."
-        if not 1.0 <= self.rate_hz <= 10_000.0:
-            yield f"rate_hz is {self.rate_hz}; accepted are 1 to 10000."
-        elif not 1 <= self.gap_ms <= MOST_GAP_MS or self.gap_ms * self.rate_hz > 1000 * MOST_GAP_SAMPLES:
-            yield (
-                f"gap_ms is {self.gap_ms}: accepted are 1 to {MOST_GAP_MS}, and at most {MOST_GAP_SAMPLES} samples, as "
-                "all samples of a gap are computed at once."
-            )
         for derived in self.derived:
             yield from self._problems_of(derived)
         kinds = {c.name: c.kind for c in self.channels}
@@ -209,6 +216,20 @@ class Layout:
                 yield f"a vector has three axes, not {len(vector)}."
             if len({kinds[self.names[self.index(name)]] for name in vector}) > 1:
                 yield f"the axes {', '.join(vector)} of a vector are of different kinds: give them one."
+
+    def _problems_of_size(self) -> Iterator[str]:
+        for what in ("channels", "wire", "derived", "inputs", "vectors"):
+            if len(getattr(self, what)) > MOST_CHANNELS:
+                yield f"{what} has {len(getattr(self, what))} entries: accepted are up to {MOST_CHANNELS}."
+        if not 1.0 <= self.rate_hz <= 10_000.0:
+            yield f"rate_hz is {self.rate_hz}; accepted are 1 to 10000."
+        elif not 1 <= self.gap_ms <= MOST_GAP_MS or self.gap_ms * self.rate_hz > 1000 * MOST_GAP_SAMPLES:
+            yield (
+                f"gap_ms is {self.gap_ms}: accepted are 1 to {MOST_GAP_MS}, and at most {MOST_GAP_SAMPLES} samples, as "
+                "all samples of a gap are computed at once."
+            )
+        elif self.gap_ms * self.rate_hz * self.n_channels > 1000 * MOST_GAP_VALUES:
+            yield f"gaps of {self.gap_ms} ms have more than {MOST_GAP_VALUES} values in {self.n_channels} channels."
 
     def _problems_of(self, derived: Derived) -> Iterator[str]:
         if derived.kind not in DERIVED_KINDS:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import BadInput, ConfigError
-from plushsense.core.files import new_folder
+from plushsense.core.files import new_folder, read_bytes
 from plushsense.core.templates import fill_text
 from plushsense.deploy.golden import write_golden
 from plushsense.models.arch import Arch
@@ -25,6 +25,7 @@ BUNDLE = "model.plush"
 LIBRARY = ("plushsense.h", "plushsense.c")
 MODEL = ("plush_model.h", "plush_model.c")
 GOLDEN = "golden"
+MOST_FILE_BYTES = 16 << 20  # that are read of a file of an export, other than golden vectors
 TOY_BYTES = 516  # size of a plush_toy with 32-bit pointers (a test compiles it)
 
 Extra = Callable[[Path, dict[str, Any]], object]
@@ -36,6 +37,7 @@ _VERSION = re.compile(
     r"(0|[1-9][0-9]*)(\.(0|[1-9][0-9]*)){2}"
     r"(-(0|[1-9][0-9]*|[0-9]*[a-zA-Z-][0-9a-zA-Z-]*)(\.(0|[1-9][0-9]*|[0-9]*[a-zA-Z-][0-9a-zA-Z-]*))*)?"
 )
+_PAGE = re.compile(r"https?://[^\s\"'\\]+")
 _HASH = re.compile(r"[0-9a-f]{16,64}")
 # Identifiers and C files of the library and the model, but not the command `plushsense` or the file of the image.
 _OWN = r"(?:(?:PLUSH|plush)_(?!model\.bin\b)\w|plushsense\.[ch]\b|PLUSHSENSE_H\b)"
@@ -102,13 +104,15 @@ def read_facts(folder: str | Path) -> dict[str, Any]:
     """
     path = Path(folder) / FACTS
     try:
-        facts = json.loads(path.read_text(encoding="utf-8"))
+        facts = json.loads(read_bytes(path, MOST_FILE_BYTES).decode())
+        if not isinstance(facts, dict):
+            raise TypeError("it holds no table")
         needed = {"title", "channels", "classes", "memory_bytes", "model_bytes"} - set(facts)
     except (FileNotFoundError, NotADirectoryError):
         problem = f"'{folder}' is no export" if Path(folder).exists() else f"There is no export '{folder}'"
         message = f"{problem}: make one with plushsense export BUNDLE OUT."
         raise BadInput(message, reason="export_gone", name=Path(folder).name) from None
-    except (OSError, ValueError, TypeError) as cause:
+    except (OSError, ValueError, TypeError, RecursionError) as cause:
         message = f"'{path}' cannot be read ({cause}): export the model again."
         raise BadInput(message, reason="export_damaged", name=Path(folder).name) from None
     name = facts.get("name", "")
@@ -132,6 +136,12 @@ def check_name(name: str) -> None:
             f"'{name}' cannot be the name of an export: accepted are up to {_MOST_NAME} lower-case letters, digits and "
             "single underscores between them, a letter first, without the words arduino and library."
         )
+
+
+def check_page(url: object) -> None:
+    """Check the address of the web page of a model; raise ConfigError for one that is not accepted."""
+    if not isinstance(url, str) or not _PAGE.fullmatch(url):
+        raise ConfigError(f"'{url}' is no address of a web page: accepted is one that begins with http:// or https://.")
 
 
 def check_model_version(version: str) -> None:
@@ -171,7 +181,7 @@ def _write(model: IntegerModel, bundle: Bundle, folder: Path, name: str) -> dict
     for file, content in code.items():
         plain = content if file == IMAGE else prefixed(content.decode(), name).encode()
         (folder / prefixed(file, name)).write_bytes(plain)
-    facts = _facts(model, bundle, code[IMAGE]) | ({"name": name} if name else {})
+    facts = facts_of(model, bundle, code[IMAGE]) | ({"name": name} if name else {})
     bundle.save(folder / BUNDLE)
     write_golden(model, bundle.scaler, folder / GOLDEN)
     return facts
@@ -184,7 +194,7 @@ def code_files(model: IntegerModel, bundle: Bundle) -> dict[str, bytes]:
     can be compared with the files of an export of unknown origin.
     """
     image = model.to_bytes()
-    facts = _facts(model, bundle, image)
+    facts = facts_of(model, bundle, image)
     return {
         **{name: library_text(name, window=model.is_window).encode() for name in LIBRARY},
         MODEL[0]: _header(facts).encode(),
@@ -208,7 +218,8 @@ def times_streaming(arch: Arch) -> float:
     return round(arch.macs_per_step / replace(arch, padding="stream", pool=None).macs_per_step, 1)
 
 
-def _facts(model: IntegerModel, bundle: Bundle, image: bytes) -> dict[str, Any]:
+def facts_of(model: IntegerModel, bundle: Bundle, image: bytes) -> dict[str, Any]:
+    """Return the facts about a model that ``export.json`` holds, without the name, page and files of an export."""
     arch, layout = model.network.arch, model.layout
     code_version = version("plushsense")
     # Provenance may come from elsewhere, and goes into C.

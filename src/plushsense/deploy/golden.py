@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput
+from plushsense.core.files import read_bytes
 from plushsense.core.layouts import MAGNITUDE_FRACTION_BITS, Layout
 from plushsense.core.templates import fill_text
 from plushsense.runtime.events import AFFECT_CODES
@@ -24,6 +25,7 @@ from plushsense.runtime.machine import Moment, ToyMachine
 from plushsense.windows.features import Scaler
 
 _MS_BITS = 32
+_MOST_BYTES = 256 << 20  # of a file of golden vectors
 _SEARCHED = 4096  # numbers on each side of a channel's mean
 _INT32 = -(1 << 31), (1 << 31) - 1
 
@@ -454,7 +456,7 @@ def read_golden(folder: Path, channels: int, classes: int) -> tuple[Ints, NDArra
     for name, columns, kind in ((FRAMES, 1 + channels, "<i4"), (ANSWERS, HEAD + 2 * classes, "<i4")):
         path = folder / name
         try:
-            data = path.read_bytes()
+            data = read_bytes(path, _MOST_BYTES)
         except OSError as cause:
             raise BadInput(f"The golden vectors '{path}' cannot be read ({cause}): export the model again.") from None
         if not data or len(data) % (4 * columns):

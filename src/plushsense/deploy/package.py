@@ -12,9 +12,21 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import LayoutError
+from plushsense.core.files import read_bytes
 from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Channel, Layout
 from plushsense.core.templates import c_comment, fill_text
-from plushsense.deploy.emit import BUNDLE, FACTS, IMAGE, LIBRARY, MODEL, TOY_BYTES, c_names, prefixed, read_facts
+from plushsense.deploy.emit import (
+    BUNDLE,
+    FACTS,
+    IMAGE,
+    LIBRARY,
+    MODEL,
+    TOY_BYTES,
+    c_names,
+    prefixed,
+    read_facts,
+    without_prefix,
+)
 from plushsense.deploy.golden import measured
 from plushsense.models.bundle import Bundle
 from plushsense.windows.features import Scaler
@@ -68,10 +80,28 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
         LayoutError: for a layout with values that the toy's line format cannot represent.
     """
     facts = read_facts(out) if facts is None else facts
-    bundle = Bundle.load(out / BUNDLE)
+    name = str(facts.get("name", ""))
+    code = {file: without_prefix((out / prefixed(file, name)).read_bytes(), name) for file in (*LIBRARY, *MODEL)}
+    written = []
+    for file, content in package_files(Bundle.load(out / BUNDLE), facts, code).items():
+        path = out / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+        written.append(path)
+    return written
+
+
+def package_files(bundle: Bundle, facts: Mapping[str, Any], code: Mapping[str, bytes]) -> dict[str, bytes]:
+    """Return the contents of the files that `package` adds, by their paths in the export.
+
+    ``code`` holds the library and the model without the name of the export (`plushsense.deploy.emit.code_files`).
+
+    Raises:
+        LayoutError: for a layout with values that the toy's line format cannot represent.
+    """
     rendered = firmware(bundle.layout, bundle.scaler, facts)
     name = str(facts.get("name", ""))
-    header = (out / prefixed(LIBRARY[0], name)).read_text(encoding="utf-8")
+    header = prefixed(code[LIBRARY[0]].decode(), name)
     c_folder = files("plushsense.deploy") / "c"
     licence = (c_folder / LICENCE).read_text(encoding="utf-8")
     simulated = " SIMULATION: trained on a virtual toy." if facts["simulated"] else ""
@@ -107,14 +137,10 @@ def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
     for file in _EXAMPLE:
         texts |= {f"{SKETCH}/{file}": rendered[file], f"{IDF_EXAMPLE}/main/{file}": rendered[file]}
     contents = {_named_path(file, name): prefixed(text, name).encode() for file, text in texts.items()}
-    contents |= {copy: (out / original).read_bytes() for copy, original in copies(name).items()}
-    written = []
-    for file, content in contents.items():
-        path = out / file
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
-        written.append(path)
-    return written
+    plain = {
+        prefixed(file, name): prefixed(text.decode(), name).encode() for file, text in code.items() if file != IMAGE
+    }
+    return contents | {copy: plain[original] for copy, original in copies(name).items()}
 
 
 def copies(name: str = "") -> dict[str, str]:
@@ -131,7 +157,7 @@ def _named_path(path: str, name: str) -> str:
     """Return the path of a file of the packages in an export with a name: also the packages are called by it."""
     folders = _folders(name)
     for plain, named in ((ARDUINO, f"arduino/{folders['library']}"), (IDF, f"esp-idf/{folders['component']}")):
-        if path.startswith(f"{plain}/"):
+        if path == plain or path.startswith(f"{plain}/"):
             path = path.replace(plain, named, 1)
     return prefixed(path, name)
 
@@ -144,13 +170,39 @@ def _folders(name: str) -> dict[str, str]:
     }
 
 
-def changed_copies(out: Path) -> list[str]:
-    """Return the copies in an export folder that differ from their originals, since only these are verified."""
-    return [
-        copy
-        for copy, original in copies(str(read_facts(out).get("name", ""))).items()
-        if (out / copy).is_file() and (out / copy).read_bytes() != (out / original).read_bytes()
-    ]
+# What a compiler or a build system may read.
+_HEADERS = frozenset((".h", ".hh", ".hpp", ".hxx", ".inc", ".gch", ".pch"))
+_SOURCES = _HEADERS | {".c", ".cc", ".cpp", ".cxx", ".s", ".asm", ".ino", ".py", ".cmake", ".a", ".o", ".so"}
+
+
+def foreign_files(out: Path, expected: Mapping[str, bytes], name: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the files of an export folder that are not those in ``expected`` (contents by path).
+
+    These are other contents, links, and further files where compilers look for those of the library: headers beside
+    it, and code in the folders of its packages. Documents are left out.
+
+    Returns:
+        Files that are compiled with the library, and files of the examples, which are there to be changed.
+    """
+    names = [path for path in expected if not path.endswith(".md") and (out / path).exists()]
+    found = [path for path in names if (out / path).is_symlink() or not _holds(out / path, expected[path])]
+    library = f"{_named_path(ARDUINO, name)}/src"
+    component = _named_path(IDF, name)
+    places = {"": _HEADERS, "zephyr": _SOURCES, f"{component}/include": _SOURCES, f"{component}/src": _SOURCES}
+    inside = [(out / place, kinds, (out / place).glob("*")) for place, kinds in places.items()]
+    inside.append((out / library, _SOURCES, (out / library).rglob("*")))
+    for _, kinds, entries in inside:
+        paths = (entry for entry in entries if entry.suffix.lower() in kinds)
+        found += [path for entry in paths if (path := entry.relative_to(out).as_posix()) not in expected]
+    examples = tuple(path for path in found if "examples" in path.split("/"))
+    return tuple(path for path in found if path not in examples), examples
+
+
+def _holds(path: Path, content: bytes) -> bool:
+    try:
+        return read_bytes(path, len(content)) == content
+    except OSError:
+        return False
 
 
 def handbook(bundle: Bundle, facts: Mapping[str, Any]) -> str:

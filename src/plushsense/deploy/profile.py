@@ -14,7 +14,7 @@ import numpy as np
 
 from plushsense.core.errors import BadInput, ProgramError, ToolError
 from plushsense.core.toml import load_table, read_toml
-from plushsense.deploy.emit import GOLDEN, LIBRARY, MODEL, read_facts
+from plushsense.deploy.emit import GOLDEN, LIBRARY, MODEL
 from plushsense.deploy.golden import read_golden
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.targets import (
@@ -519,17 +519,17 @@ def profile(
         folder: the folder that ``plushsense export`` wrote.
         targets: names of `TARGETS`; by default all that count instructions and are installed.
         optimise: optimisation flag of the compilers.
-        trust: whether to compile and run library and model files that differ from what this version writes.
+        trust: whether to compile and run code in a folder with files that differ from what this version writes.
         progress: called with (targets done, number of targets).
 
     Raises:
-        BadInput: if the folder is no export or incomplete, or its C code was changed and ``trust`` is false.
+        BadInput: if the folder is no export or incomplete, or its code was changed and ``trust`` is false.
         ToolError: if a requested target, or every target, is not installed, or a compiler fails.
     """
     progress = progress or (lambda done, total: None)
     folder = Path(folder)
-    facts = read_facts(folder)
     export = Export(folder)
+    facts = export.facts
     arch = export.model.network.arch
     if not trust:
         export.require_unchanged()

@@ -213,7 +213,7 @@ def _vectors(
 
 def _codes(mean: Floats, start: Floats, unit: Floats) -> Floats:
     """Return the mean 8-bit code of each input of a layer (0 for a constant one)."""
-    return np.divide(mean - start, unit, out=np.zeros_like(mean), where=unit != 0)
+    return np.clip(np.divide(mean - start, unit, out=np.zeros_like(mean), where=unit != 0), 0.0, 255.0)
 
 
 def _eight_bits(w: Floats, b: Floats, mean_input: Floats) -> tuple[NDArray[np.int8], NDArray[np.int64], Floats]:

@@ -15,6 +15,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TextIO
 
+from plushsense.core.errors import printable
+
 if TYPE_CHECKING:
     from rich.console import ConsoleDimensions, RenderableType
 
@@ -471,11 +473,6 @@ def duration(seconds: float) -> str:
     if hours < 48:
         return f"{hours} h {minutes:02d} min"
     return f"{hours // 24} d {hours % 24} h"
-
-
-def printable(text: str) -> str:
-    """Replace control characters by spaces: names and labels must not move the cursor."""
-    return "".join(c if c.isprintable() else " " for c in text)
 
 
 def _position(step: JobStep | None, elapsed_s: float) -> str:

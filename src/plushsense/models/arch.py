@@ -146,10 +146,12 @@ def _number(text: str, at: int, name: str, symbol: bool = True) -> tuple[int, in
 
 
 def fail(why: str, text: str, at: int, symbol: bool = True) -> NoReturn:
-    """Raise ArchError with the reason, the text, and a caret under position ``at``."""
-    printable = "".join(c if c.isprintable() else "?" for c in text)
+    """Raise ArchError with the reason; its note is the text, with a caret under position ``at``."""
+    shown = "".join(c if c.isprintable() else "?" for c in text)
     kind = "Architecture" if symbol else "Filters"
-    raise ArchError(f"{kind} '{printable}', place {at + 1}: {why}.\n    {printable}\n    {' ' * at}^")
+    error = ArchError(f"{kind} '{shown}', place {at + 1}: {why}.")
+    error.add_note(f"    {shown}\n    {' ' * at}^")
+    raise error
 
 
 Padding = Literal["stream", "causal", "mirror"]

@@ -22,13 +22,13 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from plushsense.core.errors import BadInput, BundleError
-from plushsense.core.files import write_file
+from plushsense.core.files import read_bytes, write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.core.toml import check_table
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.models.arch import Arch
-from plushsense.models.reference import Network, check_weights
+from plushsense.models.reference import CHUNK, Network, check_weights
 from plushsense.windows.features import Scaler
 
 FORMAT = "plushsense-bundle"
@@ -40,6 +40,14 @@ _AGAIN = "copy it again from where it came, or train again"
 # Offsets and scales beyond them cannot come from 32-bit values.
 _MOST_OFFSET, _SCALES = 2.0**40, (1e-15, 1e9)
 _DENSE = ("dense.weight", "dense.bias")
+# Larger weights and calibrations could overflow in four layers of floats; seconds of windows are few.
+_MOST_WEIGHT = 1e20
+_MOST = {"calibration": 1e30, "windowing": 1e6}
+_MOST_BYTES = 256 << 20
+_DEEPEST = 32  # tables within tables
+# What a network may take to run: numbers kept or computed at once (512 MiB of floats), multiply-accumulates of a
+# decision, and of those that are due at once after a gap.
+_MOST_NUMBERS, _MOST_MACS, _MOST_GAP_MACS = 1 << 26, 1_000_000_000, 100_000_000_000
 
 
 @dataclass(frozen=True)
@@ -108,7 +116,7 @@ class Bundle:
         personal: for whom the dense layer was adapted, and the layer before (`plushsense.live.adaptation`); or empty.
 
     Raises:
-        BundleError: if the parts do not fit together.
+        BundleError: if the parts do not fit together, or a number is out of range.
     """
 
     arch: Arch
@@ -141,6 +149,10 @@ class Bundle:
                 f"The bundle's scaling is out of range (scales {low:g} to {high:g}, offsets to ±{_MOST_OFFSET:g}): "
                 "train again."
             )
+        for name, weight in self.weights.items():
+            if np.size(weight) and np.abs(weight).max() > _MOST_WEIGHT:
+                raise BundleError(f"The weights '{name}' hold a value beyond ±{_MOST_WEIGHT:g}: train again.")
+        _check_size(self.arch, self.layout)
 
     def __repr__(self) -> str:
         filters = "/".join(str(f) for f in self.arch.filters)
@@ -189,7 +201,7 @@ class Bundle:
         """
         path = Path(path)
         try:
-            data = path.read_bytes()
+            data = read_bytes(path, _MOST_BYTES)
         except FileNotFoundError:
             raise BundleError(
                 f"There is no bundle '{path}': check the path, or make one with plushsense train."
@@ -219,10 +231,18 @@ class Bundle:
             weights: dict[str, NDArray[Any]] = load_tensors(data)
         except (SafetensorError, KeyError, ValueError, TypeError) as cause:
             raise BundleError(f"{_damaged(path)} ({cause}).") from None
-        if not isinstance(content, dict) or head.get("sha256") != _digest(_canonical(content), weights):
+        try:
+            genuine = head.get("sha256") == _digest(_canonical(content), weights)
+        except (ValueError, RecursionError):  # a number that is not finite; tables nested without end
+            genuine = False
+        if not isinstance(content, dict) or not genuine:
             raise BundleError(f"{_damaged(path)} (its checksum does not match).")
         try:
+            _check_numbers(content)
             _check_tables(content)
+            for name, weight in weights.items():
+                if weight.dtype != np.float32:
+                    raise BundleError(f"the weights '{name}' are of {weight.dtype}: accepted is float32.")
             bundle = cls(
                 Arch.from_dict(content["arch"]),
                 weights,
@@ -342,6 +362,43 @@ def _without_people(provenance: Mapping[str, Any]) -> dict[str, Any]:
     return others | counted | {key: len(codes) for key, codes in people.items()}
 
 
+def _check_size(arch: Arch, layout: Layout) -> None:
+    """Raise BundleError for a network that takes too much memory or time to run."""
+    streams = arch.padding == "stream"
+    rows = CHUNK if streams else arch.window
+    layers = list(zip(arch.layers, arch.inputs, strict=True))
+    kept = (rows + arch.receptive_field) * arch.channels + arch.pooled // arch.step * arch.features
+    kept += sum((layer.reach + 2 * rows) * max(read, layer.filters) for layer, read in layers)
+    taps = max(rows * layer.kernel * read for layer, read in layers)
+    if max(kept, taps) > _MOST_NUMBERS:
+        raise BundleError(
+            f"{arch.title} keeps or computes {max(kept, taps):,} numbers at once: accepted are up to "
+            f"{_MOST_NUMBERS:,}, so take shorter layers or a shorter window."
+        )
+    macs = arch.macs_per_step + (arch.pooled // arch.step * arch.features if streams else 0)
+    steps_of_gap = layout.gap_ms * layout.rate_hz / 1000 / arch.step
+    if macs > _MOST_MACS or macs * steps_of_gap > _MOST_GAP_MACS:
+        raise BundleError(
+            f"{arch.title} takes {macs:,} multiply-accumulates for a decision, and bridges gaps of {layout.gap_ms} ms: "
+            f"accepted are up to {_MOST_MACS:,} for a decision, and {_MOST_GAP_MACS:,} for those of a gap."
+        )
+
+
+def _check_numbers(content: Mapping[str, Any]) -> None:
+    """Raise BundleError for numbers beyond `_MOST`, whole ones beyond 64 bits, and tables nested too deep."""
+    below: list[tuple[int, str, Any]] = [(1, str(key), value) for key, value in content.items()]
+    while below:
+        depth, part, value = below.pop()
+        if isinstance(value, dict | list):
+            if depth > _DEEPEST:
+                raise BundleError(f"{part} has tables nested more than {_DEEPEST} deep.")
+            below += [(depth + 1, part, each) for each in (value.values() if isinstance(value, dict) else value)]
+        elif isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
+            raise BundleError(f"{part} holds a whole number beyond 64 bits.")
+        elif isinstance(value, int | float) and abs(value) > _MOST.get(part, math.inf):
+            raise BundleError(f"{part} holds {value:g}: accepted are numbers up to ±{_MOST[part]:g}.")
+
+
 def _check_tables(content: Mapping[str, Any]) -> None:
     """Raise BundleError if tables in the content of a bundle have values of wrong types; further keys are allowed."""
     # All texts must be fit for files in UTF-8.
@@ -393,7 +450,7 @@ def _damaged(path: str | Path) -> str:
     return f"The bundle '{path}' is damaged: {_AGAIN}"
 
 
-def _canonical(content: Mapping[str, Any]) -> str:
+def _canonical(content: Any) -> str:
     return json.dumps(content, sort_keys=True, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
 
 

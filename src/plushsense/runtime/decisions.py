@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import BundleError, ConfigError
 from plushsense.core.toml import load_table
-from plushsense.runtime.events import MOST_STEPS, ONE, EventSettings
+from plushsense.runtime.events import MOST_STEPS, NO_GESTURE, ONE, EventSettings
 from plushsense.runtime.fixed import LOGIT_LIMIT
 from plushsense.runtime.gate import GateSettings
 from plushsense.runtime.health import HealthSettings
@@ -21,6 +21,17 @@ class Rules:
     events: EventSettings = field(default_factory=EventSettings)
     gate: GateSettings = field(default_factory=GateSettings)
     health: HealthSettings = field(default_factory=lambda: HealthSettings(fault_ms=0))
+
+    def check(self, channels: int, inputs: int, classes: int) -> None:
+        """Raise BundleError for settings that name a measured channel, an input or a class that the model lacks."""
+        if self.health.low and len(self.health.low) != channels:
+            raise BundleError(
+                f"The health limits are of {len(self.health.low)} channels, the layout has {channels}: train again."
+            )
+        if any(i >= inputs for s in self.gate.signals for i in s.inputs):
+            raise BundleError(f"The gate reads an unknown input: the model has {inputs}; train again.")
+        if any(classes <= r.gesture != NO_GESTURE for r in self.gate.rules):
+            raise BundleError(f"The gate reports an unknown gesture: the model has {classes}; train again.")
 
 
 _SHARES = ("enter", "leave", "enter_affect", "leave_affect", "sure")

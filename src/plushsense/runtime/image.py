@@ -52,7 +52,7 @@ from plushsense.core.errors import BundleError
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.runtime.decisions import Rules
-from plushsense.runtime.events import AFFECT_CODES, NO_GESTURE
+from plushsense.runtime.events import AFFECT_CODES
 from plushsense.runtime.fixed import PROBABILITY_BITS, LogitScale, Requantize
 from plushsense.runtime.gate import JERK
 from plushsense.runtime.integer import IntegerNetwork
@@ -90,7 +90,7 @@ class IntegerModel:
     smoothing: int
     rules: Rules = field(default_factory=Rules)
 
-    def __post_init__(self) -> None:  # noqa: C901
+    def __post_init__(self) -> None:
         arch = self.network.arch
         if (self.layout.n_inputs, len(self.gestures)) != (arch.channels, arch.classes):
             raise BundleError(
@@ -138,16 +138,7 @@ class IntegerModel:
                 raise BundleError(
                     f"Channel '{derived.name}' is made of {len(derived.of)} others: the toy takes at most 255."
                 )
-        health, gate = self.rules.health, self.rules.gate
-        if health.low and len(health.low) != len(self.layout.channels):
-            raise BundleError(
-                f"The health limits are of {len(health.low)} channels, layout '{self.layout.name}' has "
-                f"{len(self.layout.channels)}: train again."
-            )
-        if any(i >= arch.channels for s in gate.signals for i in s.inputs):
-            raise BundleError(f"The gate reads an unknown input: the model has {arch.channels}; train again.")
-        if any(arch.classes <= r.gesture != NO_GESTURE for r in gate.rules):
-            raise BundleError(f"The gate reports an unknown gesture: the model has {arch.classes}; train again.")
+        self.rules.check(len(self.layout.channels), arch.channels, arch.classes)
         for gesture in self.gestures.gestures:
             if "\0" in gesture.label or gesture.label.encode(errors="replace").decode() != gesture.label:
                 raise BundleError(f"The gesture {gesture.label!r} has a character that the toy cannot keep: rename it.")

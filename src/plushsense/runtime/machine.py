@@ -255,11 +255,15 @@ class ToyMachine:
         gestures: gestures in class order.
         rules: settings of health, gate and events.
         smoothing: weight of a new step, in steps of 2^-15 (`plushsense.runtime.fixed.smoothing_weight`).
+
+    Raises:
+        BundleError: for rules that do not fit the network or the layout.
     """
 
     def __init__(
         self, network: LogitStream, layout: Layout, gestures: GestureSet, rules: Rules, smoothing: int
     ) -> None:
+        rules.check(layout.n_channels, network.arch.channels, network.arch.classes)
         self.frames = FrameReader(layout, rules.health)
         self.samples = SampleReader(network, gestures, rules, smoothing)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -12,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ArchError, BadInput, BundleError, ConfigError
+from plushsense.core.errors import ArchError, BadInput, BundleError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.convert import CONVERTERS, check_format, convert
-from plushsense.deploy.emit import IMAGE, ExportResult, check_model_version, check_name, emit, read_facts
+from plushsense.deploy.emit import IMAGE, ExportResult, check_model_version, check_name, check_page, emit, read_facts
 from plushsense.deploy.package import package
 from plushsense.deploy.quantize import calibrated, integer_model, refuse_undeployable
 from plushsense.models.bundle import Bundle
@@ -138,8 +137,8 @@ def export(
         BadInput: for a folder that is not empty.
     """
     check_name(name)
-    if url and not re.fullmatch(r"https?://[^\s\"'\\]+", url):
-        raise ConfigError(f"'{url}' is no address of a web page: accepted is one that begins with http:// or https://.")
+    if url:
+        check_page(url)
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
     if step_s is not None:
         given = _with_step(given, step_s)

@@ -88,7 +88,8 @@ def test_a_chip_of_qemu_answers_over_its_uart(
             code, report, _ = verified(capsys, export, f"tcp://{place[1]}" if place[1] else f"serial://{place[2]}")
         finally:
             qemu.kill()
-    assert code == 0 and report["passed"] and report["own"] and report["mismatches"] == 0 == report["max_abs_diff"]
+    assert code == 0 and report["passed"] and report["mismatches"] == 0 == report["max_abs_diff"]
+    assert report["own"] is None, "what the chip runs is not known"
     assert [s["name"] for s in report["streams"]] == ["golden", "patch"] and report["decisions"] > 30
     (run,) = report["runs"]
     assert run["vectors"] == sum(s["answers"] for s in report["streams"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,13 +15,13 @@ import pytest
 
 from plushsense.cli.export import verification_lines
 from plushsense.cli.main import main
-from plushsense.core.errors import BadInput, ToolError
+from plushsense.core.errors import BadInput, ConfigError, ToolError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.deploy.golden import EVENT, FAULT, HEALTH, PATCH, TRACKING, answers_of, column
-from plushsense.deploy.package import ARDUINO, package
+from plushsense.deploy.package import ARDUINO, IDF, SKETCH, package
 from plushsense.deploy.profile import profile
 from plushsense.deploy.proof.mutants import RULES, mutants_of, source_mutants
 from plushsense.deploy.proof.scenarios import all_outcomes, outcomes_of, scenarios_of
@@ -268,16 +269,69 @@ def test_a_file_edited_by_hand_is_what_is_tested(
     assert "'confidence' should be " in report["first"] and report["first"].count(".") == 1
 
 
-def test_changed_copies_in_the_packages_are_reported(
-    c_compiler: str, two_settings: None, own: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("path", "content"),
+    [
+        (f"{ARDUINO}/src/plushsense.c", None),
+        (f"{ARDUINO}/src/plush_wire.h", None),
+        (f"{ARDUINO}/src/deep/evil.cpp", "int x;"),
+        (f"{ARDUINO}/library.json", '{"build": {"extraScript": "evil.py"}}'),
+        (f"{IDF}/CMakeLists.txt", "execute_process(COMMAND evil)"),
+        (f"{IDF}/include/string.h", ""),
+        ("CMakeLists.txt", None),
+        ("zephyr/Kconfig", None),
+        ("string.h", ""),
+        ("plushsense.h.gch", ""),
+        ("export.json", None),
+    ],
+)
+def test_code_that_nobody_compiles_here_is_refused_too(own: Path, path: str, content: str | None) -> None:
+    """A folder is vouched for, and so is what others compile of it."""
+    package(own)
+    assert Export(own).changed == Export(own).edited == ()
+    (own / path).parent.mkdir(exist_ok=True)
+    before = (own / path).read_text(encoding="utf-8") if content is None else content
+    (own / path).write_text(before.replace('"model_id": ', '"model_id": 1') + "\n", encoding="utf-8")
+    export = Export(own)
+    assert path in export.changed and not export.edited
+    with pytest.raises(BadInput, match=re.escape(path)):
+        export.require_unchanged()
+
+
+def test_links_are_not_vouched_for_and_examples_are_there_to_be_edited(
+    c_compiler: str, two_settings: None, own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     package(own)
-    code, _, err = run(capsys, str(own), "--target", "host")
-    assert code == 0 and "copies" not in err
-    edit(own / ARDUINO / "src" / "plushsense.c", "toy->heard = 1;", "toy->heard = 2;")
+    reaction = f"{SKETCH}/plush_reaction.c"
+    (own / reaction).write_text("/* mine */", encoding="utf-8")
+    code, report, _ = run(capsys, str(own), "--target", "host")
+    assert (code, report["passed"], report["own"], report["changed"]) == (0, True, False, [reaction])
+    package(own)
+    shutil.move(own / "plushsense.c", tmp_path / "elsewhere.c")
+    (own / "plushsense.c").symlink_to(tmp_path / "elsewhere.c")
+    (own / "main.c").write_text("int main(void) { return 0; }", encoding="utf-8")  # no build file names it
     code, report, err = run(capsys, str(own), "--target", "host")
-    assert code == 0 and report["passed"], "what is proved are the originals"
-    assert f"these copies of them were changed: {ARDUINO}/src/plushsense.c" in err
+    assert code == 2 and "plushsense.c in " in err and "main.c" not in err
+
+
+def test_facts_of_an_export_are_those_of_its_model(own: Path) -> None:
+    """Also where `profile` reads them, which once took any that stood there."""
+    facts = json.loads((own / "export.json").read_text(encoding="utf-8"))
+    (own / "export.json").write_text(json.dumps({**facts, "step_ms": "soon", "span": -1}), encoding="utf-8")
+    export = Export(own)
+    assert export.changed == ("export.json",) and export.facts["step_ms"] == facts["step_ms"]
+    for text, why in (("[]", "holds no table"), ("[" * 100_000, "cannot be read"), ('"x"', "holds no table")):
+        (own / "export.json").write_text(text, encoding="utf-8")
+        with pytest.raises(BadInput, match=why):
+            Export(own)
+    (own / "export.json").write_text(json.dumps({**facts, "url": 'https://x"\n'}), encoding="utf-8")
+    with pytest.raises(ConfigError, match="no address"):
+        Export(own)
+    with (own / "plush_model.bin").open("r+b") as file:
+        file.truncate(1 << 40)
+    (own / "export.json").write_text(json.dumps(facts), encoding="utf-8")
+    with pytest.raises(BadInput, match="has more than"):
+        Export(own)
 
 
 def test_the_folders_own_header_is_what_the_caller_reads(c_compiler: str, own: Path) -> None:
@@ -326,10 +380,10 @@ def test_an_edited_model_that_agrees_with_its_golden_vectors_is_not_vouched_for(
     (own / "plush_model.bin").write_bytes(whole)
     edit(own / "export.json", '"smoothing": ', '"smoothing": 1')
     assert main(["verify", str(own), "--target", "host"]) == 2
-    assert "plush_model.bin in " in capsys.readouterr().err
+    assert "plush_model.bin, export.json in " in capsys.readouterr().err
     assert main(["verify", str(own), "--target", "host", "--trust"]) == 0
     # The header holds the checksum of the image.
-    named = "plush_model.h, plush_model.c, plush_model.bin"
+    named = "plush_model.h, plush_model.c, plush_model.bin, export.json"
     assert f"NOT OURS: {named} are not what this PlushSense writes" in capsys.readouterr().out
     edit(own / "export.json", '"smoothing": ', '"smoothing": true, "was": ')
     assert main(["verify", str(own), "--target", "host"]) == 2
@@ -389,10 +443,10 @@ def test_a_header_beside_the_export_is_not_compiled(
     ran = tmp_path / "ran"
     header = f"#pragma once\n#pragma GCC system_header\n#include_next <string.h>\n{PLANTED % ran}"
     (own / "string.h").write_text(header, encoding="utf-8")
-    code, report, _ = run(capsys, str(own), "--target", "host")
+    code, report, _ = run(capsys, str(own), "--target", "host", "--trust")
     assert not ran.exists()
-    assert (code, report["own"], report["changed"]) == (0, True, [])
-    profile(own, ["host"])
+    assert (code, report["own"], report["changed"]) == (0, False, ["string.h"])
+    profile(own, ["host"], trust=True)
     assert not ran.exists()
 
 

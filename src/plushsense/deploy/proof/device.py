@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 from plushsense.core.errors import DeviceError
 from plushsense.deploy.proof.vectors import Export, RowComparison, Vectors, compare, counted
-from plushsense.deploy.proof.verify import Cycles, Progress, SettingResult, VerificationReport
+from plushsense.deploy.proof.verify import CHIP, Cycles, Progress, SettingResult, VerificationReport
 from plushsense.devices.bytestreams import Link, open_link
 from plushsense.runtime.image import image_check
 
@@ -139,7 +139,7 @@ def verify_device(
     ]
     scenarios = [*export.patched(), *export.scenarios()]
     run = SettingResult(
-        "device",
+        CHIP,
         url,
         f"counter {chip.counter}" if chip.counter else "no counter",
         sum(r.vectors for r in results),
@@ -150,7 +150,7 @@ def verify_device(
         _cycles(chip, measured, fitting),
     )
     decisions = sum(v.decisions for v in fitting if v not in scenarios)
-    return VerificationReport(export.title, (), decisions, counted(fitting), (run,), tuple(not_run), ())
+    return VerificationReport(export.title, export.edited, decisions, counted(fitting), (run,), tuple(not_run), ())
 
 
 def _greet(packets: _PacketLink, export: Export) -> _DeviceInfo:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ConfigError, nearest
+from plushsense.core.files import read_bytes
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.store import Dataset
@@ -21,12 +23,16 @@ from plushsense.deploy.emit import (
     GOLDEN,
     IMAGE,
     LIBRARY,
+    MOST_FILE_BYTES,
+    check_page,
     code_files,
+    facts_of,
     prefixed,
     read_facts,
     without_prefix,
 )
 from plushsense.deploy.golden import COLUMNS, HEAD, TRACKING, answers_of, column, golden_frames, read_golden
+from plushsense.deploy.package import foreign_files, package_files
 from plushsense.deploy.proof.scenarios import patches_of, scenarios_of
 from plushsense.deploy.quantize import integer_model
 from plushsense.models.bundle import Bundle
@@ -160,7 +166,11 @@ def counted(streams: Sequence[Vectors]) -> tuple[Counts, ...]:
 class Export:
     """Export folder, opened for verification. The C of an export with a name is compiled without its prefix.
 
-    ``changed`` names the library and model files that differ from what this version writes for the bundle.
+    Attributes:
+        changed: files that are not what this version writes for the bundle: the library and the model, their copies
+            and other files in the packages (links, too), the facts, and further files that a compiler would find there.
+        edited: such files of the examples, which are there to be changed.
+        facts: those of the model, name and page; never other values that ``export.json`` may hold.
 
     Raises:
         BadInput: if it is no export, lacks a file, or its golden vectors do not fit its model.
@@ -179,10 +189,21 @@ class Export:
         self.model: IntegerModel = replace(model, smoothing=smoothing)
         self._code = code_files(self.model, self.bundle)
         name = str(facts.get("name", ""))
-        files = {file: self._require_file(prefixed(file, name)).read_bytes() for file in self._code}
-        expected = {f: c if f == IMAGE else prefixed(c.decode(), name).encode() for f, c in self._code.items()}
-        self.changed = tuple(prefixed(file, name) for file in files if files[file] != expected[file])
+        files = {file: self._read_file(prefixed(file, name)) for file in self._code}
+        expected = {
+            prefixed(f, name): c if f == IMAGE else prefixed(c.decode(), name).encode() for f, c in self._code.items()
+        }
+        self.facts = facts_of(self.model, self.bundle, self._code[IMAGE]) | ({"name": name} if name else {})
+        if "url" in facts:
+            check_page(facts["url"])
+            self.facts["url"] = facts["url"]
+        expected |= package_files(self.bundle, self.facts, self._code)
+        changed, self.edited = foreign_files(self.folder, expected, name)
+        written = json.loads(json.dumps(self.facts))
+        self.changed = (*changed, *([FACTS] if any(facts.get(key) != written[key] for key in written) else []))
+        compiled = {prefixed(file, name) for file in files} & set(self.changed)
         self._files = {f: c if f == IMAGE else without_prefix(c, name) for f, c in files.items()} if name else None
+        self._compiles_changed = bool(compiled)
         self.image, self.source = files[IMAGE], without_prefix(files[LIBRARY[1]], name)
         self._scenarios: dict[int, list[Vectors]] = {}
         self._patched: Vectors | None = None
@@ -208,26 +229,33 @@ class Export:
             raise BadInput(message, reason="export_damaged", name=self.folder.name)
         return path
 
+    def _read_file(self, name: str) -> bytes:
+        try:
+            return read_bytes(self._require_file(name), MOST_FILE_BYTES)
+        except OSError as cause:
+            message = f"'{self.folder / name}' cannot be read ({cause.strerror}): export the model again."
+            raise BadInput(message, reason="export_damaged", name=self.folder.name) from None
+
     def require_unchanged(self) -> None:
-        """Raise BadInput if a C or model file was changed, as running changed code is not safe."""
+        """Raise BadInput if files were changed, as running changed code is not safe, and vouching for it not honest."""
         if self.changed:
             one = len(self.changed) == 1
             raise BadInput(
                 f"{', '.join(self.changed)} in '{self.folder}' {'is' if one else 'are'} not what this PlushSense "
-                f"writes for {BUNDLE}, and nothing was compiled: export the model again, or give --trust to compile "
-                f"and run {'it' if one else 'them'} on this computer all the same.",
+                f"writes for {BUNDLE}, and nothing was compiled: export the model again, or give --trust to verify the "
+                "folder all the same, which runs its C on this computer.",
                 reason="export_changed",
                 files=", ".join(self.changed),
             )
 
     def code(self, room: Path) -> Path:
-        """Return the folder to compile from: the new folder ``room``, or the export itself if files in it were changed
-        and it has no name.
+        """Return the folder to compile from: the new folder ``room``, or the export itself if its C was changed and it
+        has no name.
 
         Unchanged files are written to ``room``, so that the compiler finds no other file of the export, such as a
         ``string.h`` or a precompiled header.
         """
-        if self.changed and self._files is None:
+        if self._compiles_changed and self._files is None:
             return self.folder
         room.mkdir(parents=True)
         for name, content in (self._files or self._code).items():

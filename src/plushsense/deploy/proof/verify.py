@@ -1,6 +1,6 @@
 """Verify that the C in an export folder gives exactly the results of the integer model in Python.
 
-The C and model files in the folder must be those that this version writes, unless ``trust`` is given. Golden vectors
+The files in the folder must be those that this version writes, unless ``trust`` is given. Golden vectors
 and test scenarios (`plushsense.deploy.proof.scenarios`) are always run; recordings or further generated frames are
 optional. Every number of every answer, change of an event and change of sensor health is compared.
 """
@@ -34,6 +34,7 @@ STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g")
 HARNESS = C_FOLDER / "harness.c"
 MORE_SCENARIOS = 3
+CHIP = "device"  # the target of the result of a connected chip
 _ENCODING = "latin-1"  # reads any bytes
 
 
@@ -135,9 +136,9 @@ class MutantResult:
 class VerificationReport:
     """Result of a verification; ``passed`` if nothing differs and all mutants that affect the model were caught.
 
-    ``decisions`` counts the answers after the warm-up, of which there must be some. ``changed`` names the C and model
-    files that differ from what this version writes for the bundle. Then ``own`` is False, and ``passed`` means only
-    that the files agree with the vectors.
+    ``decisions`` counts the answers after the warm-up, of which there must be some. ``changed`` names the files of the
+    folder that are not what this version writes for the bundle, also in packages and examples. Then ``own`` is False,
+    and ``passed`` means only that the C that was compiled agrees with the vectors.
     """
 
     title: str
@@ -149,9 +150,12 @@ class VerificationReport:
     mutants: tuple[MutantResult, ...]
 
     @property
-    def own(self) -> bool:
-        """Whether the compiled files are those that this version writes for the bundle."""
-        return not self.changed
+    def own(self) -> bool | None:
+        """Whether all code in the folder is what this version writes for the bundle.
+
+        None for a chip, whose program cannot be read from here, unless it is known that files were changed.
+        """
+        return False if self.changed else None if any(r.target == CHIP for r in self.runs) else True
 
     @property
     def mismatches(self) -> int:
@@ -205,7 +209,8 @@ def verify(
         mutants: selects the mutants to apply, one at a time; each must be detected on every target. None: no mutants.
             For undetected mutants of the rules, new scenarios are generated, up to `MORE_SCENARIOS` times.
         only: which settings of a target to run.
-        trust: also compile and run C and model files that differ from what this version writes.
+        trust: also compile and run C and model files that differ from what this version writes, and verify a folder
+            with other files that do.
         jobs: number of programs at a time; None: one per core.
 
     Raises:
@@ -271,9 +276,8 @@ def verify(
                 results[at] = outcome
     all_vectors = [v for stream in streams for v in stream]
     decisions = sum(v.decisions for v in all_vectors if v not in scenarios)
-    return VerificationReport(
-        export.title, export.changed, decisions, counted(all_vectors), tuple(runs), tuple(not_run), tuple(results)
-    )
+    changed, counts = (*export.changed, *export.edited), counted(all_vectors)
+    return VerificationReport(export.title, changed, decisions, counts, tuple(runs), tuple(not_run), tuple(results))
 
 
 def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[list[Setting], list[tuple[str, str]]]:

@@ -290,8 +290,7 @@ class VerificationCard:
             sentences.append(words("export.fault_missed"))
         if not result["own"]:
             sentences.append(words("export.not_own"))
-        if result["changed_copies"]:
-            sentences.append(words("export.changed_copies", files=", ".join(result["changed_copies"])))
+            sentences.append(words("export.changed_files", files=", ".join(result["changed"])))
         return sentences
 
     def _mutants(self, faults: Sequence[dict[str, Any]]) -> None:
