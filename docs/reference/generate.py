@@ -145,8 +145,8 @@ FILES = {
     ),
     "grid": FileKind(
         "Grid file: many networks to compare",
-        "A grid lists the networks and settings that [`sweep`](../sweep.md) and [`search`](../network-search.md) train and "
-        "compare: `--grid FILE`. The table `[grid]` must be there, its keys may be left out; `[search]` is for "
+        "A grid lists the networks and settings that [`sweep`](../sweep.md) and [`search`](../network-search.md) train "
+        "and compare: `--grid FILE`. The table `[grid]` must be there, its keys may be left out; `[search]` is for "
         "`search` alone.",
         {"grid": GridSpec, "search": SearchSpec, "search.space": Space},
         _read_grid,

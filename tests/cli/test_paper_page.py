@@ -21,8 +21,8 @@ ROOT = Path(__file__).parents[2]
 PAGE, TUTORIAL = ROOT / "docs" / "paper.md", ROOT / "docs" / "tutorial.md"
 VERDICTS = ("better", "equal", "not possible here", "weaker")
 
-# What makes a command small: three people instead of 25, one epoch, and no processes that would each load PyTorch (those
-# of `stream-eval` and of `examples/paper.py` remain).
+# What makes a command small: three people instead of 25, one epoch, and no processes that would each load PyTorch
+# (those of `stream-eval` and of `examples/paper.py` remain).
 SMALL = {
     "simulate": {"--people": "3", "--repetitions": "1"},
     "train": {"--epochs": "1"},

@@ -4,12 +4,14 @@ import hashlib
 import json
 import os
 import random
+import shutil
 import stat
 import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -270,6 +272,35 @@ def test_what_a_killed_run_left_goes_with_the_next(folder: Path, tmp_path: Path,
     assert left.name.startswith(f".{Path(arguments[1]).name}-unfinished-")
     backup(folder, place / "c.zip")
     assert sorted(p.name for p in place.iterdir()) == ["a.zip", "c.zip"]
+
+
+def test_a_backup_that_needs_more_room_than_there_is_is_not_restored(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backup(folder, tmp_path / "a.zip")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
+    with pytest.raises(DatasetError, match="make room"):
+        restore(tmp_path / "a.zip", tmp_path / "again")
+    assert not (tmp_path / "again").exists()
+
+
+def test_who_is_removed_between_the_last_look_and_the_end_is_in_no_backup(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = os.fsync
+
+    def slow(descriptor: int) -> None:
+        real(descriptor)
+        monkeypatch.undo()
+        forget(folder, "ana")
+
+    def last(done: int, total: int) -> None:
+        if done == total:
+            monkeypatch.setattr(os, "fsync", slow)
+
+    with pytest.raises(ForgottenError):
+        backup(folder, tmp_path / "b.zip", progress=last)
+    assert not list(tmp_path.glob("*.zip"))
 
 
 def test_who_is_removed_meanwhile_is_in_no_backup(folder: Path, tmp_path: Path) -> None:

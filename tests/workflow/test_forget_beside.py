@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+import tempfile
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -188,3 +191,67 @@ def test_the_command_says_so_and_forget_can_be_given_again(
     assert (found["evaluations"], found["leftovers"]) == (["evaluations/old"], ["../.DS-unfinished-abc"])
     assert found["absent"] and found["done"] and not left.exists()
     assert (folder / "forgotten.jsonl").read_bytes() == stones
+
+
+def test_no_byte_of_the_person_is_left_that_is_not_listed(
+    folder: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A studio's folder in use: everything that was made of the data is removed by `forget`, or listed by it."""
+    home, scratch = folder.parent / "home", folder.parent / "tmp"
+    dataset = home / "datasets" / "DS"
+    shutil.copytree(folder, dataset)
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    net = {"filters": (2, 3, 3), "context": "loop", "epochs": 1}
+    (home / "bundles").mkdir()
+    trained = ps.train(dataset, journal=unfinished(dataset), fit_decisions=False, **net)
+    trained.save(home / "bundles" / "m.plush")
+    ps.evaluate(dataset, split="by-subject:2", out=dataset / "results" / "mine", workers=1, **net)
+    shutil.copytree(dataset / "results" / "mine", dataset / "evaluations" / "mine")
+    assert cli("backup", dataset, home / "backups" / "b.zip").status == 0
+    assert cli("pseudonymise", dataset, home / "copy", "--key", home / "key.csv").status == 0
+    shutil.copytree(folder.parent / "src" / PERSON, home / "recordings" / PERSON)
+    shutil.copytree(folder.parent / "src" / PERSON, home / "discarded" / "recordings" / PERSON)
+    for place, text in {
+        f"feedback/{PERSON}.jsonl": "{}",
+        "work/job.json": json.dumps({"sessions": [f"recordings/{PERSON}/1"]}),
+        "selections/a.json": json.dumps([f"{PERSON}/Slow_1"]),
+        "studio.log": f"12:00 recording {PERSON}",
+        "datasets/DS/notes.yaml": f"late: {PERSON}",
+        "datasets/.DS-unfinished-1/raw.csv": PERSON,
+        "datasets/.DS-unfinished-1/owner.lock": "",
+        "datasets/DS/cache/adding-1/raw.csv": PERSON,
+        "datasets/DS/.marks.jsonl.1.part": PERSON,
+    }.items():
+        (home / place).parent.mkdir(parents=True, exist_ok=True)
+        (home / place).write_text(text)
+    shutil.copytree(home / "datasets" / ".DS-unfinished-1", scratch / ".plushsense-unfinished-1")
+    before = {where.split("/")[0] for where in bytes_of(home)}
+    assert {"backups", "bundles", "copy", "datasets", "discarded", "feedback", "key.csv", "work"} - before == {"copy"}
+    done = cli("forget", dataset, PERSON, "--yes", "--json").json
+    listed = [dataset / at for at in done["mentions"]] + [Path(b["bundle"]) for b in done["bundles"]]
+    listed += map(Path, (*done["feedback"], *done["discarded"], *done["elsewhere"]))
+    left = [home / where for where in bytes_of(home)]
+    assert [path for path in left if not {path, *path.parents} & set(listed)] == []
+    assert not bytes_of(scratch) and not list(scratch.iterdir())
+    results = [f"results/mine/{name}" for name in ("evaluation.json", "predictions.parquet")]
+    assert sorted(bytes_of(dataset)) == ["notes.yaml", *results]
+    for path in listed:
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    assert bytes_of(home) == []
+    assert open_dataset(dataset).subjects == ["P1", "P3", "P4", "P5"]
+
+
+def bytes_of(folder: Path) -> list[str]:
+    """Files below a folder with the person in their path or in any byte, also of what zips and Parquet files hold."""
+    found = []
+    for path in (p for p in folder.rglob("*") if p.is_file()):
+        where, data = path.relative_to(folder).as_posix(), [path.read_bytes()]
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                data += [member.encode() + archive.read(member) for member in archive.namelist()]
+        elif path.suffix == ".parquet":
+            data.append(polars.read_parquet(path).write_csv().encode())
+        if PERSON in where or any(PERSON.encode() in each for each in data):
+            found.append(where)
+    return found

@@ -86,9 +86,11 @@ def _removal_lines(result: Forgotten) -> list[str]:
     if len(plan.files) > _MOST_FILES:
         lines.append(f"  … and {len(plan.files) - _MOST_FILES} more files")
     lines += [f"contains the code or cannot be read, check it: {path}" for path in plan.mentions]
+    lines += [f"a running program uses it, and removes it when it ends: {path}" for path in plan.running]
     lines += [f"bundle: {b.bundle}: {b.message}" for b in result.bundles]
     lines += [f"corrections of this code, delete them: {path}" for path in result.feedback]
     lines += [f"discarded recordings of this code, delete them: {path}" for path in result.discarded]
+    lines += [f"contains the code or cannot be read, check it: {path}" for path in result.elsewhere]
     if plan.published:
         lines.append(f"published as https://doi.org/{plan.published}: publish a new version without them")
     lines.append(

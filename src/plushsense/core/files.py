@@ -9,6 +9,7 @@ import secrets
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -110,7 +111,13 @@ def write_file(path: Path, content: str | bytes, *, private: bool = False) -> No
 
 
 @contextlib.contextmanager
-def replacing_file(path: Path, *, private: bool = False, within: Path | None = None) -> Iterator[Path]:
+def replacing_file(
+    path: Path,
+    *,
+    private: bool = False,
+    within: Path | None = None,
+    finishing: Callable[[], AbstractContextManager[None]] = nullcontext,
+) -> Iterator[Path]:
     """Yield a path beside ``path`` to write to; it replaces ``path`` when the block ends without an exception.
 
     Readers see either the old file or the new one, even after a power failure or with several writers at once. After
@@ -119,6 +126,8 @@ def replacing_file(path: Path, *, private: bool = False, within: Path | None = N
     Args:
         private: make the file readable by its owner only (mode 600, where the system has file modes).
         within: a folder on the same disk in which to write instead, such as a `work_folder` for large files.
+        finishing: returns a context manager around the replacement, such as `dataset.store.Generation.writing`; what
+            it raises prevents the replacement.
 
     Raises:
         OSError: when the file cannot be written; on Windows also while another program has ``path`` open.
@@ -130,7 +139,7 @@ def replacing_file(path: Path, *, private: bool = False, within: Path | None = N
         yield part
         with part.open("rb+") as file:
             os.fsync(file.fileno())
-        with syncing_folder(path.parent) as sync:
+        with syncing_folder(path.parent) as sync, finishing():
             os.replace(part, path)
             sync()
     finally:
@@ -170,11 +179,16 @@ def syncing_folder(folder: Path) -> Iterator[Callable[[], None]]:
 
 
 @contextlib.contextmanager
-def new_folder(dest: Path, error: type[BadInput], last: str = "") -> Iterator[Path]:
+def new_folder(
+    dest: Path,
+    error: type[BadInput],
+    last: str = "",
+    finishing: Callable[[], AbstractContextManager[None]] = nullcontext,
+) -> Iterator[Path]:
     """Yield a folder in a `work_folder` that becomes ``dest`` when the block ends, and is deleted after an exception.
 
     If ``dest`` is an existing empty folder (such as ``.``, or a link to one), the files are moved into it, with the
-    file ``last`` moved last.
+    file ``last`` moved last. ``finishing`` is as in `replacing_file`, around the moves.
 
     Raises:
         error: when ``dest`` exists and is not an empty folder, or cannot be written.
@@ -191,11 +205,12 @@ def new_folder(dest: Path, error: type[BadInput], last: str = "") -> Iterator[Pa
             work = scratch / (real.name or "folder")
             work.mkdir()
             yield work
-            if real.is_dir():
-                for entry in sorted(work.iterdir(), key=lambda p: p.name == last):
-                    os.replace(entry, real / entry.name)
-            else:
-                os.replace(work, real)
+            with finishing():
+                if real.is_dir():
+                    for entry in sorted(work.iterdir(), key=lambda p: p.name == last):
+                        os.replace(entry, real / entry.name)
+                else:
+                    os.replace(work, real)
             with syncing_folder(real.parent) as sync:
                 sync()
     except OSError as cause:

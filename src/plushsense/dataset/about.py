@@ -119,6 +119,10 @@ class Funding:
     funder: str
     award: str = ""
 
+    def __post_init__(self) -> None:
+        if not self.funder.strip():
+            raise DatasetError("a funding has no funder: name one.", reason="funding_without_funder")
+
 
 @dataclass(frozen=True)
 class About:

@@ -94,7 +94,8 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
             "hash": source.hash,
             "files": files,
         }
-        with work_folder(target) as work, replacing_file(target, within=work) as part:
+        finishing = source.generation.writing
+        with work_folder(target) as work, replacing_file(target, within=work, finishing=finishing) as part:
             with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
                 for path in paths:
                     files.append(_store(archive, folder, path))
@@ -103,7 +104,6 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
                 text = json.dumps(manifest, ensure_ascii=False, indent=0) + "\n"
                 archive.writestr(zip_entry(MANIFEST), text.encode("utf-8"))
             _verify(part, lambda n: report(total // 2 + n, total))
-            source.generation.check()
             if target.exists():
                 message = f"'{target}' appeared meanwhile: a backup never replaces another; give a new name."
                 raise DatasetError(message, reason="name_exists", name=target.name)
@@ -154,7 +154,7 @@ def restore(
     path, folder = Path(file), Path(dest)
     with _open_backup(path) as (archive, manifest):
         total = sum(entry["bytes"] for entry in manifest["files"])
-        (limits or UnpackLimits()).check(path, len(manifest["files"]), total)
+        (limits or UnpackLimits()).check(path, len(manifest["files"]), total, folder)
         done = 0
         with new_folder(folder, DatasetError, last=HEAD) as work:
             for entry in manifest["files"]:

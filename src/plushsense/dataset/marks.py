@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from filelock import FileLock
+from filelock import FileLock, Timeout
 
 from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.toml import load_table, loads_json
 
 MARKS = "marks.jsonl"
 BY_HAND, SUGGESTED = "hand", "suggested"
-_LOCK_S = 30.0
+LOCK = MARKS + ".lock"
+"""Lock file of a data set, see `locked`."""
+# Much longer than it takes to delete a large cache on a slow disk.
+_LOCK_S = 600.0
+_MARKS_S = 30.0
 ACTIONS = ("trim", "untrim", "exclude", "include", "accept", "unaccept", "label", "unlabel", "relabel")
 HANDLING, REST, PRACTICE = "handling", "rest", "practice:"
 """Labels of a stretch; the name of a gesture follows `PRACTICE`."""
@@ -150,6 +155,48 @@ def mark_line(mark: Mark) -> str:
     return json.dumps(table, ensure_ascii=False) + "\n"
 
 
+@contextmanager
+def locked(folder: Path, timeout_s: float = _LOCK_S) -> Iterator[None]:
+    """Hold the lock of a data set while its files are written or removed; do not nest.
+
+    On a read-only disk, or one without locks, nothing is locked.
+
+    Raises:
+        DatasetError: if another program holds the lock for longer than ``timeout_s``.
+    """
+    lock = FileLock(folder / LOCK, timeout=timeout_s)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise DatasetError(
+            f"Another program has held '{folder / LOCK}' for {timeout_s:.0f} s: wait for it or end it.",
+            reason="dataset_locked",
+            folder=folder.name,
+        ) from None
+    except (OSError, NotImplementedError):
+        pass
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextmanager
+def adding_locked(folder: Path) -> Iterator[None]:
+    """Hold the lock of an import into a data set, which keeps copies of raw files in it; on a read-only disk nothing.
+
+    Raises:
+        Timeout: if an import, or a removal, holds the lock.
+    """
+    lock = FileLock(folder / "adding.lock", timeout=0)
+    with suppress(PermissionError, NotImplementedError):
+        lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()
+
+
 def append_marks(folder: Path, marks: Iterable[Mark], check: Callable[[], None] | None = None) -> None:
     """Append marks under a file lock, so that several programs can write marks at the same time.
 
@@ -164,7 +211,7 @@ def append_marks(folder: Path, marks: Iterable[Mark], check: Callable[[], None] 
     if not marks:
         return
     try:
-        with FileLock(folder / (MARKS + ".lock"), timeout=_LOCK_S):
+        with locked(folder, _MARKS_S):
             if check is not None:
                 check()
             write_marks(folder, marks)

@@ -18,6 +18,7 @@ import hashlib
 import html
 import io
 import json
+import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import MISSING, dataclass, field, fields, replace
@@ -26,7 +27,6 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import tomli_w
-from filelock import FileLock, Timeout
 
 from plushsense.core.errors import DatasetError, FileFormatError, ForgottenError
 from plushsense.core.files import write_file
@@ -35,7 +35,7 @@ from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames, ReadResult, read_recording, read_stream
 from plushsense.core.toml import load_table, read_toml
 from plushsense.dataset.about import About, HeadFile
-from plushsense.dataset.marks import MARKS, LabelledStretch, Mark, MarkState, append_marks, read_marks
+from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, append_marks, locked, read_marks
 
 FORMAT_VERSION = 1
 HEAD = "dataset.toml"
@@ -45,9 +45,6 @@ PEOPLE = "subjects.csv"
 UNKNOWN_SUBJECT = "unknown"
 FORGOTTEN = "forgotten.jsonl"
 UNDER_WAY = "forgetting.json"
-LOCK = MARKS + ".lock"
-# Much longer than it takes to delete a large cache on a slow disk.
-_LOCK_S = 600.0
 PEOPLE_COLUMNS = {
     "subject": "code of the person, never a name; must be there, each code once",
     "age_group": "age group, such as child",
@@ -79,7 +76,14 @@ class Generation:
             return cls(folder, 0)
 
     def check(self) -> None:
-        """Raise ForgottenError if a person has been removed since, or a removal is not finished."""
+        """Raise ForgottenError if a person has been removed since, or is being removed, or the data set is gone."""
+        if not (self.folder / HEAD).is_file():
+            raise ForgottenError(
+                f"The data set '{self.folder}' was moved or deleted while this ran, so its results were not written: "
+                "run it again on the data set where it is now.",
+                reason="dataset_moved",
+                folder=self.folder.name,
+            )
         if self.of(self.folder) != self:
             raise ForgottenError(
                 f"A person was removed from '{self.folder}' (plushsense forget) while this ran, so its results were "
@@ -97,30 +101,17 @@ class Generation:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Hold the data set's lock while derived data is written, after `check`; do not nest.
-
-        On a read-only disk, or one without locks, only `check` is called.
+        """Hold the data set's lock (`locked`) while derived data is written, after `check`; do not nest.
 
         Raises:
             ForgottenError: like `check`.
             DatasetError: if another program holds the lock for too long.
         """
-        lock = FileLock(self.folder / LOCK, timeout=_LOCK_S)
-        try:
-            lock.acquire()
-        except Timeout:
-            raise DatasetError(
-                f"Another program has held '{self.folder / LOCK}' for {_LOCK_S / 60:.0f} minutes: end it first.",
-                reason="dataset_locked",
-                folder=self.folder.name,
-            ) from None
-        except (OSError, NotImplementedError):
-            pass
-        try:
+        # The lock file would create the folder again.
+        self.check()
+        with locked(self.folder):
             self.check()
             yield
-        finally:
-            lock.release()
 
 
 def writing_around(path: Path) -> Callable[[], AbstractContextManager[None]]:
@@ -254,6 +245,16 @@ class DatasetHead:
     simulated: bool = False
     about: About = field(default_factory=About)
 
+    def __post_init__(self) -> None:
+        named = {key: getattr(self, key) for key in ("name", "version", "licence", "consent", "source")}
+        for key, text in _texts_by_key(named | {"about": self.about.to_table()}):
+            if found := _NO_XML.search(text):
+                raise DatasetError(
+                    f"'{key}' of the data set holds the control character U+{ord(found.group()):04X}: remove it.",
+                    reason="head_control",
+                    key=key,
+                )
+
     def to_toml(self) -> str:
         """Return the text of ``dataset.toml``."""
         table = {
@@ -298,6 +299,22 @@ class DatasetHead:
         }
         del values["gesture_set"]
         return cls(**values)
+
+
+# What no metadata file in XML can hold.
+_NO_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def _texts_by_key(value: object, key: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the texts in tables and lists with their keys, such as ``about.creators[0].name``."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _texts_by_key(inner, f"{key}.{name}" if key else name)
+    elif isinstance(value, list | tuple):
+        for n, inner in enumerate(value):
+            yield from _texts_by_key(inner, f"{key}[{n}]")
+    elif isinstance(value, str):
+        yield key, value
 
 
 class Dataset:

@@ -7,15 +7,14 @@ import html
 import os
 import secrets
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plushsense.core.errors import BundleError, ConfigError, DatasetError
-from plushsense.core.files import write_file
 from plushsense.core.sentences import Sentence
-from plushsense.dataset.index import as_dataset, open_dataset
-from plushsense.dataset.privacy.forget import RemovalPlan, plan_removal
+from plushsense.dataset.index import as_dataset, change_head, open_dataset
+from plushsense.dataset.privacy.forget import RemovalPlan, find_mentions, plan_removal
 from plushsense.dataset.privacy.forget import forget as remove_person
 from plushsense.dataset.publishing.checking import StageProgress
 from plushsense.dataset.publishing.contents import PublishOptions, public_codes
@@ -30,7 +29,7 @@ from plushsense.dataset.publishing.package import (
 from plushsense.dataset.quality import checking
 from plushsense.dataset.quality.checking import CheckReport, check
 from plushsense.dataset.quality.findings import CheckLimits
-from plushsense.dataset.store import HEAD, Dataset, DatasetHead, Progress
+from plushsense.dataset.store import Dataset, DatasetHead, Progress
 from plushsense.evaluation.reidentification import reidentify, report, verdict
 from plushsense.live.feedback import FOLDER
 from plushsense.models.bundle import Bundle
@@ -211,10 +210,12 @@ def publish_dataset(
     )
     if save:
         try:
-            write_file(dataset.path / HEAD, head.to_toml())
-        except OSError as cause:
+            change_head(
+                dataset.path, lambda now: replace(now, licence=head.licence, consent=head.consent, about=head.about)
+            )
+        except DatasetError as cause:
             # The package is complete: this is only a warning.
-            why = cause.strerror or str(cause)
+            why = cause.values.get("why", str(cause))
             message = f"licence, contact and consent could not be written into '{dataset.path}': {why}"
             done.warnings.append(Sentence(message, "statements_not_kept", why=why))
     return done
@@ -264,7 +265,8 @@ class Forgotten:
     """The files that were removed from a data set (``done``) or would be, and what else holds the person's data.
 
     ``bundles`` were trained on the person; ``feedback`` are files of the studio with corrections of this code, and
-    ``discarded`` folders of recordings that were discarded there.
+    ``discarded`` folders of recordings that were discarded there. ``elsewhere`` are other files and folders in the same
+    places that contain the code or cannot be read.
     """
 
     plan: RemovalPlan
@@ -273,6 +275,7 @@ class Forgotten:
     dataset: str
     feedback: list[str] = field(default_factory=list)
     discarded: list[str] = field(default_factory=list)
+    elsewhere: list[str] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -283,6 +286,7 @@ class Forgotten:
             "bundles": [vars(b) for b in self.bundles],
             "feedback": self.feedback,
             "discarded": self.discarded,
+            "elsewhere": self.elsewhere,
         }
 
 
@@ -296,15 +300,17 @@ def forget(
     """Remove a person from a data set permanently; without ``confirm``, only list what would be removed.
 
     Args:
-        bundles: folders or files to search for models trained on the person, for corrections of the person and for
-            recordings discarded in the studio, besides the data set's folder and the studio's folder that it lies in.
-            They are only listed; the user must train the models again, and delete the old ones and the rest.
+        bundles: folders or files to search for models trained on the person, for corrections of the person, for
+            recordings discarded in the studio and for anything else that contains the code, besides the data set's
+            folder and the studio's folder that it lies in. They are only listed; the user must train the models again,
+            and delete the old ones and the rest.
 
     Raises:
         DatasetError: when the person is not in the data set.
     """
     folder = Path(dataset)
     plan = plan_removal(folder, subject)
+    bundles = list(bundles)
     places = [folder, *map(Path, bundles)]
     trained = trained_on(folder, subject, places)
     homes = {place.resolve() for place in [*places, folder.resolve().parent.parent]}
@@ -312,9 +318,15 @@ def forget(
     code = glob.escape(subject)
     patterns = (f"recordings/{code}", f"datasets/*/recordings/{code}")
     discarded = sorted(str(p) for home in homes for pattern in patterns for p in (home / "discarded").glob(pattern))
+    inside = folder.resolve()
+    studio = [inside.parent.parent] if inside.parent.name == "datasets" else []
+    searched = dict.fromkeys(place for p in bundles if (place := Path(p).resolve()).is_dir() and place not in studio)
+    listed = {Path(path).resolve() for path in (*feedback, *discarded, *(b.bundle for b in trained))}
+    found = find_mentions([*studio, *searched], subject, inside)
+    elsewhere = sorted({str(p) for p in found if not listed & {p.resolve(), *p.resolve().parents}})
     if confirm:
         plan = remove_person(folder, subject)
-    return Forgotten(plan, trained, confirm, str(folder), feedback, discarded)
+    return Forgotten(plan, trained, confirm, str(folder), feedback, discarded, elsewhere)
 
 
 def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[TrainedOn]:

@@ -114,8 +114,7 @@ def to_hugging_face(dataset: Dataset, folder: str | os.PathLike[str]) -> list[Pa
         DatasetError: if ``folder`` exists and is not empty; ForgottenError: like `Generation.check`.
     """
     polars = need("polars", "tables")
-    writing = dataset.generation.writing()
-    with writing, new_folder(Path(folder), DatasetError) as work:
+    with new_folder(Path(folder), DatasetError, finishing=dataset.generation.writing) as work:
         tables: dict[str, list[tuple[_Part, str | list[str]]]] = {
             RECORDINGS_TABLE: [(part, part.cuts[0][0]) for part in _recordings(dataset, located=True)],
             STREAMS_TABLE: [(part, _labels(part)) for part in _streams(dataset)],
@@ -183,8 +182,7 @@ def to_xdf(dataset: Dataset, folder: str | os.PathLike[str]) -> list[Path]:
         DatasetError: if ``folder`` exists and is not empty; ForgottenError: like `Generation.check`.
     """
     files = []
-    writing = dataset.generation.writing()
-    with writing, new_folder(Path(folder), DatasetError) as work:
+    with new_folder(Path(folder), DatasetError, finishing=dataset.generation.writing) as work:
         for part in [*_streams(dataset), *_recordings(dataset, located=False)]:
             stem = part.id.removeprefix(f"{part.subject}/").replace("/", "-")
             name = Path(part.subject) / f"{stem}.xdf"

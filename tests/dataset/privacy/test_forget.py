@@ -19,13 +19,13 @@ from plushsense.core.files import temporary_folder, work_folder
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset import index
-from plushsense.dataset.importing import adding
+from plushsense.dataset.importing import adding, importers
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.marks import MARKS, Mark, append_marks, read_marks
+from plushsense.dataset.marks import LOCK, MARKS, Mark, adding_locked, append_marks, read_marks
 from plushsense.dataset.privacy import forget as room
 from plushsense.dataset.privacy.forget import FORGOTTEN, UNDER_WAY, RemovalRecord, forget, plan_removal, read_removals
-from plushsense.dataset.store import LOCK, read_people, writing_around
+from plushsense.dataset.store import read_people, writing_around
 
 ACCEL = load_layout("accel-3")
 INDEX = {"recordings.csv", "streams.csv", "index.json"}
@@ -128,7 +128,7 @@ def test_all_of_one_person_goes_and_nothing_of_another(folder: Path) -> None:
     }
     assert not (folder / "recordings" / "P1").exists()
     same = {f for f in after if f in before and after[f] == before[f]}
-    assert set(after) - same == INDEX | {MARKS, "subjects.csv", FORGOTTEN}
+    assert set(after) - same == INDEX | {MARKS, "subjects.csv", FORGOTTEN, "adding.lock"}
     assert after[MARKS] == b"".join(line for line in before[MARKS].splitlines(keepends=True) if b'"P1/' not in line), (
         "other people's lines byte for byte"
     )
@@ -254,9 +254,9 @@ def test_the_first_time_also_sweeps_leftovers(folder: Path) -> None:
 
 
 def test_what_is_written_while_forget_waits_goes_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = room.FileLock.acquire
+    real = FileLock.acquire
 
-    def late(lock: room.FileLock, *args: Any, **more: Any) -> object:
+    def late(lock: FileLock, *args: Any, **more: Any) -> object:
         if not begun:
             begun.append(True)
             (folder / "evaluations" / "late").mkdir()
@@ -264,7 +264,7 @@ def test_what_is_written_while_forget_waits_goes_too(folder: Path, monkeypatch: 
         return real(lock, *args, **more)
 
     begun = list[bool]()
-    monkeypatch.setattr(room.FileLock, "acquire", late)
+    monkeypatch.setattr(FileLock, "acquire", late)
     assert "evaluations/late" in forget(folder, "P1").evaluations
     assert not (folder / "evaluations" / "late").exists()
 
@@ -431,3 +431,81 @@ def test_the_predictions_of_an_evaluation_elsewhere_in_the_data_set_are_named(fo
     polars.DataFrame({"subject": ["P2", "P11"], "y": [1, 2]}).write_parquet(folder / "others.parquet")
     mentions = plan_removal(folder, "P1").mentions
     assert "predictions.parquet" in mentions and "others.parquet" not in mentions
+
+
+def test_a_code_in_any_writing_is_found(folder: Path) -> None:
+    code, place, journal = "Jānis", folder / "results", io.BytesIO()
+    place.mkdir()
+    np.savez(journal, np.frombuffer(json.dumps({"subject": code}).encode(), dtype=np.uint8))
+    for name, content in {
+        "escaped.json": json.dumps({"subject": code}).encode(),
+        "address.log": b"GET /recordings/J%C4%81nis/a.csv",
+        "page.html": b"<td>J&#257;nis</td>",
+        "table.bin": b"\0\1" + code.encode() + b"\0\xff\xfe\xfd" * 9,
+        "wide.bin": b"\0\1" + code.encode("utf-16-be") + b"\0\xff\xfe\xfd" * 9,
+        "journal.npz": array(
+            list(json.dumps({"subject": code}).encode()), lambda out, v: np.savez(out, v.astype("u1"))
+        ),  # type: ignore[arg-type]
+        "row.db": b"\0\3" + f"{code}child".encode() + b"\0\xff\xfe\xfd" * 9,
+    }.items():
+        (place / name).write_bytes(content)
+    (place / "link").symlink_to(f"/somewhere/{code}/x")
+    (folder / "subjects.csv").write_text(f"subject,age_group,note\nP1,child,\nP2,adult,brother of {code}\n")
+    (folder / "recordings" / code).mkdir()
+    (folder / "recordings" / code / "session.json").write_text("{}")
+    assert {m for m in plan_removal(folder, code).mentions if m.startswith("results/")} == {
+        f"results/{p.name}" for p in place.iterdir()
+    }
+    assert "subjects.csv" in plan_removal(folder, code).mentions
+
+
+@pytest.mark.parametrize("text", ["person: 7\n", '{"subject": "7"}', "id,subject\n1,7\n", "<td>7</td>", "/DS/7/a.csv"])
+def test_a_code_that_is_a_number_is_found_where_it_may_be_one(folder: Path, text: str) -> None:
+    (folder / "recordings" / "7").mkdir()
+    (folder / "recordings" / "7" / "session.json").write_text("{}")
+    (folder / "with").write_text(text)
+    (folder / "without").write_text("at 7 s, 7.5 s and 17, [1, 7, 3]")
+    assert [m for m in plan_removal(folder, "7").mentions if m.startswith("with")] == ["with"]
+
+
+def test_results_of_somebody_whose_files_were_deleted_by_hand_go(folder: Path) -> None:
+    shutil.rmtree(folder / "recordings" / "P2")
+    shutil.rmtree(folder / "streams" / "P2")
+    for name in (*INDEX, "subjects.csv", MARKS):
+        (folder / name).unlink()
+    assert "evaluations/with" in forget(folder, "P2").evaluations
+    with pytest.raises(DatasetError, match="knows no person 'P3'"):
+        forget(folder, "P3")
+
+
+def test_an_import_that_runs_is_waited_for_and_a_program_beside_is_named(folder: Path) -> None:
+    with adding_locked(folder), pytest.raises(DatasetError, match="An import is adding"):
+        forget(folder, "P1")
+    assert open_dataset(folder).subjects == ["P1", "P11", "P2"]
+    with work_folder(folder.parent / "copy") as work:
+        (work / "raw.csv").write_text("P1")
+        assert forget(folder, "P1").running == (f"../{work.name}",)
+
+
+def test_an_import_that_began_before_a_removal_brings_nobody_back(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = importers.scan_source
+
+    def slow(*args: Any) -> Any:
+        found = real(*args)
+        forget(folder, "P1")
+        return found
+
+    monkeypatch.setattr(importers, "scan_source", slow)
+    with pytest.raises(ForgottenError):
+        import_recordings(folder.parent / "src", folder, add_to=True)
+    assert not any("P1/" in name or name.startswith("cache/adding") for name in files(folder))
+
+
+def test_nothing_is_written_where_the_data_set_was(folder: Path) -> None:
+    generation = open_dataset(folder).generation
+    folder.rename(folder.with_name("moved"))
+    with pytest.raises(ForgottenError, match="moved or deleted"), generation.writing():
+        raise AssertionError
+    assert not folder.exists()

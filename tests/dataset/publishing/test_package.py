@@ -1,6 +1,7 @@
 import csv
 import json
 import re
+import shutil
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -8,12 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plushsense.core.errors import DatasetError, MissingExtraError
+from plushsense.core.errors import DatasetError, ForgottenError, MissingExtraError
 from plushsense.core.recorder_csv import read_recording, read_stream
+from plushsense.dataset.about import Funding
 from plushsense.dataset.index import open_dataset
+from plushsense.dataset.privacy.forget import forget
 from plushsense.dataset.publishing.checking import validate_package
 from plushsense.dataset.publishing.contents import PublishOptions
-from plushsense.dataset.publishing.package import PublishResult, complete_head
+from plushsense.dataset.publishing.package import PublishResult, complete_head, publish
 from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.dataset.store import Dataset
 from support.toys import KEY, SECRETS, made_of, make
@@ -255,3 +258,25 @@ def test_without_the_validators_the_install_command_is_told(
     with pytest.raises(MissingExtraError, match=r"pip install 'plushsense\[publish\]'"):
         made_of(source, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_who_is_removed_during_the_validation_is_in_no_package(source: Dataset, tmp_path: Path) -> None:
+    dataset = open_dataset(shutil.copytree(source.path, tmp_path / "DS"))
+    person = dataset.subjects[0]
+
+    def meanwhile(stage: str, done: int, total: int) -> None:
+        if stage == "validating" and person in (tmp_path / "out" / "recordings.csv").read_text():
+            forget(dataset.path, person)
+
+    with pytest.raises(ForgottenError):
+        publish(dataset, tmp_path / "out", dataset.head, progress=meanwhile)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["DS", "out"]
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_control_character_in_the_description_is_refused_in_one_sentence(source: Dataset) -> None:
+    about = replace(source.head.about, keywords=("touch", "a\0"))
+    with pytest.raises(DatasetError, match=r"'about.keywords\[1\]' .* U\+0000"):
+        replace(source.head, about=about)
+    with pytest.raises(DatasetError, match="no funder"):
+        Funding(" ")

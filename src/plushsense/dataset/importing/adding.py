@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.files import write_file
@@ -33,13 +33,14 @@ from plushsense.dataset.importing.build import (
 from plushsense.dataset.importing.sources import SourceScan
 from plushsense.dataset.importing.truncation import truncation_marks
 from plushsense.dataset.index import open_dataset, rebuild_index
-from plushsense.dataset.marks import MARKS, Mark, read_marks, write_marks
+from plushsense.dataset.marks import MARKS, Mark, adding_locked, read_marks, write_marks
 from plushsense.dataset.privacy.forget import read_removals
 from plushsense.dataset.store import (
     HEAD,
     RECORDINGS,
     STREAMS,
     Dataset,
+    Generation,
     PersonInfo,
     Progress,
     read_people,
@@ -51,9 +52,9 @@ from plushsense.dataset.store import (
 def _locked_work_folder(dest: Path) -> Iterator[Path]:
     """Create a work folder on the disk of the data set for one import at a time; remove those of killed imports."""
     cache = dest / CACHE
-    cache.mkdir(exist_ok=True)
     try:
-        with FileLock(cache / "adding.lock", timeout=0):
+        with adding_locked(dest):
+            cache.mkdir(exist_ok=True)
             for left in cache.glob("adding-*"):
                 shutil.rmtree(left, ignore_errors=True)
             work = Path(tempfile.mkdtemp(prefix="adding-", dir=cache))
@@ -111,10 +112,14 @@ def add_to_dataset(
     gestures: GestureSet | None,
     people: Mapping[str, PersonInfo],
     progress: Progress | None,
+    generation: Generation,
 ) -> ImportSummary:
     """Add the files of a search to the data set ``dest``; ``gestures`` may describe gestures that it lacks.
 
+    ``generation`` is that of ``dest`` before the source was read.
+
     Raises:
+        ForgottenError: if a person, who may be among the new files, was removed since.
         DatasetError: if the data set cannot be opened, nothing can be added, or another import is running.
     """
     with _locked_work_folder(dest) as work:
@@ -149,7 +154,7 @@ def add_to_dataset(
         account.check()
         new = set(account.kept)
         # Without the lock, marks and the people's table could restore a person who is removed meanwhile.
-        with dataset.generation.writing():
+        with generation.writing():
             if head.gestures != dataset.head.gestures:
                 write_file(dest / HEAD, head.to_toml())
             marks = _new_marks(dest, account.set_aside_reasons())

@@ -7,6 +7,7 @@ are ambiguous or reserved on some file system, encrypted or damaged members, and
 from __future__ import annotations
 
 import re
+import shutil
 import stat
 import struct
 import unicodedata
@@ -70,8 +71,8 @@ class UnpackLimits:
             raise ConfigError(f"--max-gb is {gigabytes:g}: give a number above 0.")
         return cls(total_bytes=int(gigabytes * 1e9))
 
-    def check(self, path: Path, files: int, total_bytes: int) -> None:
-        """Raise DatasetError if the archive ``path`` would unpack to more files or bytes than are allowed."""
+    def check(self, path: Path, files: int, total_bytes: int, place: Path) -> None:
+        """Raise DatasetError if unpacking the archive ``path`` into ``place`` needs more than is allowed or free."""
         if files > self.files or total_bytes > self.total_bytes:
             raise DatasetError(
                 f"'{path}' would unpack to {files} files and {total_bytes / 1e9:.1f} GB; {self.files} files and "
@@ -81,6 +82,14 @@ class UnpackLimits:
                 name=path.name,
                 files=self.files,
                 gb=f"{self.total_bytes / 1e9:g}",
+            )
+        there = next(folder for folder in (place.resolve(), *place.resolve().parents) if folder.is_dir())
+        if total_bytes > (free := shutil.disk_usage(there).free):
+            raise DatasetError(
+                f"'{path}' would unpack to {total_bytes / 1e9:.1f} GB, but the disk of '{place}' has only "
+                f"{free / 1e9:.1f} GB: make room, or give another place.",
+                reason="zip_no_room",
+                name=path.name,
             )
 
 
@@ -176,7 +185,7 @@ def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list
         ) from None
     with archive:
         members = [m for m in archive.infolist() if not m.filename.endswith("/")]
-        limits.check(path, len(members), sum(m.file_size for m in members))
+        limits.check(path, len(members), sum(m.file_size for m in members), folder)
         seen: set[str] = set()
         room = limits.total_bytes
         for info in members:

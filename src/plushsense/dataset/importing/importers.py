@@ -6,7 +6,6 @@ in `importing.sources`.
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import ConfigError, DatasetError, FileFormatError
-from plushsense.core.files import work_folder, write_file
+from plushsense.core.files import temporary_folder, work_folder, write_file
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
@@ -63,6 +62,7 @@ from plushsense.dataset.index import rebuild_index
 from plushsense.dataset.store import (
     HEAD,
     DatasetHead,
+    Generation,
     Progress,
     read_people,
 )
@@ -430,7 +430,7 @@ def preview_import(source: str | Path, **given: Any) -> ImportPreview:
     Raises:
         DatasetError: if there is nothing to import.
     """
-    with tempfile.TemporaryDirectory(prefix="plushsense-") as place, _temporary_folders(Path(place) / "new") as folder:
+    with temporary_folder() as place, _temporary_folders(place / "new") as folder:
         return preview(scan_source(Path(source), _options(folder, **given)))
 
 
@@ -493,6 +493,7 @@ def import_recordings(
     with _temporary_folders(dest) as new_folder:
         options = _options(new_folder, layout, gestures, subjects, columns, limits, person, guess_layout, pattern)
         given, known, head = options.layout, options.gestures, None
+        generation = Generation.of(dest)
         if add_to:
             head = DatasetHead.read(dest)
             if adopt_proposals:
@@ -529,8 +530,9 @@ def import_recordings(
             _propose(done, adopt_proposals)
         else:
             try:
-                done = add_to_dataset(dest, search, known, people_info, progress)
+                done = add_to_dataset(dest, search, known, people_info, progress, generation)
             except OSError as cause:
+                generation.check()
                 raise DatasetError(
                     f"'{dest}' cannot be written ({cause.strerror or cause}, {cause.filename}), but is as valid as "
                     "before: check the disk and import again."

@@ -11,6 +11,8 @@ from __future__ import annotations
 import contextlib
 import glob
 import json
+import os
+import re
 import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
@@ -18,7 +20,7 @@ from datetime import datetime, timezone
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from filelock import FileLock
+from filelock import Timeout
 
 from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.files import (
@@ -43,12 +45,13 @@ from plushsense.dataset.files import (
     person_folders,
 )
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.marks import MARKS
-from plushsense.dataset.privacy.redaction import NamePatterns, texts_in
+from plushsense.dataset.marks import MARKS, adding_locked, locked
+from plushsense.dataset.privacy.redaction import NamePatterns, is_searchable, texts_in, words_of_rows
 from plushsense.dataset.store import (
     FORGOTTEN,
     HEAD,
-    LOCK,
+    RECORDINGS,
+    STREAMS,
     UNDER_WAY,
     UNKNOWN_SUBJECT,
     DatasetHead,
@@ -57,6 +60,9 @@ from plushsense.dataset.store import (
 )
 
 _EVALUATION = "evaluation.json"
+_LONG_CODE = 4
+# A line of its own, perhaps with a key as in YAML, a cell, a quoted text, a tag's text, or a part of a path.
+_SHORT = r"^(?:\s*[\w-]+:)?\s*{0}\s*$|(?<![^\n,;\t\"'/\\>]){0}(?![^\n,;\t\"'/\\<])"
 
 
 @dataclass(frozen=True)
@@ -85,8 +91,8 @@ class RemovalPlan:
     is whether the people's table contains them. ``caches`` and ``evaluations`` may derive from their data; ``mentions``
     are files that stay and contain the code, or cannot be read; ``published`` is the DOI of the data set.
     ``leftovers`` are unfinished files of killed programs in the data set, beside it (``../``), or in the system's
-    folder for temporary files. If ``absent``, the data set does not contain the person (any more), and only derived
-    files are removed.
+    folder for temporary files; ``running`` are those beside it that programs use now, and remove when they end. If
+    ``absent``, the data set does not contain the person (any more), and only derived files are removed.
     """
 
     subject: str
@@ -99,6 +105,7 @@ class RemovalPlan:
     mentions: tuple[str, ...]
     published: str = ""
     leftovers: tuple[str, ...] = ()
+    running: tuple[str, ...] = ()
     absent: bool = False
 
     def to_dict(self) -> dict[str, Any]:
@@ -158,7 +165,9 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
     # An incomplete line or another spelling is not enough: the code must be exact, since the removal is permanent.
     marked = any(_parsed(line) is not None for line in about)
     absent = not own and not marked and subject not in table and intent is None
-    if absent:
+    evaluations = sorted((folder / EVALUATIONS).iterdir()) if (folder / EVALUATIONS).is_dir() else []
+    # Files may have been deleted by hand, and results kept.
+    if absent and not any(subject in _people_of(e) for e in evaluations):
         known = people_of_dataset(folder)
         # Codes of removed people are not stored, so an unknown code may be one of them, but not another spelling.
         if not _record_lines(folder) or match_code(subject, known):
@@ -176,9 +185,9 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
             n=len(lost),
             file=lost[0],
         )
-    leftovers = _leftovers(folder, files)
-    evaluations = sorted((folder / EVALUATIONS).iterdir()) if (folder / EVALUATIONS).is_dir() else []
-    used = tuple(f"{EVALUATIONS}/{e.name}" for e in evaluations if _uses_person(e, subject))
+    leftovers, running = _leftovers(folder, files)
+    # Assume that a folder that does not state its people used the person.
+    used = tuple(f"{EVALUATIONS}/{e.name}" for e in evaluations if subject in (_people_of(e) or (subject,)))
     about_head = read_toml(folder / HEAD, "data set", DatasetError).get("about")
     raw = sum(f.kind == "raw" for f in own)
     return RemovalPlan(
@@ -192,26 +201,80 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
         tuple(_mentions(folder, files, subject, (CACHE, *used, *leftovers))),
         str(about_head.get("doi", "")) if isinstance(about_head, dict) else "",
         leftovers,
+        running,
         absent,
     )
 
 
 def _mentions(folder: Path, files: Iterable[DatasetFile], subject: str, removed: tuple[str, ...]) -> Iterator[str]:
     """Yield the files that stay, and contain the code of a person or cannot be read; ``removed`` are places."""
-    names = NamePatterns({subject: ""})
     for file in files:
         path = file.path.as_posix()
         goes = file.person == subject or f"{path}/".startswith(tuple(f"{place}/" for place in removed))
         goes = goes or (len(file.path.parts) == 1 and file.path.suffix == PART)
-        if goes or file.kind in ("raw", "index", "link", "people") or path in (UNDER_WAY, FORGOTTEN):
+        if goes or file.kind == "index" or path in (UNDER_WAY, FORGOTTEN):
             continue
-        texts = iter([_other_marks(folder, subject)]) if path == MARKS else texts_in(folder / path)
         try:
-            found = bool(names.find_in(path)) or any(names.find_in(t) or subject in t.splitlines() for t in texts)
+            found = _named(path, subject) or any(_holds(text, subject) for text in _texts_of(folder, file, subject))
         except (OSError, ValueError):
             found = True
         if found:
             yield path
+
+
+def _texts_of(folder: Path, file: DatasetFile, subject: str) -> Iterator[str]:
+    """Yield the texts of a file that remain when ``subject`` is removed."""
+    path = folder / file.path
+    if file.kind == "marks":
+        yield _other_marks(folder, subject)
+    elif file.kind == "people":
+        people = read_people(folder)
+        people.pop(_row_of(subject, people), None)
+        yield "\n".join(cell for p in people.values() for cell in (p.age_group, p.gender, p.consent, *p.more.values()))
+    elif file.kind == "raw":
+        yield words_of_rows(path.read_bytes())
+    elif file.kind == "link":
+        yield path.readlink().as_posix() if path.is_symlink() else ""
+    else:
+        yield from texts_in(path)
+
+
+def _named(path: str, subject: str) -> bool:
+    """Return whether a path contains the code of a person."""
+    return _holds(path, subject) or subject in re.split(r"[\W_]+", path)
+
+
+def _holds(text: str, subject: str) -> bool:
+    """Return whether a text contains the code of a person.
+
+    It is searched for as a whole word in any spelling, and as it is in the middle of other text if it is not too short
+    for that. Codes such as ``7`` also are numbers, so they must be a line, a cell, a quoted text or a folder.
+    """
+    if is_searchable(subject):
+        found = bool(NamePatterns({subject: ""}).find_in(text)) or subject in text.splitlines()
+        return found or (len(subject) >= _LONG_CODE and subject in text)
+    return re.search(_SHORT.format(re.escape(subject)), text, re.MULTILINE) is not None
+
+
+def find_mentions(places: Iterable[Path], subject: str, apart_from: Path) -> Iterator[Path]:
+    """Yield what contains the code of a person, or cannot be read, in folders other than the data set ``apart_from``.
+
+    Folders that are named after the person are not searched further.
+    """
+    for place in places:
+        for at, folders, names in os.walk(place):
+            here = Path(at)
+            yield from (here / name for name in folders if name == subject)
+            folders[:] = [name for name in folders if name != subject and (here / name).resolve() != apart_from]
+            for path in (here / name for name in names):
+                raw = path.suffix.lower() == ".csv" and {RECORDINGS, STREAMS} & set(path.parts)
+                try:
+                    texts = iter([words_of_rows(path.read_bytes())]) if raw else texts_in(path)
+                    found = _named(path.name, subject) or any(_holds(text, subject) for text in texts)
+                except (OSError, ValueError):
+                    found = True
+                if found:
+                    yield path
 
 
 def forget(dataset: str | Path, subject: str) -> RemovalPlan:
@@ -229,7 +292,7 @@ def forget(dataset: str | Path, subject: str) -> RemovalPlan:
     folder = Path(dataset)
     plan_removal(folder, subject)  # Refuse before the lock is taken.
     try:
-        with FileLock(folder / LOCK):
+        with adding_locked(folder), locked(folder):
             # Plan again under the lock, since other programs may have written until now.
             plan = plan_removal(folder, subject)
             intent = None if plan.absent else _begin(folder, plan)
@@ -237,6 +300,12 @@ def forget(dataset: str | Path, subject: str) -> RemovalPlan:
             _remove_own(folder, plan)
             if intent is not None:
                 _finish(folder, intent)
+    except Timeout:
+        raise DatasetError(
+            f"An import is adding to '{folder}' now, and nothing was removed: wait until it ends, or end it, then give "
+            "the command again.",
+            reason="import_runs",
+        ) from None
     except OSError as cause:
         raise DatasetError(
             f"'{cause.filename or folder}' cannot be removed ({cause.strerror or cause}): close the programs that use "
@@ -289,12 +358,13 @@ def _rewrite_marks(folder: Path, subject: str) -> None:
         write_file(folder / MARKS, b"".join(others))
 
 
-def _leftovers(folder: Path, files: Iterable[DatasetFile]) -> tuple[str, ...]:
-    """Return unfinished files and folders that killed programs left in the data set, beside it, or as temporary ones.
+def _leftovers(folder: Path, files: Iterable[DatasetFile]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return unfinished files and folders in the data set, beside it, and in the folder for temporary files.
 
-    Those that a process still uses are not among them.
+    The first are those that killed programs left, the second those folders that a process still uses.
     """
     place = folder.resolve().parent
+    running = [f"../{entry.name}" for entry in place.iterdir() if is_unfinished(entry.name) and is_in_use(entry)]
     beside = [f for f in place.glob(f"{glob.escape(unfinished(folder))}*") if not is_in_use(f)]
     out = {f"../{entry.name}" for entry in (*abandoned_folders(place), *beside)}
     out |= {entry.as_posix() for entry in abandoned_temporary_folders() if entry.parent != place}
@@ -305,7 +375,7 @@ def _leftovers(folder: Path, files: Iterable[DatasetFile]) -> tuple[str, ...]:
             out.add(inside[0])
         elif parts[0] == EVALUATIONS and file.path.suffix == ".part":
             out.add(file.path.as_posix())
-    return tuple(sorted(out))
+    return tuple(sorted(out)), tuple(sorted(running))
 
 
 def _row_of(subject: str, table: Iterable[str]) -> str:
@@ -344,14 +414,13 @@ def _other_marks(folder: Path, subject: str) -> str:
     return b"".join(line for line in _mark_lines(folder) if not _is_about(line, subject)).decode("utf-8", "replace")
 
 
-def _uses_person(place: Path, subject: str) -> bool:
-    """Return whether an evaluation used a person's data; assume so if it does not state its people."""
+def _people_of(place: Path) -> set[str]:
+    """Return the people whose data an evaluation used; none if it does not state them."""
     try:
         table = json.loads((place / _EVALUATION).read_text(encoding="utf-8"))
-        people = {str(row["subject"]) for row in table["subjects"]}
+        return {str(row["subject"]) for row in table["subjects"]}
     except (OSError, ValueError, KeyError, TypeError):
-        return True
-    return not people or subject in people
+        return set()
 
 
 def _remove(path: Path) -> None:

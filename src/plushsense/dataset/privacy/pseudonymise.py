@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -47,6 +48,7 @@ from plushsense.dataset.privacy.redaction import (
     redact_marks,
     redact_people,
     subject_in,
+    words_of_rows,
 )
 from plushsense.dataset.store import (
     HEAD,
@@ -193,7 +195,7 @@ class _Pseudonymisation:
         return self._rewordings[self._pseudonym(person).original]
 
     def run(self, dest: Path) -> PseudonymisationResult:
-        with new_folder(dest, DatasetError, last=HEAD) as work:
+        with new_folder(dest, DatasetError, last=HEAD, finishing=self._finishing) as work:
             self.moved: dict[str, str] = {}
             times = self._raw_files(work)
             self._written_files(work)
@@ -211,8 +213,6 @@ class _Pseudonymisation:
                     name=name,
                 )
             files = len(list_files(work))
-            self.source.generation.check()
-            write_key(self.key, self.codes)
         if self.notes.prose:
             message = f"{self.notes.prose} notes in free text were kept: names are replaced, but read them"
             self.notes.add("", Sentence(message, "free_text_kept", n=self.notes.prose))
@@ -226,6 +226,12 @@ class _Pseudonymisation:
             self.notes.add("", Sentence(message, "session_names_kept", listed=listed))
         result = Dataset(dest, made.head, made.recordings, made.streams)
         return PseudonymisationResult(result, files, self.notes.merged(), self.key)
+
+    @contextmanager
+    def _finishing(self) -> Iterator[None]:
+        with self.source.generation.writing():
+            write_key(self.key, self.codes)
+            yield
 
     def _raw_files(self, work: Path) -> NDArray[np.int64]:
         """Rewrite the raw files and compare each with its original; return every original time in them."""
@@ -377,17 +383,6 @@ def _same(before: ReadResult, after: ReadResult, columns: Collection[str], shift
 
 
 _TIMES = re.compile(rb"(?<![0-9A-Za-z.])\d{12,14}(?![0-9A-Za-z])")
-_PLAIN = b"0123456789;,.+- \t\r\n"
-
-
-def _words(data: bytes) -> str:
-    """Return the distinct cells of a raw file that are not numbers, one a line: header, labels, garbled text."""
-    cells: set[bytes] = set()
-    if data.translate(None, _PLAIN):
-        for line in data.splitlines():
-            if line.translate(None, _PLAIN):
-                cells.update(cell for cell in re.split(rb"[;,\t]", line) if cell.translate(None, _PLAIN))
-    return "\n".join(sorted(cell.decode("utf-8", "replace").strip() for cell in cells))
 
 
 def find_traces(
@@ -415,7 +410,7 @@ def find_traces(
         for stamp in sorted(set(stamps[known[at] == stamps].tolist())) if len(known) else ():
             yield path, str(stamp)
         if content.kind == "raw":
-            found_in = names.find_in(_words(data))
+            found_in = names.find_in(words_of_rows(data))
         else:
             text = data.decode("utf-8", "replace")
             # The stamp of the index contains the times at which the new files were written.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import html
 import json
 import lzma
 import re
@@ -19,6 +20,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, cast
+from urllib.parse import unquote
 
 import numpy as np
 import tomli_w
@@ -55,7 +57,7 @@ def _pattern(word: str) -> str:
     pieces = _PIECES.findall(unicodedata.normalize("NFC", word))
     if any(len(p) == 1 and p.isalpha() for p in pieces):
         # A single letter can be part of another word: "it's 1 o'clock" does not contain S1.
-        return "(?<!['’])" + r"[\s_-]?".join(map(re.escape, pieces))
+        return r"(?<![^\W_]['’])" + r"[\s_-]?".join(map(re.escape, pieces))
     return r"[\s_.'-]*".join(map(re.escape, pieces))
 
 
@@ -244,7 +246,11 @@ def read_lines(path: Path) -> Iterator[tuple[int, Any]]:
 
 _CHUNK = 1 << 20
 _LONGEST_NAME = 256
-_RUNS = re.compile(rb"[\x20-\x7e]{3,}|(?:[\x20-\x7e]\0){3,}")
+# Text in a binary file: in UTF-8, and in UTF-16 of either byte order.
+_RUNS = re.compile(rb"[\x20-\x7e\x80-\xff]{2,}")
+_WIDE = {"utf-16-le": re.compile(rb"(?:[^\0][\0-\x04]){2,}"), "utf-16-be": re.compile(rb"(?:[\0-\x04][^\0]){2,}")}
+_ESCAPED = re.compile(r"\\u([0-9a-fA-F]{4})")
+_NUMBERS = b"0123456789;,.+- \t\r\n"
 _MAX_UNPACKED = 1 << 33
 # First bytes of files whose text is compressed in a way that is not read here: zstd, 7z, rar, PDF.
 _UNREAD = (b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf\x27\x1c", b"Rar!", b"%PDF")
@@ -258,7 +264,8 @@ _UNPACK: dict[bytes, Callable[[IO[bytes]], IO[bytes]]] = {
 def texts_in(path: Path) -> Iterator[str]:
     """Yield the text in a file of any kind, piece by piece.
 
-    Of binary files that is what is printable in them, of compressed files and zips what is packed in them, of Parquet
+    Characters that are escaped as in JSON, HTML or an address are there plainly, too. Of binary files that is what is
+    printable in them, of compressed files and zips what is packed in them, of Parquet
     and NumPy files the cells that are texts.
 
     Raises:
@@ -303,6 +310,8 @@ def _cells(file: IO[bytes], parquet: bool) -> Iterator[str]:
         array = np.lib.format.read_array(file, allow_pickle=False)
         if array.dtype.kind in "SU":
             yield "\n".join(np.unique(array).astype(np.str_).tolist())
+        elif array.dtype.itemsize == 1:
+            yield _printable(array.tobytes())
         return
     try:
         polars = need("polars", extra="tables")
@@ -314,7 +323,13 @@ def _cells(file: IO[bytes], parquet: bool) -> Iterator[str]:
     for column in table.iter_columns():
         yield column.name
         if not column.dtype.is_numeric():
-            yield "\n".join(sorted({str(cell) for cell in column.to_list()}))
+            yield "\n".join(sorted({_cell_text(cell) for cell in column.to_list()}))
+
+
+def _cell_text(cell: object) -> str:
+    if isinstance(cell, bytes):
+        return _printable(cell)
+    return json.dumps(cell, ensure_ascii=False, default=str) if isinstance(cell, list | dict) else str(cell)
 
 
 def _pieces(file: IO[bytes]) -> Iterator[str]:
@@ -328,9 +343,26 @@ def _pieces(file: IO[bytes]) -> Iterator[str]:
 def _printable(data: bytes) -> str:
     text = data.decode("utf-8", "replace")
     # Characters may be cut at both ends.
-    if "\0" not in text and text.count("\ufffd") <= 6:
-        return text
-    return "\n".join(run.replace(b"\0", b"").decode("ascii") for run in _RUNS.findall(data))
+    if "\0" in text or text.count("\ufffd") > 6:
+        runs = [run.decode("utf-8", "replace") for run in _RUNS.findall(data)]
+        runs += [run.decode(code, "replace") for code, wide in _WIDE.items() for run in wide.findall(data)]
+        text = "\n".join(runs)
+    elif "\ufffd" in text:
+        text += "\n" + data.decode("cp1252", "replace")
+    plain = _ESCAPED.sub(lambda match: chr(int(match[1], 16)), text) if "\\u" in text else text
+    plain = unquote(plain) if "%" in plain else plain
+    plain = html.unescape(plain) if "&" in plain else plain
+    return text if plain == text else f"{text}\n{plain}"
+
+
+def words_of_rows(data: bytes) -> str:
+    """Return the distinct cells of a raw file that are not numbers, one a line: header, labels, garbled text."""
+    cells: set[bytes] = set()
+    if data.translate(None, _NUMBERS):
+        for line in data.splitlines():
+            if line.translate(None, _NUMBERS):
+                cells.update(cell for cell in re.split(rb"[;,\t]", line) if cell.translate(None, _NUMBERS))
+    return "\n".join(sorted(cell.decode("utf-8", "replace").strip() for cell in cells))
 
 
 def redact_json(path: Path, new: str, words: Redactor) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import time
 from collections import Counter
 from dataclasses import dataclass, field, replace
@@ -11,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import DatasetError, need
+from plushsense.core.errors import DatasetError, ForgottenError, need
 from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import SIMULATION_MARK
@@ -216,7 +217,7 @@ def publish(
     target = check_output_folder(dataset, out)
     options = options or PublishOptions()
     day = published or date.today().isoformat()
-    with new_folder(out, DatasetError) as work:
+    with new_folder(out, DatasetError, finishing=dataset.generation.writing) as work:
         contents = ContentsWriter(dataset, work / DATA, head, options, partial(progress, "writing")).write()
         d = Description(
             contents.dataset,
@@ -231,10 +232,17 @@ def publish(
         if bids:
             write_bids(work, d)
         _write_metadata(work, d)
-        dataset.generation.check()
     checked = check_folder(out, thorough=thorough, progress=progress)
-    if checked.valid:
-        write_zip(out, target, f"{d.name}-{d.version}")
+    try:
+        if checked.valid:
+            write_zip(out, target, f"{d.name}-{d.version}", dataset.generation.writing)
+        dataset.generation.check()
+    except ForgottenError:
+        # A person was removed during the validation. ``out`` itself may be the current folder.
+        for entry in list(out.iterdir()):
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+        target.unlink(missing_ok=True)
+        raise
     files = list_package_files(out)
     return PublishResult(
         out,

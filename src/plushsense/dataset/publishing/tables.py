@@ -7,8 +7,8 @@ import io
 import re
 import tomllib
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -178,8 +178,12 @@ def read_checksums(root: Path) -> dict[str, str]:
     return sums
 
 
-def write_zip(root: Path, target: Path, folder: str) -> None:
+def write_zip(
+    root: Path, target: Path, folder: str, finishing: Callable[[], AbstractContextManager[None]] = nullcontext
+) -> None:
     """Write the package as the zip ``target`` with the top folder ``folder``, completely or not at all.
+
+    ``finishing`` is as in `replacing_file`.
 
     Raises:
         DatasetError: if ``target`` exists.
@@ -192,7 +196,7 @@ def write_zip(root: Path, target: Path, folder: str) -> None:
         )
     with (
         work_folder(target) as work,
-        replacing_file(target, within=work) as part,
+        replacing_file(target, within=work, finishing=finishing) as part,
         zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive,
     ):
         for path in list_package_files(root):

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from plushsense.core.errors import ConfigError, PlushSenseError
-from plushsense.core.files import write_file
 from plushsense.dataset.importing.build import DEVICE_NAME
+from plushsense.dataset.index import change_head
 from plushsense.dataset.store import DatasetHead
 from plushsense.recording.session_files import SESSION_HEAD
 
@@ -173,7 +173,7 @@ class Workspace:
                 message = f"Another data set is called '{name}': give another name."
                 raise ConfigError(message, reason="name_exists", name=name)
             self._check_name(name)
-            write_file(real / _HEAD, replace(DatasetHead.read(real), name=name).to_toml())
+            change_head(real, lambda head: replace(head, name=name))
             return real
         place = self.new(BUNDLES, f"{name}{real.suffix}")
         real.rename(place)

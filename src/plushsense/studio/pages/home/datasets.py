@@ -187,12 +187,13 @@ class ForgetDialog:
                 *(b.bundle for b in found.bundles),
                 *found.feedback,
                 *found.discarded,
+                *found.elsewhere,
                 *(str(p) for p in sorted((workspace.folder / BACKUPS).glob("*.zip"))),
                 *(str(self._entry.path / mention) for mention in plan.mentions),
                 *([f"https://doi.org/{plan.published}"] if plan.published else ()),
             ]
             ui.label(words("home.forget_rest")).classes("text-bold")
-            self._paths(rest)
+            self._paths(dict.fromkeys(rest))
             ui.label(words("home.forget_elsewhere")).classes("ps-note")
             button("forget-next", words("home.forget_next"), self._confirm, "outline color=negative")
 
