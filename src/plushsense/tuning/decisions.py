@@ -23,7 +23,7 @@ from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import ONE
 from plushsense.runtime.fixed import Ints, integer_logits, known_score, smoothing_weight, softmax
 from plushsense.runtime.health import MOST_MS, HealthSettings
-from plushsense.runtime.trace import TraceReplayer, trace_of
+from plushsense.runtime.trace import trace_of
 from plushsense.scoring.events import ErrorCosts
 from plushsense.tuning.events import OTHER, MarkedStream, Truth, tune
 from plushsense.tuning.gate import fit_gate
@@ -344,7 +344,7 @@ def labelled_steps(bundle: Bundle, streams: Sequence[MarkedStream], spec: Decide
     recording: list[int] = []
     number = 0
     for h in streams:
-        parts = TraceReplayer(h.trace).smoothed(weight)
+        parts = h.replayer.smoothed(weight)
         times = [h.trace.step_times_us(part) for part in h.trace.parts]
         for t in h.truths:
             if t.gesture == OTHER:
@@ -376,7 +376,7 @@ def labelled_windows(bundle: Bundle, dataset: Dataset, subjects: Iterable[str]) 
         empty = np.zeros((0, len(bundle.gestures)), dtype=np.int64)
         return LabelledSteps(empty, _ints(()), _ints(()), np.zeros(0, dtype=np.str_), _ints(()))
     logits = integer_logits(bundle.network().forward(bundle.scaler.apply(windows.x)))
-    shares = np.array([softmax(row) for row in logits], dtype=np.int64)
+    shares = softmax(logits)
     known = known_score(logits, np.array([g.idle for g in bundle.gestures.gestures]))
     return LabelledSteps(shares, known, windows.y, windows.subject, windows.recording)
 
