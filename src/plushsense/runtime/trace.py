@@ -5,10 +5,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from itertools import accumulate, pairwise
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,7 @@ from plushsense.runtime.fixed import (
     smoothing_weight,
     softmax,
 )
-from plushsense.runtime.gate import Gate, GateSettings
+from plushsense.runtime.gate import Firings, GateSettings, firings
 from plushsense.runtime.health import Health, HealthSettings
 from plushsense.runtime.image import IntegerModel
 from plushsense.runtime.machine import Break, FloatLogits, InputRows, LogitStream, Sample, SampleReader
@@ -202,19 +202,6 @@ class _TracedLogits:
         return max(0, (samples - self.arch.span) // self.arch.step + 1)
 
 
-def gate_hits(part: Part, settings: GateSettings) -> list[tuple[int, int]]:
-    """Return the sample index and rule index of every firing of the gate in a part."""
-    if not settings.rules:
-        return []
-    gate = Gate(settings)
-    rows, suspects = part.inputs.tolist(), part.suspect.tolist()
-    fired = [gate.push(row, suspect) for row, suspect in zip(rows, suspects, strict=True)]
-    return [(at, rule) for at, rule in enumerate(fired) if rule >= 0]
-
-
-Hits = list[list[tuple[int, int]]]
-
-
 @dataclass(frozen=True, slots=True)
 class ReportedEvent:
     """A whole event; times are in seconds since the first frame of the stream.
@@ -282,7 +269,7 @@ class TraceReplayer:
         self._idle = np.array([g.idle for g in trace.gestures.gestures], dtype=np.bool_)
         self._edges = np.cumsum([0, *(len(part.logits) for part in trace.parts)]).tolist()
         self._smoothed: dict[int, SmoothedSteps] = {}
-        self._hits: dict[GateSettings, Hits] = {}
+        self._hits: dict[GateSettings, list[Firings]] = {}
         self._candidates: tuple[tuple[int, ...], _Candidates] | None = None
 
     @cached_property
@@ -318,31 +305,40 @@ class TraceReplayer:
         self._smoothed.clear()
         self._candidates = None
 
-    def _smooth(self, weight: int) -> SmoothedSteps:
-        if weight not in self._smoothed:
-            half = 1 << (PROBABILITY_BITS - 1)
-
-            def update(mean: int, value: int) -> int:
-                """Do the same as `fixed.smooth` with plain integers."""
-                return mean + (((value - mean) * weight + half) >> PROBABILITY_BITS)
-
-            rows = self._probabilities << SMOOTH_EXTRA_BITS
-            means = np.empty_like(rows)
-            for first, last in pairwise(self._edges):
-                for column, values in enumerate(rows[first:last].T.tolist()):
-                    means[first:last, column] = list(accumulate(values, update))
-            shares = means >> SMOOTH_EXTRA_BITS
+    def smooth(self, weights: Collection[int]) -> None:
+        """Smooth with several weights at once, which takes little longer than with one, and cache the values."""
+        missing = sorted({*weights} - self._smoothed.keys())
+        if not missing:
+            return
+        rows = self._probabilities[:, None] << SMOOTH_EXTRA_BITS
+        means = np.empty((len(rows), len(missing), rows.shape[2]), dtype=np.int64)
+        weight, half = np.array(missing)[:, None], 1 << (PROBABILITY_BITS - 1)
+        for first, last in pairwise(self._edges):
+            means[first:last] = rows[first:last]
+            for mean, now in pairwise(means[first:last]):
+                # As in `fixed.smooth`, but without new arrays.
+                now -= mean
+                now *= weight
+                now += half
+                now >>= PROBABILITY_BITS
+                now += mean
+        for at, one in enumerate(missing):
+            shares = means[:, at] >> SMOOTH_EXTRA_BITS
             totals = np.zeros((len(rows), 4), dtype=np.int64)
             for code in range(4):
                 totals[:, code] = shares[:, :-1][:, (self._affects == code) & ~self._idle].sum(axis=1)
-            best = means[:, :-1].argmax(axis=1)
-            self._smoothed[weight] = SmoothedSteps(shares[:, :-1], best, shares[:, -1], totals)
+            best = means[:, at, :-1].argmax(axis=1)
+            self._smoothed[one] = SmoothedSteps(shares[:, :-1], best, shares[:, -1], totals)
+
+    def _smooth(self, weight: int) -> SmoothedSteps:
+        self.smooth([weight])
         return self._smoothed[weight]
 
-    def hits(self, gate: GateSettings) -> Hits:
-        """Return the `gate_hits` of each part; they are cached."""
+    def hits(self, gate: GateSettings) -> list[Firings]:
+        """Return the firings of the gate in each part; they are cached."""
         if gate not in self._hits:
-            self._hits[gate] = [gate_hits(part, gate) for part in self.trace.parts]
+            parts = self.trace.parts
+            self._hits[gate] = firings(gate, [part.inputs for part in parts], [part.suspect for part in parts])
         return self._hits[gate]
 
     def replay(self, rules: Rules, weight: int) -> list[Update]:
@@ -357,7 +353,11 @@ class TraceReplayer:
 
     def updates(self, spec: DecideSpec) -> list[Update]:
         """Return the updates of events with the settings ``spec``, times in microseconds."""
-        return self.replay(spec.rules(self.step_s), smoothing_weight(spec.smoothing_s, self.step_s))
+        return self.replay(spec.rules(self.step_s), self.weight(spec.smoothing_s))
+
+    def weight(self, smoothing_s: float) -> int:
+        """Return the weight of a new step for a time constant."""
+        return smoothing_weight(smoothing_s, self.step_s)
 
     def events(self, spec: DecideSpec) -> list[ReportedEvent]:
         """Return the events with the settings ``spec``."""
@@ -419,7 +419,8 @@ class TraceReplayer:
                     at += same
                     continue
                 doubt = bool(self._suspect[k])
-                shares, best = smoothed.shares[k].tolist(), int(smoothed.best[k])
+                # Shares are only needed for an open event.
+                shares, best = smoothed.shares[k].tolist() if machine.open else [], int(smoothed.best[k])
                 yield from machine.follow(shares, best, gesture, affect, times[at], doubt)
                 at += 1
             if rule >= 0:
@@ -436,8 +437,9 @@ class TraceReplayer:
             stays = smoothed.affect_shares[at : at + steps, machine.affect] >= settings.leave_affect
         else:
             return 0
-        against = np.flatnonzero(~stays | idle[at : at + steps])
-        return int(against[0]) if len(against) else steps
+        stays &= ~idle[at : at + steps]
+        against = int(stays.argmin())
+        return steps if stays[against] else against
 
 
 def reported_events(updates: Sequence[Update]) -> list[ReportedEvent]:

@@ -205,6 +205,8 @@ def tune(
     gate = bool(spec.gate.rules)
     settings = TRIED | (TRIED_AFFECT if gestures.has_affect else {}) | (TRIED_GATE if gate else {})
     settings = {name: values for name, values in settings.items() if name not in keep}
+    for h in streams:
+        h.replayer.smooth([h.replayer.weight(s) for s in (spec.smoothing_s, *settings.get("smoothing_s", ()))])
     costs: dict[tuple[Any, ...], list[NDArray[np.float64]]] = {}
 
     def cost(candidate: DecideSpec) -> list[NDArray[np.float64]]:
