@@ -53,7 +53,7 @@ class HealthSettings:
 
 
 class Health:
-    """Checks the sensor health of one stream of frames; ``inside`` holds the usual values (low, high) of each channel."""
+    """Checks the sensor health of one stream of frames; ``inside`` has the usual values (low, high) of each channel."""
 
     def __init__(self, settings: HealthSettings, layout: Layout) -> None:
         self.settings = settings

@@ -130,9 +130,9 @@ def _health_of(frames: Frames, layout: Layout, settings: HealthSettings) -> tupl
     x, ms = frames.values, frames.device_ms
     health = Health(settings, layout)
     low, high = np.array(health.inside, dtype=np.int64).reshape(-1, 2).T
-    unusual = ((x < low) | (x > high)).any(axis=1)
+    unusual: Bools = np.any((x < low) | (x > high), axis=1)
     unusual[1:] |= (x[1:] == x[:-1]).all(axis=1)
-    suspect, fault = np.zeros((2, len(x)), dtype=np.bool_)
+    suspect, fault = np.zeros(len(x), dtype=np.bool_), np.zeros(len(x), dtype=np.bool_)
     checked = 0
     for at in np.flatnonzero(unusual).tolist():
         if at < checked:
