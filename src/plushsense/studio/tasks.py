@@ -325,19 +325,24 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     check_folder(out.parent, "A bundle")
     reporter.progress(stage="reading", share=0.0)
 
-    from plushsense.workflow.api import FIRST_NETWORK, train, unfinished
+    from plushsense.workflow.api import train, unfinished
+    from plushsense.workflow.networks import FIRST_NETWORK
+    from plushsense.workflow.preparation import MOST_GROUPS, cross_fitting_groups
 
     clock, tuning = Clock(), int(spec.get("quantize_aware", 0))
     hard = config.windows.context == ANYWHERE and config.anywhere.hard_share > 0
     first = config.training.epochs if hard else 0
-    whole = first + config.training.epochs + tuning
+    one = first + config.training.epochs + tuning
+    groups = cross_fitting_groups(config, MOST_GROUPS)
 
     def epoch(at: int, of: int, row: dict[str, Any]) -> None:
-        stage = {None: "training", FIRST_NETWORK: "first_network"}.get(row.get("what"), "fine-tuning")
-        done = at + {"training": first, "first_network": 0, "fine-tuning": first + config.training.epochs}[stage]
+        what, fold = str(row.get("what", "")), int(row.get("fold", 0))
+        hard_first = what.endswith(FIRST_NETWORK)
+        stage = "cross_fitting" if fold else {"": "training", FIRST_NETWORK: "first_network"}.get(what, "fine-tuning")
+        done = fold * one + at + (0 if hard_first else first) + config.training.epochs * (stage == "fine-tuning")
         scores = {k: row.get(k) for k in ("train_loss", "train_accuracy", "validation_loss", "accuracy")}
-        reporter.progress(stage=stage, epoch=at, epochs=of, **scores, **clock.at(done / whole))
-        if at == of and stage == "training" and not tuning:
+        reporter.progress(stage=stage, epoch=at, epochs=of, **scores, **clock.at(min(1.0, done / (one * (1 + groups)))))
+        if at == of and stage in ("training", "cross_fitting") and not tuning and not hard_first and fold == groups:
             reporter.progress(stage="deciding", epoch=at, epochs=of, share=1.0)
 
     done = train(
@@ -373,7 +378,8 @@ def run_make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
     def report(at: BudgetProgress) -> None:
         row = {key: value for key, value in at.row.items() if key != "learning_rate"}
-        stage = "first_network" if at.stage == TRAINING and "what" in row else at.stage
+        first = at.stage == TRAINING and "what" in row
+        stage = "cross_fitting" if "fold" in row else "first_network" if first else at.stage
         reporter.progress(**row | {"stage": stage, "bundle": at.bundle}, **clock.at(at.share))
 
     settings = spec.get("settings")
