@@ -436,7 +436,7 @@ def validation_predictions(bundle: Bundle, dataset: Dataset | str | os.PathLike[
     """Return what `train` scored: predictions for people on whom the network that made them was not trained.
 
     Those of a cross-fitting were stored in the data set's cache for 30 days. For validation people, they are computed
-    anew; recordings at rest are then left out, because it is not stored which of them were held out.
+    anew. Recordings at rest, which are nobody's, are left out.
 
     Raises:
         DatasetError: if the bundle has no such predictions, the data set was changed since the training (reason
@@ -456,7 +456,9 @@ def validation_predictions(bundle: Bundle, dataset: Dataset | str | os.PathLike[
             name=dataset.head.name,
         )
     if stored is not None:
-        return Predictions(**{**stored, "labels": tuple(stored["labels"])})
+        known = ~np.isin(stored["subject"], [NOBODY, UNKNOWN_SUBJECT])
+        arrays = {key: value[known] for key, value in stored.items() if key != "labels"}
+        return Predictions(labels=tuple(stored["labels"]), **arrays)
     dataset = dataset.with_inputs(bundle.layout).with_gestures(bundle.gestures)
     # All recordings are cut, because how long a gesture usually is depends on them.
     every = windows_for(dataset, bundle.arch, whole_gestures(bundle.windowing), bundle.gestures)
