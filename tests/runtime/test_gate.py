@@ -9,7 +9,7 @@ import pytest
 
 from plushsense.core.errors import BundleError, ConfigError
 from plushsense.runtime.decisions import DecideSpec
-from plushsense.runtime.gate import HELD, JERK, LEVEL, Gate, GateSettings, Rule, Signal, Term
+from plushsense.runtime.gate import HELD, JERK, LEVEL, Gate, GateSettings, Rule, Signal, Term, firings
 from plushsense.tuning.gate import signal_sizes
 
 BLOW = Rule((Term(0, 32, times=2),), affect=3, gesture=255, within=3, deaf=5)
@@ -17,10 +17,16 @@ LEVELS = GateSettings((Signal(LEVEL, (0,), floor=10),), (BLOW,))
 
 
 def fired(settings: GateSettings, rows: list[list[int]], suspects: set[int] = frozenset()) -> list[tuple[int, int]]:
-    """(sample, rule) of every firing."""
+    """(sample, rule) of every firing, which is the same for a stretch among several."""
     gate = Gate(settings)
     heard = [(at, gate.push(row, at in suspects)) for at, row in enumerate(rows)]
-    return [(at, rule) for at, rule in heard if rule >= 0]
+    found = [(at, rule) for at, rule in heard if rule >= 0]
+    x, doubts = np.array(rows), np.isin(np.arange(len(rows)), list(suspects))
+    assert firings(settings, [x[:0], x, x[: len(x) // 3], x], [doubts[:0], doubts, doubts[: len(x) // 3], doubts]) == [
+        [], found, [hit for hit in found if hit[0] < len(x) // 3], found
+    ]  # fmt: skip
+    assert firings(settings, [x], [doubts]) == [found]
+    return found
 
 
 def tremble(values: list[int]) -> list[list[int]]:

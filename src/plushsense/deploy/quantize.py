@@ -320,6 +320,4 @@ def classifier_of(bundle: Bundle, decide: DecideSpec | None, engine: str) -> Str
 
 def integer_probabilities(network: IntegerNetwork, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
     """Compute the probabilities (N, K) of raw windows (N, C, T) with a deployed network, without smoothing."""
-    rows = [softmax(logits) for logits in network.forward(x)]
-    table = np.array(rows, dtype=np.float32).reshape(len(x), network.arch.classes)
-    return table / np.float32(1 << PROBABILITY_BITS)
+    return softmax(network.forward(x)).astype(np.float32) / np.float32(1 << PROBABILITY_BITS)

@@ -32,7 +32,6 @@ from plushsense.reports.figures import new_figure, png
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import ONE
 from plushsense.runtime.fixed import smoothing_weight
-from plushsense.runtime.trace import TraceReplayer
 from plushsense.scoring.metrics import RelativeMahalanobis, RiskCoverage, auroc, confidences, risk_coverage
 from plushsense.scoring.splits import Fold, parse_split
 from plushsense.training.spec import TrainSpec
@@ -87,7 +86,7 @@ def last_answers(
     weight = smoothing_weight(spec.smoothing_s, bundle.arch.step * bundle.layout.period_us / 1e6)
     rows: list[tuple[NDArray[Any], NDArray[Any], Any, str, str, float]] = []
     for stream in marked_streams(bundle, dataset, subjects, spec, gestures):
-        smoothed = TraceReplayer(stream.trace).smoothed(weight)
+        smoothed = stream.replayer.smoothed(weight)
         for truth in stream.truths:
             if truth.gesture < 0:
                 continue

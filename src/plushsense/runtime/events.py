@@ -214,6 +214,21 @@ class EventMachine:
             self._count(NO_GESTURE, 0, now)
             self._resting = max(0, self._resting - steps)
 
+    def stay(self, steps: int, gesture: int, affect: int, now: int) -> None:
+        """Process ``steps`` steps with the same candidate, none of them suspect, in which the open event continues.
+
+        The candidate is none or that of the event, and in each step the event's share is high enough and no idle class
+        prevails.
+        """
+        self._count(gesture, affect, now)
+        if self._candidate >= 0:
+            self._candidate_steps += steps - 1
+        if gesture != NO_GESTURE:
+            self._gesture_steps += steps - 1
+        self._lasted += steps
+        self._wait = max(0, self._wait - steps)
+        self._away = 0
+
     def blind_step(self, now: int) -> list[Update]:
         """Process a step without an answer, while the network is warming; it can end an event of the gate."""
         if not self.open:

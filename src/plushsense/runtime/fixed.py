@@ -167,15 +167,15 @@ def integer_logits(logits: NDArray[Any]) -> Ints:
 
 
 def softmax(logits: Ints) -> Ints:
-    """Compute probabilities (K,) in steps of 2^-15 from logits (K,) in steps of 1/256.
+    """Compute probabilities (..., K) in steps of 2^-15 from logits (..., K) in steps of 1/256.
 
     ``d = max - logit``; from 4096 on the probability is 0; else ``e = (coarse[d >> 6] * fine[d & 63]) >> 16``. The
     probability is ``((e << 15) + (sum >> 1)) / sum``, rounded down.
     """
-    d = int(logits.max()) - logits
+    d = logits.max(axis=-1, keepdims=True) - logits
     inside = np.minimum(d, 4095)
     e = np.where(d < 4096, (_COARSE[inside >> 6] * _FINE[inside & 63]) >> 16, 0)
-    total = int(e.sum())
+    total = e.sum(axis=-1, keepdims=True)
     return np.asarray(((e << PROBABILITY_BITS) + (total >> 1)) // total)
 
 

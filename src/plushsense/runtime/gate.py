@@ -26,6 +26,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from plushsense.core.errors import BundleError
 
 LEVEL, JERK = 0, 1
@@ -253,3 +256,133 @@ class Gate:
 
 def _held(value: int) -> int:
     return value if -HELD <= value <= HELD else HELD if value > 0 else -HELD
+
+
+Firings = list[tuple[int, int]]
+"""Sample and rule of every firing of a gate."""
+
+_CELLS = 1 << 24  # number of stretches times samples times signals computed together, which limits memory
+_ROWS = 500  # samples whose baselines are kept at once
+_TOGETHER = 2  # fewer stretches at once are slower than one sample at a time
+
+
+def firings(
+    settings: GateSettings, xs: Sequence[NDArray[np.int64]], suspects: Sequence[NDArray[np.bool_]] | None = None
+) -> list[Firings]:
+    """Return the firings of a `Gate` in each of several stretches.
+
+    Args:
+        xs: inputs (T, I) of each; suspects: which samples (T,) are suspect, by default none.
+    """
+    if not settings.rules:
+        return [[] for _ in xs]
+    if suspects is None:
+        suspects = [np.zeros(len(x), dtype=np.bool_) for x in xs]
+    if sum(map(len, xs)) < _TOGETHER * max(map(len, xs), default=0):
+        return [_one_by_one(settings, x, suspect) for x, suspect in zip(xs, suspects, strict=True)]
+    pieces: list[tuple[int, NDArray[np.int64]]] = []  # of which stretch, and its samples that are not skipped
+    for n, (x, suspect) in enumerate(zip(xs, suspects, strict=True)):
+        at = np.flatnonzero(~suspect)
+        forgets = np.flatnonzero(np.diff(at) > DOUBT) + 1
+        kept = np.append(True, (x[at[1:]] != x[at[:-1]]).any(axis=1))[: len(at)]
+        kept[forgets] = True
+        pieces += [(n, some[keep]) for some, keep in zip(np.split(at, forgets), np.split(kept, forgets), strict=True)]
+    found: list[dict[int, int]] = [{} for _ in xs]
+    order = sorted(range(len(pieces)), key=lambda k: -len(pieces[k][1]))
+    while order:
+        longest = len(pieces[order[0]][1])
+        together = max(1, _CELLS // max(1, longest * len(settings.signals)))
+        some, order = [pieces[k] for k in order[:together]], order[together:]
+        block = np.zeros((longest, len(some), len(settings.signals)), dtype=np.int32)
+        for column, (n, at) in enumerate(some):
+            block[: len(at), column] = raw_signals(xs[n][at], settings.signals)
+        follow(block, settings.signals)
+        for column, (n, at) in enumerate(some):
+            fired = _judge_all(settings, block[: len(at), column])
+            hit = np.flatnonzero(fired >= 0)
+            found[n].update(zip(at[hit].tolist(), fired[hit].tolist(), strict=True))
+    out: list[Firings] = []
+    for hits in found:
+        heard: Firings = []
+        for sample, rule in sorted(hits.items()):
+            if not heard or sample > heard[-1][0] + settings.rules[heard[-1][1]].deaf:
+                heard.append((sample, rule))
+        out.append(heard)
+    return out
+
+
+def _one_by_one(settings: GateSettings, x: NDArray[np.int64], suspect: NDArray[np.bool_]) -> Firings:
+    gate = Gate(settings)
+    fired = [gate.push(row, doubt) for row, doubt in zip(x.tolist(), suspect.tolist(), strict=True)]
+    return [(at, rule) for at, rule in enumerate(fired) if rule >= 0]
+
+
+def raw_signals(x: NDArray[np.int64], signals: Sequence[Signal]) -> NDArray[np.int64]:
+    """Return the values (T, S) of signals, before their baseline is subtracted, from inputs (T, I)."""
+    known: dict[tuple[object, ...], NDArray[np.int64]] = {}
+    for s in signals:
+        key = s.kind, s.inputs, s.lag, s.shift
+        if key in known:
+            continue
+        columns: NDArray[np.int64] = np.clip(x[:, list(s.inputs)] >> s.shift, -HELD, HELD)
+        if s.kind == LEVEL:
+            known[key] = columns[:, 0]
+        else:
+            known[key] = np.zeros(len(x), dtype=np.int64)
+            known[key][s.lag :] = np.minimum(np.abs(columns[s.lag :] - columns[: -s.lag]).sum(axis=1), HELD)
+    return np.stack([known[s.kind, s.inputs, s.lag, s.shift] for s in signals], axis=1)
+
+
+def follow(block: NDArray[np.int32], signals: Sequence[Signal], deviations: bool = False) -> NDArray[np.int32]:
+    """Replace raw signals (T, stretches, S) by their sizes with the sign of the deviation, in place.
+
+    With ``deviations``, they are replaced by the deviations instead.
+    """
+    slow = np.array([s.baseline for s in signals], dtype=np.int32)
+    slower = np.array([s.noise for s in signals], dtype=np.int32)
+    floor = np.array([s.floor for s in signals], dtype=np.int32)
+    if not len(block):
+        return block
+    base = block[0] << EXTRA_BITS
+    noise, change = np.zeros_like(base), np.zeros_like(base)
+    for first in range(0, len(block), _ROWS):
+        values = block[first : first + _ROWS]
+        bases, noises = np.empty_like(values), np.empty_like(values)
+        for high, before in zip(values << EXTRA_BITS, bases, strict=True):
+            before[...] = base
+            np.subtract(high, base, out=change)
+            np.right_shift(change, slow, out=change)
+            base += change
+        values -= bases >> EXTRA_BITS
+        if deviations:
+            continue
+        sizes = np.abs(values)
+        for size, before in zip(sizes, noises, strict=True):
+            before[...] = noise
+            np.right_shift(noise, EXTRA_BITS, out=change)
+            np.add(change, floor, out=change)
+            np.multiply(change, NOISE_CLIP, out=change)
+            np.minimum(change, size, out=change)
+            np.left_shift(change, EXTRA_BITS, out=change)
+            np.subtract(change, noise, out=change)
+            np.right_shift(change, slower, out=change)
+            noise += change
+        sizes = (sizes << THRESHOLD_BITS) // ((noises >> EXTRA_BITS) + floor)
+        np.multiply(np.sign(values), sizes, out=values)
+    return block
+
+
+def _judge_all(settings: GateSettings, sizes: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Return the first rule whose terms hold at each sample (T,), or -1, from sizes (T, S) with a sign."""
+    at = np.arange(len(sizes))
+    fired = np.full(len(sizes), -1, dtype=np.int64)
+    for number, rule in enumerate(settings.rules):
+        every = fired < 0
+        for term in rule.terms:
+            size = sizes[:, term.signal]
+            reached = (size * term.sign if term.sign else np.abs(size)) >= term.threshold
+            row = at - np.maximum.accumulate(np.where(reached, -1, at))
+            last = np.maximum.accumulate(np.where(row >= term.times, at, -1 - rule.within))
+            every &= at - last <= rule.within
+        fired[every] = number
+    return fired

@@ -58,7 +58,7 @@ class HealthSettings:
 
 
 class Health:
-    """Checks the sensor health of one stream of frames."""
+    """Checks the sensor health of one stream of frames; ``inside`` has the usual values (low, high) of each channel."""
 
     def __init__(self, settings: HealthSettings, layout: Layout) -> None:
         self.settings = settings
@@ -68,7 +68,7 @@ class Health:
             raise BundleError(
                 f"The health limits are of {len(usual)} channels, the layout has {len(self._valid)}: train again."
             )
-        self._inside = [(max(a, c), min(b, d)) for (a, b), (c, d) in zip(self._valid, usual, strict=True)]
+        self.inside = [(max(a, c), min(b, d)) for (a, b), (c, d) in zip(self._valid, usual, strict=True)]
         self.reset()
 
     def reset(self) -> None:
@@ -92,7 +92,7 @@ class Health:
         """
         settings, last = self.settings, self._last
         wrong = False
-        for i, (value, (low, high)) in enumerate(zip(values, self._inside, strict=True)):
+        for i, (value, (low, high)) in enumerate(zip(values, self.inside, strict=True)):
             # For most values only the first comparison is evaluated.
             if not low <= value <= high and (
                 not self._valid[i][0] <= value <= self._valid[i][1] or (last is not None and value == last[i])

@@ -5,14 +5,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.gestures import GestureSet
+from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
@@ -28,11 +30,22 @@ from plushsense.runtime.events import (
     EventSettings,
     Update,
 )
-from plushsense.runtime.fixed import SMOOTH_EXTRA_BITS, Ints, known_score, smooth, smoothing_weight, softmax
-from plushsense.runtime.gate import Gate, GateSettings
-from plushsense.runtime.health import HealthSettings
+from plushsense.runtime.fixed import (
+    PROBABILITY_BITS,
+    SMOOTH_EXTRA_BITS,
+    Ints,
+    known_score,
+    smoothing_weight,
+    softmax,
+)
+from plushsense.runtime.gate import Firings, GateSettings, firings
+from plushsense.runtime.health import Health, HealthSettings
 from plushsense.runtime.image import IntegerModel
-from plushsense.runtime.machine import Break, FloatLogits, FrameReader, InputRows, LogitStream, Sample, SampleReader
+from plushsense.runtime.machine import Break, FloatLogits, InputRows, LogitStream, Sample, SampleReader
+from plushsense.windows.clock import resample, row_times_us
+from plushsense.windows.features import network_inputs
+
+Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,27 +102,53 @@ def trace_of(frames: Frames, model: Bundle | IntegerModel, health: HealthSetting
         network, own = model.network.stepper(), model.rules.health
     else:
         network, own = FloatLogits(model), DecideSpec.from_dict(model.decision).health
-    reader = FrameReader(model.layout, own if health is None else health)
+    layout = model.layout
+    suspect, fault, faults = _health_of(frames, layout, own if health is None else health)
+    times = row_times_us(frames, layout.period_us)
+    step_ms = np.diff(frames.device_ms, prepend=frames.device_ms[:1])
+    begins = (step_ms < 0) | (step_ms > layout.gap_ms)
+    begins[1:] |= fault[1:] != fault[:-1]
+    edges = [0, *np.flatnonzero(begins).tolist(), len(times)]
     parts: list[Part] = []
-    samples: list[Sample] = []
-
-    def end(time_us: int) -> None:
-        if samples:
-            inputs = np.array([s.inputs for s in samples], dtype=np.int64)
-            suspect = np.array([s.suspect for s in samples], dtype=np.bool_)
+    for first, last in pairwise(edges):
+        for segment in [] if fault[first:last].any() else resample(frames.slice(first, last), layout):
+            inputs = network_inputs(segment.data, layout)
             network.reset()
-            parts.append(Part(samples[0].time_us, time_us, inputs, suspect, network.push(inputs)))
-            samples.clear()
-
-    for ms, values in zip(frames.device_ms.tolist(), frames.values.tolist(), strict=True):
-        for item in reader.push(ms, values):
-            if isinstance(item, Sample):
-                samples.append(item)
-            else:
-                end(item.time_us)
-    end(reader.time_us)
+            # A fault ends a part when it is found, a gap at the frame before.
+            ends_us = int(times[last] if last < len(times) and fault[last] else times[last - 1])
+            start_us = segment.start_us - int(frames.device_ms[first]) * 1000 + int(times[first])
+            parts.append(Part(start_us, ends_us, inputs, suspect[first + segment.row_of], network.push(inputs)))
     first_ms = int(frames.device_ms[0]) if len(frames) else 0
-    return Trace(network.arch, model.layout.period_us, model.gestures, first_ms, tuple(parts), reader.health.faults)
+    return Trace(network.arch, layout.period_us, model.gestures, first_ms, tuple(parts), faults)
+
+
+def _health_of(frames: Frames, layout: Layout, settings: HealthSettings) -> tuple[Bools, Bools, int]:
+    """Return for each frame whether it is suspect (T,) and whether there is a fault after it (T,), and count faults.
+
+    `Health` checks only the frames at which it may find something, and during faults.
+    """
+    x, ms = frames.values, frames.device_ms
+    health = Health(settings, layout)
+    low, high = np.array(health.inside, dtype=np.int64).reshape(-1, 2).T
+    unusual: Bools = np.any((x < low) | (x > high), axis=1)
+    unusual[1:] |= (x[1:] == x[:-1]).all(axis=1)
+    suspect, fault = np.zeros(len(x), dtype=np.bool_), np.zeros(len(x), dtype=np.bool_)
+    checked = 0
+    for at in np.flatnonzero(unusual).tolist():
+        if at < checked:
+            continue
+        if at > checked:
+            # Nothing of the frames between matters but the last one.
+            health.clear()
+            health.push(int(ms[at - 1]), x[at - 1].tolist())
+        while at < len(x) and (unusual[at] or health.fault):
+            if at and not 0 <= ms[at] - ms[at - 1] <= layout.gap_ms:
+                health.clear()
+            health.push(int(ms[at]), x[at].tolist())
+            suspect[at], fault[at] = health.suspect, health.fault
+            at += 1
+        checked = at
+    return suspect, fault, health.faults
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,19 +202,6 @@ class _TracedLogits:
         return max(0, (samples - self.arch.span) // self.arch.step + 1)
 
 
-def gate_hits(part: Part, settings: GateSettings) -> list[tuple[int, int]]:
-    """Return the sample index and rule index of every firing of the gate in a part."""
-    if not settings.rules:
-        return []
-    gate = Gate(settings)
-    rows, suspects = part.inputs.tolist(), part.suspect.tolist()
-    fired = [gate.push(row, suspect) for row, suspect in zip(rows, suspects, strict=True)]
-    return [(at, rule) for at, rule in enumerate(fired) if rule >= 0]
-
-
-Hits = list[list[tuple[int, int]]]
-
-
 @dataclass(frozen=True, slots=True)
 class ReportedEvent:
     """A whole event; times are in seconds since the first frame of the stream.
@@ -193,8 +219,8 @@ class ReportedEvent:
 
 
 @dataclass(frozen=True, eq=False)
-class SmoothedPart:
-    """Smoothed values of the n steps of a part.
+class SmoothedSteps:
+    """Smoothed values of n steps.
 
     ``shares`` (n, K): probabilities in units of 2^-15; ``best`` (n,): most probable class, before rounding; ``known``
     (n,): known score in units of 1/256; ``affect_shares`` (n, 4): sum of the shares of each affect, without idle.
@@ -205,12 +231,35 @@ class SmoothedPart:
     known: Ints
     affect_shares: Ints
 
+    def between(self, first: int, last: int) -> SmoothedSteps:
+        """Return the steps from ``first`` to ``last`` (exclusive)."""
+        return SmoothedSteps(*(getattr(self, f.name)[first:last] for f in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """Candidate of each of n steps: ``gesture`` (or `NO_GESTURE`) and ``affect``.
+
+    ``until``: the first later step with another candidate, or before or after a suspect step; ``idle`` (n,): whether an
+    idle class has at least ``enter``.
+    """
+
+    gesture: list[int]
+    affect: list[int]
+    until: list[int]
+    idle: Bools
+
+
+# Fewer steps are processed faster one by one; more are rarely of use at once, as the event ends before.
+_FEW_STEPS, _MANY_STEPS = 4, 100
+
 
 class TraceReplayer:
     """Replay one trace with many settings, with the same updates as `replay`, but faster.
 
     Probabilities are computed once, and smoothed once for each weight; the candidates of all steps are computed as
-    arrays; steps without a candidate are skipped while no event is open.
+    arrays; steps without a candidate while no event is open, and those in which an open event just continues, are
+    processed many at a time.
     """
 
     def __init__(self, trace: Trace) -> None:
@@ -218,112 +267,179 @@ class TraceReplayer:
         self.step_s = trace.arch.step * trace.period_us / 1e6
         self._affects = np.array([AFFECT_CODES[a] for a in trace.gestures.affects], dtype=np.int64)
         self._idle = np.array([g.idle for g in trace.gestures.gestures], dtype=np.bool_)
-        self._smoothed: dict[int, list[SmoothedPart]] = {}
-        self._hits: dict[GateSettings, Hits] = {}
+        self._edges = np.cumsum([0, *(len(part.logits) for part in trace.parts)]).tolist()
+        self._smoothed: dict[int, SmoothedSteps] = {}
+        self._hits: dict[GateSettings, list[Firings]] = {}
+        self._candidates: tuple[tuple[int, ...], _Candidates] | None = None
 
     @cached_property
-    def _probabilities(self) -> list[Ints]:
-        """Probabilities and known score (n, K + 1) of each part."""
-        k = len(self.trace.gestures)
-        rows = [np.array([softmax(row) for row in part.logits], dtype=np.int64) for part in self.trace.parts]
-        return [
-            np.column_stack([row.reshape(-1, k), known_score(part.logits.reshape(-1, k), self._idle)])
-            for row, part in zip(rows, self.trace.parts, strict=True)
-        ]
+    def _probabilities(self) -> Ints:
+        """Probabilities and known score (n, K + 1) of the steps of all parts."""
+        logits = np.concatenate([np.empty((0, len(self._idle)), dtype=np.int64), *(p.logits for p in self.trace.parts)])
+        return np.column_stack([softmax(logits), known_score(logits, self._idle)])
 
-    def smoothed(self, weight: int) -> list[SmoothedPart]:
+    @cached_property
+    def _steps(self) -> list[tuple[list[int], int]]:
+        """Times of the steps of each part, and how many of them come before its first answer."""
+        step, span, period = self.trace.arch.step, self.trace.arch.span, self.trace.period_us
+        first = (span % step or step) - 1
+        steps = []
+        for part in self.trace.parts:
+            times = (part.start_us + np.arange(first, len(part.inputs), step) * period).tolist()
+            steps.append((times, (span - 1 - first) // step))
+        return steps
+
+    @cached_property
+    def _suspect(self) -> Bools:
+        """Whether each step (n,) with an answer is suspect."""
+        step, span = self.trace.arch.step, self.trace.arch.span
+        return np.concatenate([np.zeros(0, dtype=np.bool_), *(p.suspect[span - 1 :: step] for p in self.trace.parts)])
+
+    def smoothed(self, weight: int) -> list[SmoothedSteps]:
         """Return the values of each part smoothed with ``weight``; they are cached."""
-        if weight not in self._smoothed:
-            self._smoothed[weight] = [self._smooth(rows, weight) for rows in self._probabilities]
-        return self._smoothed[weight]
+        whole = self._smooth(weight)
+        return [whole.between(first, last) for first, last in pairwise(self._edges)]
 
     def clear_cache(self) -> None:
         """Drop the cached smoothed values, which need many times the memory of the trace."""
         self._smoothed.clear()
+        self._candidates = None
 
-    def _smooth(self, rows: Ints, weight: int) -> SmoothedPart:
-        means = np.empty_like(rows)
-        mean: Ints | None = None
-        for at, row in enumerate(rows):
-            mean = smooth(mean, row, weight)
-            means[at] = mean
-        shares = means >> SMOOTH_EXTRA_BITS
-        totals = np.zeros((len(rows), 4), dtype=np.int64)
-        for code in range(4):
-            totals[:, code] = shares[:, :-1][:, (self._affects == code) & ~self._idle].sum(axis=1)
-        return SmoothedPart(shares[:, :-1], means[:, :-1].argmax(axis=1), shares[:, -1], totals)
+    def smooth(self, weights: Collection[int]) -> None:
+        """Smooth with several weights at once, which takes little longer than with one, and cache the values."""
+        missing = sorted({*weights} - self._smoothed.keys())
+        if not missing:
+            return
+        rows = self._probabilities[:, None] << SMOOTH_EXTRA_BITS
+        means = np.empty((len(rows), len(missing), rows.shape[2]), dtype=np.int64)
+        weight, half = np.array(missing)[:, None], 1 << (PROBABILITY_BITS - 1)
+        for first, last in pairwise(self._edges):
+            means[first:last] = rows[first:last]
+            for mean, now in pairwise(means[first:last]):
+                # As in `fixed.smooth`, but without new arrays.
+                now -= mean
+                now *= weight
+                now += half
+                now >>= PROBABILITY_BITS
+                now += mean
+        for at, one in enumerate(missing):
+            shares = means[:, at] >> SMOOTH_EXTRA_BITS
+            totals = np.zeros((len(rows), 4), dtype=np.int64)
+            for code in range(4):
+                totals[:, code] = shares[:, :-1][:, (self._affects == code) & ~self._idle].sum(axis=1)
+            best = means[:, at, :-1].argmax(axis=1)
+            self._smoothed[one] = SmoothedSteps(shares[:, :-1], best, shares[:, -1], totals)
 
-    def hits(self, gate: GateSettings) -> Hits:
-        """Return the `gate_hits` of each part; they are cached."""
+    def _smooth(self, weight: int) -> SmoothedSteps:
+        self.smooth([weight])
+        return self._smoothed[weight]
+
+    def hits(self, gate: GateSettings) -> list[Firings]:
+        """Return the firings of the gate in each part; they are cached."""
         if gate not in self._hits:
-            self._hits[gate] = [gate_hits(part, gate) for part in self.trace.parts]
+            parts = self.trace.parts
+            self._hits[gate] = firings(gate, [part.inputs for part in parts], [part.suspect for part in parts])
         return self._hits[gate]
 
     def replay(self, rules: Rules, weight: int) -> list[Update]:
         """Return the same updates as `replay`, with times in microseconds."""
         machine = EventMachine(rules.events, weight, self.trace.gestures)
+        candidates = self._candidates_of(weight, rules.events)
         updates: list[Update] = []
-        for part, smoothed, hits in zip(self.trace.parts, self.smoothed(weight), self.hits(rules.gate), strict=True):
-            updates += self._replay_part(machine, part, smoothed, hits, rules)
+        for at, part in enumerate(self.trace.parts):
+            updates += self._replay_part(machine, at, self._smoothed[weight], candidates, rules)
             updates += machine.lost(part.ends_us)
         return updates
 
     def updates(self, spec: DecideSpec) -> list[Update]:
         """Return the updates of events with the settings ``spec``, times in microseconds."""
-        return self.replay(spec.rules(self.step_s), smoothing_weight(spec.smoothing_s, self.step_s))
+        return self.replay(spec.rules(self.step_s), self.weight(spec.smoothing_s))
+
+    def weight(self, smoothing_s: float) -> int:
+        """Return the weight of a new step for a time constant."""
+        return smoothing_weight(smoothing_s, self.step_s)
 
     def events(self, spec: DecideSpec) -> list[ReportedEvent]:
         """Return the events with the settings ``spec``."""
         return reported_events(self.updates(spec))
 
-    def _candidates(self, smoothed: SmoothedPart, settings: EventSettings) -> tuple[Ints, Ints]:
-        """Return gesture (n,) (or `NO_GESTURE`) and affect (n,) of the candidate of each step, as in `EventMachine`."""
+    def _candidates_of(self, weight: int, settings: EventSettings) -> _Candidates:
+        """Return the candidates of all steps, as in `EventMachine`; those of the last settings are cached."""
+        key = weight, settings.enter, settings.enter_affect, settings.known
+        smoothed = self._smooth(weight)
+        if self._candidates is not None and self._candidates[0] == key:
+            return self._candidates[1]
         share = np.take_along_axis(smoothed.shares, smoothed.best[:, None], axis=1)[:, 0]
-        known = (smoothed.known >= settings.known) & ~self._idle[smoothed.best]
-        sure = known & (share >= settings.enter)
+        high, idle = share >= settings.enter, self._idle[smoothed.best]
+        known = (smoothed.known >= settings.known) & ~idle & ~self._suspect
+        sure = known & high
         totals = smoothed.affect_shares[:, 1:]
         leans = known & ~sure & (totals.max(axis=1) >= settings.enter_affect)
         gesture = np.where(sure, smoothed.best, NO_GESTURE)
-        return gesture, np.where(sure, self._affects[smoothed.best], np.where(leans, totals.argmax(axis=1) + 1, 0))
+        affect = np.where(sure, self._affects[smoothed.best], np.where(leans, totals.argmax(axis=1) + 1, 0))
+        differs = np.ones(len(share), dtype=np.bool_)
+        for one in (gesture, affect):
+            differs[1:] &= one[1:] == one[:-1]
+        differs[1:] = ~differs[1:] | self._suspect[1:] | self._suspect[:-1]
+        begins = np.append(np.flatnonzero(differs), len(share))
+        until = np.repeat(begins[1:], np.diff(begins)).tolist()
+        found = _Candidates(gesture.tolist(), affect.tolist(), until, idle & high)
+        self._candidates = key, found
+        return found
 
     def _replay_part(
-        self,
-        machine: EventMachine,
-        part: Part,
-        smoothed: SmoothedPart,
-        hits: Sequence[tuple[int, int]],
-        rules: Rules,
+        self, machine: EventMachine, number: int, smoothed: SmoothedSteps, candidates: _Candidates, rules: Rules
     ) -> Iterator[Update]:
-        step, span, period = self.trace.arch.step, self.trace.arch.span, self.trace.period_us
-        first = (span % step or step) - 1
-        blind = (span - 1 - first) // step  # steps before the first answer
-        at_sample = np.arange(first, len(part.inputs), step)
-        n, times = len(at_sample), (part.start_us + at_sample * period).tolist()
-        gestures, affects = self._candidates(smoothed, rules.events)
-        suspects = part.suspect[at_sample[blind:]]
-        lively = blind + np.flatnonzero((gestures != NO_GESTURE) | (affects > 0) | suspects)
-        next_lively = np.append(lively, n)[np.searchsorted(lively, np.arange(n + 1))].tolist()
-        rows = list(zip(smoothed.best.tolist(), gestures.tolist(), affects.tolist(), strict=True))
-        doubts: list[bool] = suspects.tolist()
-        at = 0
+        part, (times, blind), base = self.trace.parts[number], self._steps[number], self._edges[number]
+        step, n, at = self.trace.arch.step, len(times), 0
+        first = (self.trace.arch.span % step or step) - 1
         # If the gate fires, it does so before the step of the same sample.
-        for sample, rule in [*hits, (len(part.inputs), -1)]:
+        for sample, rule in [*self.hits(rules.gate)[number], (len(part.inputs), -1)]:
             stop = min(-((first - sample) // step), n) if rule >= 0 else n
             while at < stop:
-                quiet = at if machine.open else min(next_lively[at], stop)
-                if quiet > at:
-                    machine.skip(max(0, quiet - max(at, blind)), times[at])
-                    at = quiet
-                    continue
                 if at < blind:
-                    yield from machine.blind_step(times[at])
-                else:
-                    k = at - blind
-                    yield from machine.follow(smoothed.shares[k].tolist(), *rows[k], times[at], doubts[k])
+                    if machine.open:
+                        yield from machine.blind_step(times[at])
+                        at += 1
+                    else:
+                        at = min(blind, stop)
+                    continue
+                k = base + at - blind
+                gesture, affect = candidates.gesture[k], candidates.affect[k]
+                same = min(candidates.until[k] - k, stop - at)
+                if machine.open:
+                    if same > _FEW_STEPS and affect in (0, machine.affect) and gesture in (NO_GESTURE, machine.gesture):
+                        stays = self._staying(machine, k, min(same, _MANY_STEPS), smoothed, candidates.idle)
+                        if stays:
+                            machine.stay(stays, gesture, affect, times[at])
+                            at += stays
+                            continue
+                elif gesture == NO_GESTURE and not affect and not self._suspect[k]:
+                    machine.skip(same, times[at])
+                    at += same
+                    continue
+                doubt = bool(self._suspect[k])
+                # Shares are only needed for an open event.
+                shares, best = smoothed.shares[k].tolist() if machine.open else [], int(smoothed.best[k])
+                yield from machine.follow(shares, best, gesture, affect, times[at], doubt)
                 at += 1
             if rule >= 0:
                 fired = rules.gate.rules[rule]
-                yield from machine.gate(fired.affect, fired.gesture, part.start_us + sample * period)
+                yield from machine.gate(fired.affect, fired.gesture, part.start_us + sample * self.trace.period_us)
+
+    @staticmethod
+    def _staying(machine: EventMachine, at: int, steps: int, smoothed: SmoothedSteps, idle: Bools) -> int:
+        """Return how many of the ``steps`` from ``at`` on do not speak against the open event, from the first."""
+        settings = machine.settings
+        if machine.gesture != NO_GESTURE:
+            stays = smoothed.shares[at : at + steps, machine.gesture] >= settings.leave
+        elif machine.affect:
+            stays = smoothed.affect_shares[at : at + steps, machine.affect] >= settings.leave_affect
+        else:
+            return 0
+        stays &= ~idle[at : at + steps]
+        against = int(stays.argmin())
+        return steps if stays[against] else against
 
 
 def reported_events(updates: Sequence[Update]) -> list[ReportedEvent]:

@@ -23,7 +23,7 @@ from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import ONE
 from plushsense.runtime.fixed import Ints, integer_logits, known_score, smoothing_weight, softmax
 from plushsense.runtime.health import MOST_MS, HealthSettings
-from plushsense.runtime.trace import TraceReplayer, trace_of
+from plushsense.runtime.trace import trace_of
 from plushsense.scoring.events import ErrorCosts
 from plushsense.tuning.events import OTHER, MarkedStream, Truth, tune
 from plushsense.tuning.gate import fit_gate
@@ -141,7 +141,7 @@ def _long_wrong(
 COVERAGE = 0.9
 KNOWN_SHARE = 0.95
 # The search uses at most this much of the streams, for which it takes about 15 s.
-MOST_SEARCHED_S = 3600.0
+MOST_SEARCHED_S = 4 * 3600.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +179,7 @@ def fit_decisions(
     training: Iterable[str] = (),
     spec: DecideSpec | None = None,
     keep: Collection[str] = (),
+    networks: Sequence[tuple[Bundle, Collection[str]]] = (),
 ) -> DecideSpec:
     """Fit all decision settings; ``fitted`` of the result describes the data and the outcome.
 
@@ -194,9 +195,11 @@ def fit_decisions(
     Labelled steps are in the second half of a recording, as in the first half the network still reads earlier samples.
 
     Args:
-        subjects: training people to whom the weights were not fitted.
+        subjects: people to whom the weights of the network that reads them were not fitted.
         training: people to whom they were fitted, who are used for gate and health only.
         spec: start of the search; ``keep`` names the settings not to change.
+        networks: for cross-fitting: networks of the same kind, each with those of ``subjects`` whose recordings it
+            reads because it was trained on others; by default, ``bundle`` reads those of all.
 
     Raises:
         ConfigError: for a coverage or a share out of range.
@@ -216,7 +219,10 @@ def fit_decisions(
     if "gate" not in keep:
         fitted = fit_gate(dataset, bundle.gestures, everybody, false_alarms_per_hour=false_alarms_per_hour)
         spec, gate = replace(spec, gate=fitted.settings), fitted.report
-    streams = marked_streams(bundle, dataset, people, spec)
+    reads = [(network, set(theirs)) for network, theirs in networks] or [(bundle, set(people))]
+    streams = [
+        h for network, theirs in reads for h in marked_streams(network, dataset, theirs, spec, share=len(people))
+    ]
     idle = [k for k, gesture in enumerate(bundle.gestures.gestures) if gesture.idle]
     report: dict[str, Any] = {
         "people": len(people),
@@ -224,6 +230,7 @@ def fit_decisions(
         "hours": round(sum(h.trace.seconds for h in streams) / 3600, 3),
         "gestures": sum(t.gesture not in (OTHER, *idle) for h in streams for t in h.truths),
         "simulated": dataset.head.simulated,
+        "networks": len(networks) or None,
     }
     if streams:
         if "known_margin" not in keep:
@@ -244,7 +251,7 @@ def fit_decisions(
             "moved": {name: list(values) for name, values in tuned.moved.items()},
         }
     else:
-        labelled = labelled_windows(bundle, dataset, people)
+        labelled = joined([labelled_windows(network, dataset, theirs) for network, theirs in reads])
         report["events"] = {"on": "nothing: nobody who was held back has a stream", "moved": {}}
     if len(labelled.truth):
         if "known_margin" not in keep:
@@ -292,13 +299,16 @@ def marked_streams(
     subjects: Iterable[str],
     spec: DecideSpec,
     gestures: GestureSet | None = None,
+    share: int = 0,
 ) -> list[MarkedStream]:
     """Compute the traces of the streams of some people, with their marked recordings.
 
-    Streams without a marked recording are left out. Of more than an hour, an equal part is used for each person.
+    Streams without a marked recording are left out. Of more than `MOST_SEARCHED_S`, an equal part is used for each
+    person.
 
     Args:
         gestures: the set to which the indices of the truths refer; by default the network's own.
+        share: number of people among whom this time is shared; at least those who have streams here.
     """
     people = set(subjects)
     marked: dict[str, list[RecordingInfo]] = {}
@@ -306,7 +316,7 @@ def marked_streams(
         if r.stream_row >= 0:
             marked.setdefault(r.stream, []).append(r)
     streams = [s for s in dataset.streams if s.subject in people and s.id in marked]
-    share_s = MOST_SEARCHED_S / max(len({s.subject for s in streams}), 1)
+    share_s = MOST_SEARCHED_S / max(len({s.subject for s in streams}), share, 1)
     left = {s.subject: round(share_s * dataset.layout.rate_hz) for s in streams}
     out = []
     for stream in streams:
@@ -344,7 +354,7 @@ def labelled_steps(bundle: Bundle, streams: Sequence[MarkedStream], spec: Decide
     recording: list[int] = []
     number = 0
     for h in streams:
-        parts = TraceReplayer(h.trace).smoothed(weight)
+        parts = h.replayer.smoothed(weight)
         times = [h.trace.step_times_us(part) for part in h.trace.parts]
         for t in h.truths:
             if t.gesture == OTHER:
@@ -376,9 +386,16 @@ def labelled_windows(bundle: Bundle, dataset: Dataset, subjects: Iterable[str]) 
         empty = np.zeros((0, len(bundle.gestures)), dtype=np.int64)
         return LabelledSteps(empty, _ints(()), _ints(()), np.zeros(0, dtype=np.str_), _ints(()))
     logits = integer_logits(bundle.network().forward(bundle.scaler.apply(windows.x)))
-    shares = np.array([softmax(row) for row in logits], dtype=np.int64)
+    shares = softmax(logits)
     known = known_score(logits, np.array([g.idle for g in bundle.gestures.gestures]))
     return LabelledSteps(shares, known, windows.y, windows.subject, windows.recording)
+
+
+def joined(parts: Sequence[LabelledSteps]) -> LabelledSteps:
+    """Join the labelled steps of different people; their recordings are numbered anew."""
+    whole = LabelledSteps(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(LabelledSteps)))
+    offsets = np.cumsum([0, *(int(p.recording.max(initial=-1)) + 1 for p in parts)])[:-1]
+    return replace(whole, recording=whole.recording + np.repeat(offsets, [len(p.truth) for p in parts]))
 
 
 def _ints(values: Sequence[int]) -> Ints:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,11 @@ class MarkedStream:
     person: str
     trace: Trace
     truths: tuple[Truth, ...]
+
+    @cached_property
+    def replayer(self) -> TraceReplayer:
+        """The replayer of the trace."""
+        return TraceReplayer(self.trace)
 
 
 @dataclass(slots=True)
@@ -196,17 +202,18 @@ def tune(
         keep: settings not to change.
     """
     prices = prices or ErrorCosts()
-    listeners = [(h, TraceReplayer(h.trace)) for h in streams]
     gate = bool(spec.gate.rules)
     settings = TRIED | (TRIED_AFFECT if gestures.has_affect else {}) | (TRIED_GATE if gate else {})
     settings = {name: values for name, values in settings.items() if name not in keep}
+    for h in streams:
+        h.replayer.smooth([h.replayer.weight(s) for s in (spec.smoothing_s, *settings.get("smoothing_s", ()))])
     costs: dict[tuple[Any, ...], list[NDArray[np.float64]]] = {}
 
     def cost(candidate: DecideSpec) -> list[NDArray[np.float64]]:
         key = tuple(getattr(candidate, name) for name in settings)
         if key not in costs:
             costs[key] = [
-                event_costs(h, timed_events(listener.updates(candidate)), gestures, prices) for h, listener in listeners
+                event_costs(h, timed_events(h.replayer.updates(candidate)), gestures, prices) for h in streams
             ]
         return costs[key]
 

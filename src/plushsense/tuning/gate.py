@@ -21,18 +21,17 @@ from plushsense.core.layouts import Layout
 from plushsense.dataset.store import Dataset
 from plushsense.runtime.events import AFFECT_CODES, NO_GESTURE
 from plushsense.runtime.gate import (
-    EXTRA_BITS,
     HELD,
     JERK,
     LEVEL,
     MOST_LAG,
-    NOISE_CLIP,
-    THRESHOLD_BITS,
-    Gate,
     GateSettings,
     Rule,
     Signal,
     Term,
+    firings,
+    follow,
+    raw_signals,
 )
 from plushsense.tuning.gate_rules import BETWEEN, CALM, LEFT_OUT, FoundRule, Heights, Material, best_rule, material_of
 
@@ -40,16 +39,6 @@ LEAD = 1200
 """Number of samples computed before a piece, in which the baseline settles."""
 PIECE = 4800
 _CELLS = 12_000  # number of pieces times signals computed together; more do not fit the cache
-
-
-def raw_signal(x: NDArray[np.int64], signal: Signal) -> NDArray[np.int64]:
-    """Return the values (T,) of a signal, before its baseline is subtracted, from inputs (T, I)."""
-    columns: NDArray[np.int64] = np.clip(x[:, list(signal.inputs)] >> signal.shift, -HELD, HELD)
-    if signal.kind == LEVEL:
-        return np.asarray(columns[:, 0])
-    out = np.zeros(len(x), dtype=np.int64)
-    out[signal.lag :] = np.abs(columns[signal.lag :] - columns[: -signal.lag]).sum(axis=1)
-    return np.minimum(out, HELD)
 
 
 def signal_sizes(
@@ -68,34 +57,14 @@ def signal_sizes(
     for first in range(0, len(pieces), per):
         some = pieces[first : first + per]
         stops = [min(at + PIECE, len(xs[n])) for n, at, _ in some]
-        # A jerk needs up to `MOST_LAG` earlier samples.
         block = np.zeros((stops[0] - some[0][2], len(some), len(signals)), dtype=np.int32)
         for column, ((n, _, begin), stop) in enumerate(zip(some, stops, strict=True)):
-            back = max(0, begin - 16)
-            for s, signal in enumerate(signals):
-                block[: stop - begin, column, s] = raw_signal(xs[n][back:stop], signal)[begin - back :]
-        sizes = _follow_block(block, signals, deviations)
+            back = max(0, begin - MOST_LAG)
+            block[: stop - begin, column] = raw_signals(xs[n][back:stop], signals)[begin - back :]
+        sizes = follow(block, signals, deviations)
         for column, ((n, at, begin), stop) in enumerate(zip(some, stops, strict=True)):
             out[n][at:stop] = sizes[at - begin : stop - begin, column]
     return out
-
-
-def _follow_block(block: NDArray[np.int32], signals: Sequence[Signal], deviations: bool) -> NDArray[np.int32]:
-    """Replace raw signals (T, pieces, S) by their sizes, in place."""
-    slow = np.array([s.baseline for s in signals], dtype=np.int32)
-    slower = np.array([s.noise for s in signals], dtype=np.int32)
-    floor = np.array([s.floor for s in signals], dtype=np.int32)
-    base = block[0] << EXTRA_BITS
-    noise = np.zeros_like(base)
-    for t in range(len(block)):
-        value = block[t]
-        deviation = value - (base >> EXTRA_BITS)
-        size = np.abs(deviation)
-        level = (noise >> EXTRA_BITS) + floor
-        base += ((value << EXTRA_BITS) - base) >> slow
-        noise += ((np.minimum(size, NOISE_CLIP * level) << EXTRA_BITS) - noise) >> slower
-        block[t] = deviation if deviations else np.sign(deviation) * ((size << THRESHOLD_BITS) // level)
-    return block
 
 
 _TOGETHER = 6  # number of stretches processed at once with all candidates, which limits memory
@@ -235,12 +204,9 @@ class _Candidates:
         self._sizes = [self._lasting(sizes) for sizes in self._signed(self._xs, self.candidates)]
 
     def _signed(self, xs: list[NDArray[np.int64]], candidates: list[tuple[Signal, int]]) -> list[NDArray[np.int32]]:
+        signs = np.array([sign for _, sign in candidates], dtype=np.int32)
         sizes = signal_sizes(xs, [signal for signal, _ in candidates])
-        for column, (_, sign) in enumerate(candidates):
-            for of in sizes:
-                one = of[:, column]
-                np.copyto(one, np.abs(one) if sign == 0 else np.maximum(one * sign, 0))
-        return sizes
+        return [np.maximum(of * signs, np.where(signs == 0, np.abs(of), 0)) for of in sizes]
 
     def _lasting(self, sizes: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the largest threshold at which a term holds: minimum over ``times``, then maximum over ``within``."""
@@ -373,12 +339,10 @@ def measure_gate(settings: GateSettings, material: Material, layout: Layout) -> 
     wrong = {CALM: 0, BETWEEN: 0}
     calm_hit: set[int] = set()
     wrong_by: dict[str, int] = {}
-    for stretch in material.stretches:
-        gate = Gate(settings)
+    hits = firings(settings, [s.x for s in material.stretches])
+    for stretch, fired in zip(material.stretches, hits, strict=True):
         begun = {int(t): int(np.argmax(stretch.trial == t)) for t in np.unique(stretch.trial) if t >= 0}
-        for at, row in enumerate(stretch.x.tolist()):
-            if gate.push(row) < 0:
-                continue
+        for at, _ in fired:
             trial = int(stretch.trial[at])
             if trial >= 0:
                 first.setdefault(trial, at - begun[trial])
