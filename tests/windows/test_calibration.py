@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,14 +42,12 @@ def frames(x: NDArray[np.int64], start: int = 0) -> Frames:
 
 
 @settings(max_examples=10)
-@given(
-    st.integers(0, 1 << 20), st.lists(st.integers(0, 700), max_size=4), st.integers(-60_000, 60_000), st.booleans()
-)
+@given(st.integers(0, 1 << 20), st.lists(st.integers(0, 700), max_size=4), st.integers(-60_000, 60_000), st.booleans())
 def test_blocks_and_single_samples_give_the_same(seed: int, cuts: list[int], offset: int, coarse: bool) -> None:
     x = readings(700, seed, 60.0 if coarse else 9000.0) + offset
     edges = [0, *sorted(cuts), len(x)]
     batch, stream = SelfCalibration(LAYOUT), SelfCalibration(LAYOUT)
-    parts = [batch.apply(x[a:b]) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    parts = [batch.apply(x[a:b]) for a, b in itertools.pairwise(edges)]
     assert np.concatenate(parts).tolist() == [stream.push(row) for row in x.tolist()]
 
 
