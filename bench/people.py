@@ -3,9 +3,10 @@
     python bench/people.py ../shared/data/makeability-gestures OUT [--rows kept,raw] [--seeds 0,1,2] [--json]
 
 The settings are chosen on the people P01 to P14 alone: by-subject:5, the shared gestures, windows with their real past;
-the other people are not read. Each seed trains five networks. OUT holds the data set of these people and the finished
-folds, so that a stopped run can be continued, and networks that several rows share. A row of three seeds takes about
-three minutes on two cores, all of them about two hours. The row "ceiling" needs the extra "rocket".
+the other people are not read, except with --everybody, for the rows of the self-calibration. Each seed trains five
+networks. OUT holds the data set of these people and the finished folds, so that a stopped run can be continued, and
+networks that several rows share. A row of three seeds takes about three minutes on two cores, all of them about two
+hours. The row "ceiling" needs the extra "rocket".
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ from torch.nn import functional as F
 
 import plushsense as ps
 from plushsense.core import layouts
-from plushsense.dataset.store import HEAD, Dataset
+from plushsense.core.recorder_csv import Frames
+from plushsense.dataset.store import HEAD, Dataset, RecordingInfo
 from plushsense.evaluation.crossval import EpochProgress, FoldOutput, evaluate, windows_fingerprint
 from plushsense.experiments.baselines.models import RocketFit, likelihoods
 from plushsense.jobs.journal import Journal, job_id
@@ -285,7 +287,9 @@ VARIANTS: dict[str, Callable[[FoldTask], Floats]] = {
 class Row:
     """An idea: settings as for `plushsense.evaluate`, a time constant of gravity, and one of `VARIANTS`.
 
-    ``seeds``: the most that are measured; ``parameters``: where they are not those of the one network.
+    ``seeds``: the most that are measured; ``parameters``: where they are not those of the one network;
+    ``calibrated``: whether the accelerometer calibrates itself; ``regained``: whether each person's readings have
+    another gain and offset (`Regained`).
     """
 
     title: str
@@ -294,6 +298,8 @@ class Row:
     variant: str = ""
     seeds: int = 3
     parameters: int | None = None
+    calibrated: bool = False
+    regained: bool = False
 
 
 GAIN, TILT, SPEED = "random-gain:0.3", "random-tilt:8", "random-speed:0.2"
@@ -339,7 +345,38 @@ ROWS: dict[str, Row] = {
     "people-3": Row("trained on 3 people of 11", variant="people 3"),
     "people-6": Row("trained on 6 people of 11", variant="people 6"),
     "people-9": Row("trained on 9 people of 11", variant="people 9"),
+    "calibrated": Row("self-calibration", calibrated=True),
+    "regained": Row("  each person's readings with another gain and offset", calibrated=True, regained=True),
+    "uncalibrated": Row("  the same without self-calibration", regained=True),
 }
+
+
+class Regained(Dataset):
+    """A data set whose readings have a gain (0.2 to 5, log-uniform) and an offset (up to ±5 g) of each person's own."""
+
+    _WIDE = 1 << 18
+
+    @classmethod
+    def of(cls, dataset: Dataset) -> Regained:
+        """Return the data set with other readings, and a layout that takes them for valid."""
+        layout = dataset.layout
+        channels = tuple(replace(c, valid_min=-float(cls._WIDE), valid_max=float(cls._WIDE)) for c in layout.channels)
+        head = replace(dataset.head, layout=replace(layout, channels=channels))
+        return cls(dataset.path, head, dataset.recordings, dataset.streams)
+
+    def read(self, recording: RecordingInfo) -> Frames:
+        return self._changed(super().read(recording), recording.subject)
+
+    def read_stream(self, stream: str) -> Frames:
+        return self._changed(super().read_stream(stream), next(s.subject for s in self.streams if s.id == stream))
+
+    def _changed(self, frames: Frames, person: str) -> Frames:
+        rng = np.random.default_rng(list(person.encode()))
+        gain, offset = 5.0 ** rng.uniform(-1.0, 1.0), np.rint(rng.uniform(-40_000, 40_000, frames.values.shape[1]))
+        return replace(frames, values=np.rint(frames.values * gain + offset).astype(np.int64))
+
+    def with_inputs(self, layout: layouts.Layout) -> Dataset:
+        return Regained(self.path, replace(self.head, layout=layout), self.recordings, self.streams)
 
 
 @dataclass(frozen=True)
@@ -373,6 +410,7 @@ def main() -> None:
     parser.add_argument("out", type=Path, help="folder for the data set and the finished folds")
     parser.add_argument("--rows", default=",".join(ROWS), help="rows to measure (all)")
     parser.add_argument("--seeds", default="0,1,2")
+    parser.add_argument("--everybody", action="store_true", help="all people, also those kept for the final score")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--epochs", type=int, help="fewer epochs, to try the program")
     parser.add_argument("--json", action="store_true")
@@ -380,21 +418,23 @@ def main() -> None:
     names = args.rows.split(",")
     if unknown := [name for name in names if name not in ROWS]:
         raise SystemExit(f"unknown rows: {', '.join(unknown)}; there are {', '.join(ROWS)}")
-    began, dataset = time.monotonic(), chosen_people(args.source, args.out)
+    began, dataset = time.monotonic(), chosen_people(args.source, args.out, args.everybody)
     table = {}
     for name in names:
         table[name] = measured(ROWS[name], dataset, [int(s) for s in args.seeds.split(",")], args)
         if not args.json:
             print(line(ROWS[name], table[name]), flush=True)
     if args.json:
-        print(json.dumps({"people": PEOPLE, "split": SPLIT, "rows": table}))
+        print(json.dumps({"people": None if args.everybody else PEOPLE, "split": SPLIT, "rows": table}))
     else:
         print(f"{len(table)} rows in {(time.monotonic() - began) / 60:.0f} min, folds of earlier runs not counted")
 
 
-def chosen_people(source: Path, out: Path) -> Dataset:
-    """Import the recordings of `PEOPLE` alone, once."""
-    folder = out / "dataset"
+def chosen_people(source: Path, out: Path, everybody: bool = False) -> Dataset:
+    """Import the recordings of `PEOPLE` alone, or of all people, once."""
+    folder = out / ("everybody" if everybody else "dataset")
+    if everybody and not (folder / HEAD).is_file():
+        ps.import_recordings(source, folder, layout="accel-3")
     if not (folder / HEAD).is_file():
         with tempfile.TemporaryDirectory() as place:
             for person in PEOPLE:
@@ -418,6 +458,10 @@ def measured(row: Row, dataset: Dataset, seeds: list[int], args: argparse.Namesp
 def evaluated(row: Row, dataset: Dataset, seed: int, args: argparse.Namespace) -> tuple[dict[str, Any], int]:
     settings = {**row.settings, "seed": seed} | ({"epochs": args.epochs} if args.epochs else {})
     config: RunConfig
+    if row.regained:
+        dataset = Regained.of(dataset)
+    if row.calibrated:
+        dataset = dataset.with_inputs(replace(dataset.layout, self_calibration=dataset.layout.vectors[0]))
     read, config = network_inputs_of(dataset, from_settings(**settings))
     config = replace(config, evaluation=replace(config.evaluation, seed=0))
     gestures = classes_for(read, config.evaluation.classes, config.windows.context)

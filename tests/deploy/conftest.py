@@ -64,6 +64,12 @@ def window_libraries(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.fixture(scope="session")
+def calibrated_library(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The library for models whose accelerometers calibrate themselves."""
+    return compiled(c_compiler, tmp_path_factory, "-DPLUSH_CALIBRATE")
+
+
+@pytest.fixture(scope="session")
 def sanitized(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Programs that read a file of cases under the address and undefined-behaviour sanitizers."""
     folder = built_once(tmp_path_factory, "sanitized", lambda draft: _sanitize(c_compiler, draft))

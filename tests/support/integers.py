@@ -29,8 +29,11 @@ GRAVITY_RANGES = ((0, 1023), (-3, 3), (5, 5), (-32_768, 32_767), (-262_000, 262_
 RATES = (50.0, 62.5, 99.7, 100.0, 104.0, 333.3)
 
 
-def any_layout(draw: st.DrawFn) -> Layout:
-    """1 to 8 measured channels, up to 3 magnitudes, 1 to 11 inputs, each rate and gap; at times 1 or 2 vectors."""
+def any_layout(draw: st.DrawFn, calibrated: bool = False) -> Layout:
+    """1 to 8 measured channels, up to 3 magnitudes, 1 to 11 inputs, each rate and gap; at times 1 or 2 vectors.
+
+    With ``calibrated`` there is a vector, and the last or all calibrate themselves.
+    """
     ranges = draw(st.lists(st.sampled_from(RANGES), min_size=1, max_size=8))
     magnitudes = draw(st.lists(st.lists(st.integers(0, len(ranges) - 1), min_size=1, max_size=4), max_size=3))
     for of in magnitudes:
@@ -41,7 +44,7 @@ def any_layout(draw: st.DrawFn) -> Layout:
         Channel(f"c{i}", "raw", "touch", valid_min=low, valid_max=high) for i, (low, high) in enumerate(ranges)
     )
     vectors = []
-    for v in range(draw(st.sampled_from((0, 0, 1, 2)))):
+    for v in range(draw(st.sampled_from((1, 2) if calibrated else (0, 0, 1, 2)))):
         low, high = draw(st.sampled_from(GRAVITY_RANGES))
         zero = draw(st.integers(low, high))
         channels += tuple(
@@ -62,6 +65,7 @@ def any_layout(draw: st.DrawFn) -> Layout:
         csv=CsvFormat(("device_ms",), ("device_ms",), ","),
         gap_ms=draw(st.sampled_from((30, 100, 250, 4000))),
         vectors=tuple(vectors),
+        self_calibration=tuple(a for v in vectors[-draw(st.integers(1, 2)) :] for a in v) if calibrated else (),
     )
     return layout.for_vectors() if vectors else layout
 
@@ -188,9 +192,9 @@ def any_rules(arch: Arch, layout: Layout, rng: np.random.Generator) -> Rules:
 
 
 @st.composite
-def models(draw: st.DrawFn, longest: int = 700, window: bool = False) -> IntegerModel:
+def models(draw: st.DrawFn, longest: int = 700, window: bool = False, calibrated: bool = False) -> IntegerModel:
     """Any model that fits the toy and whose span is at most ``longest`` samples; a ``window`` network has padding."""
-    layout = any_layout(draw)
+    layout = any_layout(draw, calibrated)
     layers: list[ConvLayer] = []
     left = longest - 100
     vector = None

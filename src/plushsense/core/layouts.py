@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +21,9 @@ MAGNITUDE_FRACTION_BITS = 4
 GRAVITY_FRACTION_BITS = 4
 GRAVITY_STATE_BITS = 10  # fraction bits of the running mean itself
 GRAVITY_S = 0.64  # time constant of the running mean; chosen on 14 people (bench/people.py)
+CALIBRATION_BLOCK_S = 0.32
+MOST_CALIBRATED_VECTORS = 8  # as many flags as fit a byte of the image
+MOST_CALIBRATED = 1 << 19  # size of a reading in steps, so that the sums of a self-calibration fit 64 bits
 ACCELERATION = "acceleration"
 BINARY, COUNT = "binary", "count"
 DERIVED_KINDS = ("magnitude", "gravity")
@@ -166,6 +169,8 @@ class Layout:
             anew (1 to 60000, and at most 60000 samples).
         vectors: the axes of each three-axis sensor as a list of three channels of one kind. With an acceleration among
             them, the default network does not depend on how the toy is held.
+        self_calibration: axes of accelerometers whose offset and scale are estimated from the readings themselves
+            (`plushsense.windows.calibration`); their offsets in ``channels`` then do not matter (default: none).
     """
 
     name: str
@@ -178,6 +183,7 @@ class Layout:
     csv: CsvFormat
     gap_ms: int = 100
     vectors: tuple[tuple[str, ...], ...] = ()
+    self_calibration: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for problem in self._problems():
@@ -216,6 +222,7 @@ class Layout:
                 yield f"a vector has three axes, not {len(vector)}."
             if len({kinds[self.names[self.index(name)]] for name in vector}) > 1:
                 yield f"the axes {', '.join(vector)} of a vector are of different kinds: give them one."
+        yield from self._problems_of_calibration(kinds)
 
     def _problems_of_size(self) -> Iterator[str]:
         for what in ("channels", "wire", "derived", "inputs", "vectors"):
@@ -249,6 +256,25 @@ class Layout:
                     f"channel '{name}' feeds '{derived.name}' but is valid from {self.valid_min_int[at]} to "
                     f"{self.valid_max_int[at]} steps: give it valid_min and valid_max within {limit} steps of its "
                     f"offset, so that the {derived.kind} fits 32 bits."
+                )
+
+    def _problems_of_calibration(self, kinds: Mapping[str, str]) -> Iterator[str]:
+        accelerometers = [v for v in self.vectors if kinds[v[0]] == ACCELERATION]
+        whole = [axis for v in accelerometers if set(v) <= set(self.self_calibration) for axis in v]
+        if sorted(self.self_calibration) != sorted(whole):  # both are empty by default
+            known = "; ".join(", ".join(v) for v in accelerometers) or "none"
+            yield (
+                f"self_calibration is {', '.join(self.self_calibration)}: accepted are all three axes of vectors of "
+                f"the kind '{ACCELERATION}', here {known}."
+            )
+        if len(whole) > 3 * MOST_CALIBRATED_VECTORS:
+            yield f"self_calibration names {len(whole) // 3} sensors: accepted are up to {MOST_CALIBRATED_VECTORS}."
+        for axis in whole:
+            at = self.index(axis)
+            if max(abs(int(self.valid_min_int[at])), abs(int(self.valid_max_int[at]))) > MOST_CALIBRATED:
+                yield (
+                    f"channel '{axis}' is in self_calibration but is valid from {self.valid_min_int[at]} to "
+                    f"{self.valid_max_int[at]} steps: give it valid_min and valid_max within ±{MOST_CALIBRATED}."
                 )
 
     @property
@@ -295,6 +321,16 @@ class Layout:
     def gravity_shift(self) -> int:
         """Binary logarithm of the time constant of the running mean, in samples."""
         return max(0, round(math.log2(GRAVITY_S * self.rate_hz)))
+
+    @property
+    def calibrated_vectors(self) -> tuple[tuple[int, ...], ...]:
+        """Indices of the channels (x, y, z) of each accelerometer that calibrates itself."""
+        return tuple(tuple(map(self.index, v)) for v in self.vectors if set(v) <= set(self.self_calibration))
+
+    @property
+    def calibration_shift(self) -> int:
+        """Binary logarithm of the samples in a block of a self-calibration, 2 to 8."""
+        return min(max(2, round(math.log2(CALIBRATION_BLOCK_S * self.rate_hz))), 8)
 
     @property
     def input_kinds(self) -> tuple[str, ...]:
@@ -378,8 +414,11 @@ class Layout:
         return max(1, round(seconds * self.rate_hz))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON."""
-        return asdict(self)
+        """Return plain values, ready for JSON; without ``self_calibration`` if it is empty, as before there was one."""
+        table = asdict(self)
+        if not self.self_calibration:
+            del table["self_calibration"]
+        return table
 
     @classmethod
     def from_dict(cls, table: dict[str, Any], where: str = "layout") -> Layout:

@@ -340,11 +340,15 @@ class Dataset:
         self._with_stretches = True
 
     def with_inputs(self, layout: Layout) -> Dataset:
-        """Return this data set with the network inputs of ``layout``; itself if the measured channels differ."""
+        """Return this data set with the network inputs of ``layout``; itself if the measured channels differ.
+
+        With the inputs comes the self-calibration that they are computed from.
+        """
         own = self.layout
-        if own.channels != layout.channels or (own.inputs, own.derived) == (layout.inputs, layout.derived):
+        given = {key: getattr(layout, key) for key in ("inputs", "derived", "self_calibration")}
+        if own.channels != layout.channels or given == {key: getattr(own, key) for key in given}:
             return self
-        head = replace(self.head, layout=replace(own, inputs=layout.inputs, derived=layout.derived))
+        head = replace(self.head, layout=replace(own, **given))
         return self._copy(head, self.recordings)
 
     def with_gestures(self, gestures: GestureSet) -> Dataset:

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
@@ -196,21 +197,32 @@ def code_files(model: IntegerModel, bundle: Bundle) -> dict[str, bytes]:
     image = model.to_bytes()
     facts = facts_of(model, bundle, image)
     return {
-        **{name: library_text(name, window=model.is_window).encode() for name in LIBRARY},
+        **{
+            name: library_text(name, window=model.is_window, calibrate=bool(model.layout.calibrated_vectors)).encode()
+            for name in LIBRARY
+        },
         MODEL[0]: _header(facts).encode(),
         MODEL[1]: _source(model, facts["title"]).encode(),
         IMAGE: image,
     }
 
 
-# What is compiled only with, or without, PLUSH_WINDOW; with an alternative or none.
-_ONLY_WINDOW = re.compile(r"#if(n?)def PLUSH_WINDOW\n(.*?)(?:#else\n(.*?))?#endif /\* PLUSH_WINDOW \*/\n", re.S)
+def library_text(name: str, *, window: bool, calibrate: bool = False) -> str:
+    """Return a file of the C library with the code for window networks, or else with that for streaming ones.
 
-
-def library_text(name: str, *, window: bool) -> str:
-    """Return a file of the C library with the code for window networks, or else with that for streaming ones."""
+    With ``calibrate``, it has the code for sensors that calibrate themselves.
+    """
     text = (files("plushsense.deploy") / "c" / name).read_text(encoding="utf-8")
-    return _ONLY_WINDOW.sub(lambda m: (m[2] if window != bool(m[1]) else m[3]) or "", text)
+    # PLUSH_WINDOW first: it also stands within PLUSH_CALIBRATE.
+    for macro, defined in (("PLUSH_WINDOW", window), ("PLUSH_CALIBRATE", calibrate)):
+        parts = rf"#if(n?)def {macro}\b[^\n]*\n(.*?)(?:#else\n(.*?))?#endif /\* {macro} \*/\n"
+        text = re.sub(parts, partial(_compiled, defined), text, flags=re.S)
+    return text
+
+
+def _compiled(defined: bool, found: re.Match[str]) -> str:
+    """Return what is compiled with, or without, a macro; with an alternative or none."""
+    return (found[2] if defined != bool(found[1]) else found[3]) or ""
 
 
 def times_streaming(arch: Arch) -> float:

@@ -273,6 +273,8 @@ def evaluate(
     predictions = gather_predictions(score_windows, tested, [outcome["probabilities"] for outcome in outcomes])
     table = compute_scores(predictions, records, score_windows.affects, parsed.apart)
     table["leakage"] = audit_leakage(train_windows, score_windows, folds)
+    if score_windows.self_calibration:
+        table["self_calibration"] = score_windows.self_calibration
     if all("deployed" in outcome for outcome in outcomes):
         deployed = gather_predictions(score_windows, tested, [outcome["deployed"] for outcome in outcomes])
         after = compute_scores(deployed, records, score_windows.affects, parsed.apart)

@@ -19,9 +19,9 @@ from plushsense.dataset.statistics import DurationBand
 from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.dataset.trimming import Trim
 from plushsense.reports.figures import new_figure, png
-from plushsense.windows.clock import resample
 from plushsense.windows.cut import WindowSpec, from_recording
 from plushsense.windows.features import network_inputs
+from plushsense.windows.sessions import SessionReader
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -172,7 +172,7 @@ def windows(dataset: Dataset, info: RecordingInfo, spec: WindowSpec) -> tuple[Fi
     """
     layout = dataset.layout
     window, step = layout.samples(spec.window_s), layout.samples(spec.step_s)
-    segments = resample(dataset.read(info), layout)
+    segments = SessionReader(dataset).recording(info)
     if not segments:
         raise DatasetError(f"'{info.id}' has no valid sample, and so gives no window: choose another recording.")
     segment = max(segments, key=len)

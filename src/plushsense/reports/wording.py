@@ -82,6 +82,9 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
         answers.append(("More people", more))
     if not evaluation.get("leaky"):
         answers.insert(2, ("Leak", _NO_LEAK))
+    if evaluation.get("self_calibration"):
+        how = "Offset and scale of accelerometers: causal, from the readings of the session so far, without labels."
+        answers.append(("Self-calibration", how))
     if audit := evaluation.get("leakage"):
         answers.append(("Leakage audit", describe_leakage(audit)))
     return answers

@@ -9,6 +9,8 @@ of everything after the head. The following sections come in this order:
 - for each measured channel: i32 lowest and i32 highest valid value, i32 zero
 - for each input: u8 kind (0 channel, 1 magnitude, 2 gravity), u8 n, u8 shift of the running mean (else 0), n × u8
   measured channels
+- self-calibration, only in images of such models: u8 sensors (1 to 8); for each, 3 × u8 measured channels, u8 binary
+  logarithm of the samples in a block
 - vector layer: u8 vectors, u8 filters, u16 taps (all 0 without one); then for each vector: u8 shift + 16, and for each
   filter: u8 down, taps × u8 weight + 128
 - 0 to 3 bytes 0, up to a multiple of 4 bytes from the beginning: scales and weights of all layers are then aligned
@@ -27,7 +29,8 @@ of everything after the head. The following sections come in this order:
   of its terms: u8 signal, i8 sign, u8 times, u8 0, u32 threshold
 
 Images of window networks have a version of their own, because the C library of a streaming network cannot run them, nor
-the other way round.
+the other way round. So have those with a self-calibration (`plushsense.windows.calibration`), whose code is compiled
+for such models only.
 
 A patch replaces the dense layer of one image. Its head is that of an image with ``PLPT`` for ``PLSH``; then come the
 u32 CRC-32 in the head of that image, and the two sections of the new dense layer as in an image.
@@ -63,6 +66,8 @@ PATCH_MAGIC = b"PLPT"
 # 2: settings of events, gate and health; 3: zeros and the vector layer; 4: another known score; 6: aligned weights
 IMAGE_VERSION = 6
 WINDOW_IMAGE_VERSION = 7  # of window networks; otherwise as 6
+_CALIBRATED = 2  # added to the version of a model with a self-calibration
+SENSOR_BYTES = 176  # of the state of a sensor that calibrates itself
 HEAD_BYTES = 16
 IDLE_BIT = 4
 GROUP = 4  # number of filters, and of channels, in a block of weights
@@ -151,7 +156,8 @@ class IntegerModel:
     @property
     def image_version(self) -> int:
         """Version of the image, and of a patch of it."""
-        return WINDOW_IMAGE_VERSION if self.is_window else IMAGE_VERSION
+        version = WINDOW_IMAGE_VERSION if self.is_window else IMAGE_VERSION
+        return version + _CALIBRATED if self.layout.calibrated_vectors else version
 
     @property
     def pooled_steps(self) -> int:
@@ -199,6 +205,10 @@ class IntegerModel:
             shift = layout.gravity_shift if kind == "gravity" else 0
             source = bytes([_INPUT_KINDS.index(kind), len(parts), shift, *parts])
             sections.append((f"input '{name}': {kind}, measured channels", source))
+        if layout.calibrated_vectors:
+            plan = [bytes([*axes, layout.calibration_shift]) for axes in layout.calibrated_vectors]
+            title = "self-calibration: sensors; measured channels and shift of a block of each"
+            sections.append((title, bytes([len(plan)]) + b"".join(plan)))
         sections += _vectors(self.network.vectors)
         sections.append(("filling up to a multiple of 4 bytes", bytes(-sum(len(piece) for _, piece in sections) % 4)))
         scale = self.network.inputs
@@ -291,7 +301,7 @@ def image_check(image: bytes) -> int:
     Raises:
         BundleError: for bytes that are no image of this version.
     """
-    versions = (IMAGE_VERSION, WINDOW_IMAGE_VERSION)
+    versions = [v + more for v in (IMAGE_VERSION, WINDOW_IMAGE_VERSION) for more in (0, _CALIBRATED)]
     if image[:HEAD_BYTES] not in [image_head(image[HEAD_BYTES:], version=v) for v in versions]:
         raise BundleError("The image is damaged, or of another version of PlushSense: export the model again.")
     return int(struct.unpack_from("<I", image, HEAD_BYTES - 4)[0])
@@ -340,6 +350,8 @@ def memory_bytes(model: IntegerModel) -> int:
     health = model.rules.health
     if health.low or health.still_ms:
         pieces.append(4 * channels)  # the frame before
+    if sensors := len(model.layout.calibrated_vectors):
+        pieces.append(SENSOR_BYTES * sensors + 4)
     if gate.rules:
         past = max((s.lag for s in gate.signals if s.kind == JERK), default=1)
         pieces.append(4 * arch.channels * (past + 1))  # inputs

@@ -1,7 +1,8 @@
 """The computation of a toy, from frames to events. All readers of frames use this module.
 
 1. `FrameReader` resamples frames to evenly spaced samples: it detects gaps and resets of the device clock, which break
-   the stream, checks sensor health, applies the clock rule, and computes the inputs of the network.
+   the stream, checks sensor health, applies the clock rule and the self-calibration, and computes the inputs of the
+   network. Only the self-calibration survives a break: the sensor is still the same.
 2. `SampleReader` passes each sample to the gate, and every ``step`` samples computes the network, the decision and the
    events. The steps are aligned so that the first answer is at the sample that completes the span. A break ends the
    open event and restarts everything.
@@ -29,6 +30,7 @@ from plushsense.runtime.events import Answer, EventMachine, Update
 from plushsense.runtime.fixed import Ints, integer_logits
 from plushsense.runtime.gate import Gate, Rule
 from plushsense.runtime.health import Health, HealthSettings
+from plushsense.windows.calibration import SelfCalibration
 from plushsense.windows.clock import SampleClock
 from plushsense.windows.features import SampleInputs
 
@@ -97,6 +99,7 @@ class FrameReader:
 
     def __init__(self, layout: Layout, health: HealthSettings) -> None:
         self.layout = layout
+        self._calibration = SelfCalibration(layout)
         self._inputs = SampleInputs(layout)
         self._gap_us, self._period_us = layout.gap_ms * 1000, layout.period_us
         self.health = Health(health, layout)
@@ -105,6 +108,7 @@ class FrameReader:
     def reset(self) -> None:
         """Begin a new stream at time 0 and set all counts to 0."""
         self.clock = SampleClock(self.layout)
+        self._calibration.reset()
         self._inputs.reset()
         self.health.reset()
         self._begun = False
@@ -144,7 +148,7 @@ class FrameReader:
             suspect, period = health.suspect, self._period_us
             time_us = (clock.now_us or 0) - (len(samples) - 1) * period - self.zero_us
             for n, sample in enumerate(samples):
-                yield Sample(time_us + n * period, self._inputs(sample), suspect)
+                yield Sample(time_us + n * period, self._inputs(self._calibration.push(sample)), suspect)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from plushsense.core.gestures import GestureSet
 from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.runtime.fixed import Ints
-from plushsense.windows.clock import Segment, resample
+from plushsense.windows.clock import Segment
 from plushsense.windows.cut import recordings_in_time
 from plushsense.windows.features import network_inputs
+from plushsense.windows.sessions import SessionReader
 
 BETWEEN, CALM, LEFT_OUT = -1, -2, -3
 """Kinds of samples: between recordings; in a recording of a gesture that is not energetic; of unknown content."""
@@ -93,6 +94,7 @@ def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str
                 trial[first:last], which[first:last] = k, number
             stretches.append(Stretch(subject, network_inputs(segment.data, layout), trial, which))
 
+    sessions = SessionReader(dataset)
     for stream in dataset.streams:
         if stream.subject in people:
             located = [
@@ -100,11 +102,10 @@ def material_of(dataset: Dataset, gestures: GestureSet, subjects: Collection[str
                 for r in mine
                 if r.stream == stream.id and r.stream_row >= 0
             ]
-            add(stream.subject, resample(dataset.read_stream(stream.id), layout), located, BETWEEN)
+            add(stream.subject, sessions.stream(stream.id), located, BETWEEN)
     for r in mine:
         if r.stream_row < 0 and r.id in in_time:
-            frames = dataset.read(r)
-            add(r.subject, resample(frames, layout), [(0, len(frames), r)], LEFT_OUT)
+            add(r.subject, sessions.recording(r), [(0, r.stop - r.start, r)], LEFT_OUT)
     return Material(tuple(stretches), tuple(trials), tuple(calm), layout.rate_hz)
 
 

@@ -32,9 +32,9 @@ from plushsense.runtime.classifier import GestureEvent
 from plushsense.runtime.events import AFFECT_CODES, AFFECTS, BEGUN, ENDED, GATE, KINDS, NO_GESTURE, SOURCES, Update
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.machine import FrameReader, Sample
-from plushsense.windows.clock import resample
 from plushsense.windows.cut import recordings_in_time
 from plushsense.windows.features import network_inputs
+from plushsense.windows.sessions import SessionReader
 
 _LAG_S = 0.05
 _SMOOTHING_S = 0.3
@@ -245,9 +245,10 @@ def fit_rule_baseline(
     peaks: list[tuple[int, int]] = []
     unanswered: dict[str, list[NDArray[np.int64]]] = {"neutral": [], "negative": []}
     used = recordings_in_time([r for r in dataset.used if r.subject in people and gestures.find(r.gesture)])
+    sessions = SessionReader(dataset)
     for recording in used:
         affect = gestures.get(recording.gesture).affect
-        for segment in resample(dataset.read(recording), layout):
+        for segment in sessions.recording(recording):
             x = network_inputs(segment.data, layout)
             change = x[lag:] - x[:-lag]
             if affect in ("positive", "neutral") and len(change):

@@ -35,7 +35,7 @@ from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.marks import LabelledStretch
 from plushsense.dataset.store import Dataset, Progress, RecordingInfo, StreamInfo
-from plushsense.windows.clock import Segment, resample
+from plushsense.windows.clock import Segment
 from plushsense.windows.cut import (
     ANYWHERE,
     WindowCut,
@@ -46,6 +46,7 @@ from plushsense.windows.cut import (
     from_recording,
 )
 from plushsense.windows.features import network_inputs
+from plushsense.windows.sessions import SessionReader
 
 IDLE_LABEL = "Idle"
 _LIVELY_S = 1.0
@@ -172,8 +173,9 @@ def cut_anywhere(
             progress(done + 1, len(dataset.streams))
     reached = {r.id for r, _ in (*moving, *resting)}
     cuts: list[tuple[RecordingInfo, WindowCut]] = []
+    sessions = SessionReader(dataset)
     for recording in (r for r in used if r.id not in reached):
-        instead = from_recording(resample(dataset.read(recording), layout), dataset, reach, layout.samples(spec.step_s))
+        instead = from_recording(sessions.recording(recording), dataset, reach, layout.samples(spec.step_s))
         if not instead:
             left_out.append(Sentence(f"{recording.id}: no valid sample", "no_valid_sample", recording=recording.id))
         cuts += [(recording, c) for c in instead]
@@ -207,7 +209,7 @@ def _positions(
     held: list[tuple[RecordingInfo, _Place]] = []
     free: list[_Place] = []
     lively: list[float] = []
-    segments = resample(dataset.read_stream(stream.id), dataset.layout)
+    segments = SessionReader(dataset).stream(stream.id)
     whole = [network_inputs(segment.data, dataset.layout) for segment in segments]
     spread = np.std(np.concatenate(whole), axis=0) if whole else np.zeros(0)
     for segment, x in zip(segments, whole, strict=True):

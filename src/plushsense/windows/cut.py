@@ -26,8 +26,9 @@ from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, usual_rows
 from plushsense.dataset.store import RECORDINGS, UNKNOWN_SUBJECT, Dataset, Progress, RecordingInfo
-from plushsense.windows.clock import Segment, resample
+from plushsense.windows.clock import Segment
 from plushsense.windows.features import network_inputs
+from plushsense.windows.sessions import SessionReader
 
 CONTEXTS = ("stream", "loop")
 ANYWHERE = "anywhere"
@@ -87,6 +88,7 @@ class WindowSet:
     the recording, or ""; ``window_rows`` and ``recording_rows`` (N, 2): rows of that stream which the window and its
     recording cover, −1 if unknown (always for looped windows). ``vectors``: triples of inputs that are the axes of one
     vector; ``left_out``: recordings that gave no window, and gestures of free choice, with the reason.
+    ``self_calibration``: "causal" if sensors calibrate themselves (`plushsense.windows.sessions`), else "".
     """
 
     x: NDArray[np.int32]
@@ -105,6 +107,7 @@ class WindowSet:
     inputs: tuple[str, ...]
     vectors: tuple[tuple[int, ...], ...] = ()
     left_out: tuple[Sentence, ...] = ()
+    self_calibration: str = ""
 
     def __len__(self) -> int:
         return len(self.y)
@@ -228,21 +231,18 @@ def cut_windows(
     left_out += too_long
     recordings.sort(key=lambda r: (r.stream, r.id))
     cuts: list[tuple[RecordingInfo, WindowCut]] = []
-    stream_id, segments = "", list[_Read]()
+    sessions, stream_id, segments = SessionReader(dataset), "", list[_Read]()
     for done, recording in enumerate(recordings):
         own: list[WindowCut] = []
         if spec.context == "stream" and recording.stream_row >= 0:
             if recording.stream != stream_id:
                 stream_id = recording.stream
-                segments = [
-                    (segment, network_inputs(segment.data, layout))
-                    for segment in resample(dataset.read_stream(stream_id), layout)
-                ]
+                segments = [(segment, network_inputs(segment.data, layout)) for segment in sessions.stream(stream_id)]
             first = recording.stream_row + recording.start
             last = first + recording.stop - recording.start
             own = _from_stream(segments, first, last, window, reach, step)
         if not own:
-            own = from_recording(resample(dataset.read(recording), layout), dataset, reach, step)
+            own = from_recording(sessions.recording(recording), dataset, reach, step)
         if not own:
             left_out.append(Sentence(f"{recording.id}: no valid sample", "no_valid_sample", recording=recording.id))
         cuts += [(recording, c) for c in own]
@@ -306,6 +306,7 @@ def assemble(cuts: list[tuple[RecordingInfo, WindowCut]], gestures: GestureSet, 
         rate_hz=dataset.layout.rate_hz,
         inputs=dataset.layout.inputs,
         vectors=dataset.layout.input_vectors,
+        self_calibration="causal" if dataset.layout.self_calibration else "",
     )
     return windows.take(by_recording)
 

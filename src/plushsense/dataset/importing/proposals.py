@@ -336,6 +336,8 @@ def _zeros(layout: Layout, sensors: Sequence[Sensor]) -> Iterator[Proposal]:
     reasons, several = [], []
     different: list[Sensor] = []
     for vector in dict.fromkeys(sensor.axes for sensor in sensors):
+        if set(vector) <= set(layout.self_calibration):
+            continue  # whatever its zero is
         found = [sensor for sensor in sensors if sensor.axes == vector]
         if len(found) > 1:
             different += found

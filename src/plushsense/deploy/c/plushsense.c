@@ -61,6 +61,12 @@
 #define MOST_TAPS 255u
 #define MOST_AXIS_SHIFT 16u
 #define MOST_MEAN_SHIFT 15u
+#ifdef PLUSH_CALIBRATE
+#define MOST_SENSORS 8u
+#define MOST_READING (INT32_C(1) << 19) /* of a self-calibration, so that its sums fit 64 bits */
+#define LEAST_BLOCK_SHIFT 2u
+#define MOST_BLOCK_SHIFT 8u
+#endif /* PLUSH_CALIBRATE */
 #define MOST_GRAVITY (UINT32_C(1) << 19) /* so that a running mean and its changes fit 32 bits */
 
 /* How an input comes from the measured channels. */
@@ -475,6 +481,32 @@ PLUSH_SMALL static int read_input_plan(plush_toy *toy, source *from)
     return 1;
 }
 
+#ifdef PLUSH_CALIBRATE
+/* The accelerometers that calibrate themselves: of each, three channels, and the binary logarithm of a block's samples. */
+PLUSH_SMALL static int read_sensors(plush_toy *toy, source *from)
+{
+    const uint8_t *p = next_bytes(from, 1);
+    uint32_t i, n;
+
+    toy->sensors = p == NULL ? 0 : *p;
+    toy->sensor_plan = p = next_bytes(from, 4u * toy->sensors);
+    if (p == NULL || toy->sensors == 0 || toy->sensors > MOST_SENSORS)
+        return 0;
+    for (i = 0; i < toy->sensors; i++, p += 4) {
+        if (p[3] < LEAST_BLOCK_SHIFT || p[3] > MOST_BLOCK_SHIFT)
+            return 0;
+        for (n = 0; n < 3; n++) {
+            const uint8_t *range = toy->ranges + RANGE_BYTES * p[n];
+
+            if (p[n] >= toy->channels || as_signed(word_at(range)) < -MOST_READING ||
+                as_signed(word_at(range + 4)) > MOST_READING)
+                return 0;
+        }
+    }
+    return 1;
+}
+
+#endif /* PLUSH_CALIBRATE */
 /* One kernel of a vector layer; its sums are sure to fit. */
 PLUSH_SMALL static int read_kernel(const plush_toy *toy, source *from)
 {
@@ -693,8 +725,13 @@ PLUSH_SMALL static int read_model(plush_toy *toy, const uint8_t *model)
 
     from.at = model + HEAD_BYTES;
     from.left = word_at(model + 8) - HEAD_BYTES;
+#ifdef PLUSH_CALIBRATE
+    if (!read_head(toy, &from) || !read_input_plan(toy, &from) || !read_sensors(toy, &from) || !read_vectors(toy, &from))
+        return 0;
+#else
     if (!read_head(toy, &from) || !read_input_plan(toy, &from) || !read_vectors(toy, &from))
         return 0;
+#endif /* PLUSH_CALIBRATE */
 #ifdef PLUSH_WINDOW
     if (toy->vectors != 0 || toy->span < 2 || toy->span > MOST_ROWS)
         return 0;
@@ -796,6 +833,13 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 #endif /* PLUSH_WINDOW */
     toy->memory_bytes = used; /* what a restart forgets: health has its own rules */
     toy->last = (int32_t *)take(memory, &used, last_matters(toy) ? 4u * toy->channels : 0);
+#ifdef PLUSH_CALIBRATE
+    { /* at a multiple of 8, for its 64-bit numbers */
+        uint8_t *piece = (uint8_t *)take(memory, &used, (uint32_t)sizeof(plush_sensor) * toy->sensors + 4u);
+
+        toy->sensor = (plush_sensor *)(void *)(piece == NULL || (uintptr_t)piece % 8u == 0 ? piece : piece + 4);
+    }
+#endif /* PLUSH_CALIBRATE */
     return used;
 }
 
@@ -2103,10 +2147,180 @@ static void read_inputs(plush_toy *toy)
         vector_sample(toy, x, row);
 }
 
+#ifdef PLUSH_CALIBRATE
+/* ---- Self-calibration: windows/calibration ---------------------------------------------------------------------- */
+
+#define MEAN_SIZE_BITS 12u
+#define SHARE_BITS 14u
+#define MOST_WEIGHT (UINT32_C(1) << 22)
+#define LEAST_RADIUS 256
+#define MOST_VARIANCE ((INT64_C(1) << 47) - 1)
+#define VARIANCE_OF_STEPS 256
+#define SWEEPS 2u
+#define MOST_OUTPUT 32767
+#define MOST_CENTRE (INT64_C(4) << 20)
+
+/* Halves, or quarters and so on, toward 0. */
+PLUSH_SMALL static void divide(int64_t *sums, uint32_t n, int64_t by)
+{
+    for (; n > 0; n--)
+        *sums++ /= by;
+}
+
+/* The mean of a block, with its weight, into the sums. */
+PLUSH_SMALL static void add_mean(plush_sensor *s, int64_t weight)
+{
+    int64_t m[3], square = 0;
+    uint32_t top = 0, i, n = 3;
+
+    for (i = 0; i < 3; i++)
+        top |= distance_of(s->sum[i], 0);
+    for (; top >> (s->exponent + MEAN_SIZE_BITS) != 0; s->exponent++) {
+        divide(s->first, 3, 2);
+        divide(s->second, 6, 4);
+        divide(s->third, 3, 8);
+        for (i = 0; i < 3; i++)
+            s->centre[i] /= 2;
+    }
+    for (i = 0; i < 3; i++) {
+        m[i] = s->sum[i] / (INT32_C(1) << s->exponent);
+        square += m[i] * m[i];
+    }
+    s->weight += (uint32_t)weight;
+    for (i = 0; i < 3; i++) {
+        s->first[i] += weight * m[i];
+        s->third[i] += weight * m[i] * square;
+        s->second[i] += weight * m[i] * m[i];
+    }
+    s->second[n++] += weight * m[0] * m[1];
+    s->second[n++] += weight * m[0] * m[2];
+    s->second[n] += weight * m[1] * m[2];
+    if (s->weight > MOST_WEIGHT) {
+        s->weight >>= 1;
+        divide(s->first, 3, 2);
+        divide(s->second, 6, 2);
+        divide(s->third, 3, 2);
+    }
+}
+
+/* The centre moves toward the solution of A d = b; offset and scale follow. All with 8 fraction bits, products with 16. */
+PLUSH_SMALL static void fit_sphere(plush_sensor *s, uint32_t shift)
+{
+    static const uint8_t place[9] = {0, 3, 4, 3, 1, 5, 4, 5, 2};
+    int64_t n = s->weight != 0 ? (int64_t)s->weight : 1, mean[3], a[6], b[3], d[3], square = 0, least;
+    uint64_t size = UINT64_C(1) << 16;
+    uint32_t radius, bits = 0, i, j;
+
+    for (i = 0; i < 3; i++)
+        mean[i] = s->first[i] * 256 / n;
+    for (i = 0; i < 6; i++) {
+        a[i] = s->second[i] * 256 / n;
+        if (i < 3)
+            square += a[i];
+    }
+    for (i = 0; i < 3; i++)
+        for (j = i; j < 3; j++)
+            a[place[3 * i + j]] -= mean[i] * mean[j] / 256;
+    for (i = 0; i < 3; i++) {
+        b[i] = s->third[i] / n * 65536 - square * mean[i];
+        for (j = 0; j < 3; j++)
+            b[i] -= 2 * (a[place[3 * i + j]] * mean[j]);
+        b[i] /= 2;
+        d[i] = s->centre[i] - mean[i];
+    }
+    for (j = 0; j < 3 * SWEEPS; j++) {
+        uint32_t one, other;
+
+        i = j % 3;
+        one = (i + 1) % 3;
+        other = (i + 2) % 3;
+        d[i] = (b[i] - a[place[3 * i + one]] * d[one] - a[place[3 * i + other]] * d[other]) / ((a[i] > 0 ? a[i] : 0) + 1);
+        d[i] = d[i] < -MOST_CENTRE ? -MOST_CENTRE : d[i] > MOST_CENTRE ? MOST_CENTRE : d[i];
+    }
+    least = s->level >> (2 * s->exponent);
+    least = (least < INT64_C(1) << 36 ? least : INT64_C(1) << 36) * LEAST_RADIUS * 65536;
+    square = (a[0] + a[1] + a[2]) * 256;
+    for (i = 0; i < 3; i++)
+        square += d[i] * d[i];
+    if (square < least)
+        square = least;
+    if (square > (int64_t)size)
+        size = (uint64_t)square;
+    radius = square_root(size);
+    while (radius >> bits != 0)
+        bits++;
+    s->multiplier = (uint32_t)((UINT64_C(1) << (bits + 15)) / radius);
+    s->down = (uint8_t)(bits + s->exponent - shift);
+    for (i = 0; i < 3; i++) {
+        int64_t centre = mean[i] + d[i];
+
+        s->centre[i] = (int32_t)centre;
+        s->offset[i] = 16 * s->base[i] + (int32_t)(centre * (INT32_C(1) << s->exponent) / (INT32_C(16) << shift));
+    }
+}
+
+/* A complete block. */
+PLUSH_SMALL static void end_block(plush_sensor *s, uint32_t shift)
+{
+    int64_t variance = s->squares * (INT32_C(1) << shift) + VARIANCE_OF_STEPS, share;
+    uint32_t i;
+
+    for (i = 0; i < 3; i++)
+        variance -= (int64_t)s->sum[i] * s->sum[i];
+    if (variance > MOST_VARIANCE)
+        variance = MOST_VARIANCE;
+    if (s->level == 0)
+        s->level = variance;
+    share = s->level * (INT32_C(1) << SHARE_BITS) / (variance + s->level);
+    s->level += variance < s->level ? -(s->level >> 2) : s->level >> 5;
+    add_mean(s, share * share >> SHARE_BITS);
+    fit_sphere(s, shift);
+    s->count = 0;
+    s->squares = 0;
+    memset(s->sum, 0, sizeof s->sum);
+}
+
+/* The even sample, with calibrated axes around the zeros of their channels. */
+PLUSH_CODE
+static void calibrate(plush_toy *toy)
+{
+    const uint8_t *plan = toy->sensor_plan;
+    plush_sensor *s = toy->sensor;
+    uint32_t n, i;
+
+    for (n = 0; n < toy->sensors; n++, s++, plan += 4) {
+        for (i = 0; i < 3; i++) {
+            int32_t *sample = toy->sample + plan[i], x = *sample, y;
+            int64_t out = 0;
+
+            if (!s->begun)
+                s->base[i] = x;
+            if (s->multiplier != 0) {
+                int64_t half_one = INT64_C(1) << (s->down - 1);
+
+                out = ((int64_t)16 * x - s->offset[i]) * (int64_t)s->multiplier + half_one;
+                out = out >= 0 ? out >> s->down : ~(~out >> s->down);
+                out = out < -MOST_OUTPUT ? -MOST_OUTPUT : out > MOST_OUTPUT ? MOST_OUTPUT : out;
+            }
+            *sample = as_signed((uint32_t)(int32_t)out + le32(toy->ranges + RANGE_BYTES * plan[i] + 8));
+            y = x - s->base[i];
+            s->sum[i] += y;
+            s->squares += (int64_t)y * y;
+        }
+        s->begun = 1;
+        if (++s->count >> plan[3] != 0)
+            end_block(s, plan[3]);
+    }
+}
+
+#endif /* PLUSH_CALIBRATE */
 /* One even sample, in toy->sample. Returns 1 when an answer fell due. */
 PLUSH_CODE
 static uint32_t push_sample(plush_toy *toy, uint32_t ms)
 {
+#ifdef PLUSH_CALIBRATE
+    calibrate(toy);
+#endif /* PLUSH_CALIBRATE */
     read_inputs(toy);
     if (has_gate(toy))
         gate_sample(toy, ms);
@@ -2239,6 +2453,10 @@ PLUSH_SMALL plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint3
         status = prepare(toy, model, memory, memory_bytes);
     if (status != PLUSH_OK)
         memset(toy, 0, sizeof *toy);
+#ifdef PLUSH_CALIBRATE
+    else
+        memset(toy->sensor, 0, sizeof *toy->sensor * toy->sensors);
+#endif /* PLUSH_CALIBRATE */
     plush_restart(toy);
     return status;
 }
@@ -2256,6 +2474,9 @@ static plush_status take_over(plush_toy *toy, const uint8_t *model, void *memory
     lose(toy, toy->seen_ms); /* while the old model can still be read */
     memcpy(&next, toy, offsetof(plush_toy, layers)); /* answers, events, counts, callbacks */
     *toy = next;
+#ifdef PLUSH_CALIBRATE
+    memset(toy->sensor, 0, sizeof *toy->sensor * toy->sensors);
+#endif /* PLUSH_CALIBRATE */
     plush_restart(toy);
     return PLUSH_OK;
 }

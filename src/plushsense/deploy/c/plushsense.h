@@ -41,11 +41,19 @@
 extern "C" {
 #endif
 
+#ifdef PLUSH_CALIBRATE /* models whose accelerometers find their offset and scale themselves */
+#ifdef PLUSH_WINDOW
+#define PLUSH_IMAGE_VERSION 9
+#else
+#define PLUSH_IMAGE_VERSION 8
+#endif /* PLUSH_WINDOW */
+#else
 #ifdef PLUSH_WINDOW
 #define PLUSH_IMAGE_VERSION 7 /* of window networks, which compute the whole window again at every step */
 #else
 #define PLUSH_IMAGE_VERSION 6
 #endif /* PLUSH_WINDOW */
+#endif /* PLUSH_CALIBRATE */
 #define PLUSH_MAX_LAYERS 4
 #define PLUSH_ONE 32768 /* a confidence or probability of 1 */
 #define PLUSH_NO_GESTURE 255
@@ -147,6 +155,19 @@ typedef struct {
     uint32_t *tap_sums;     /* for each of the next `dilation` samples: sum of the activations already under its taps */
 } plush_layer;
 
+#ifdef PLUSH_CALIBRATE
+/* What is known of an accelerometer: sums over the blocks so far, the block at hand, and what follows. */
+typedef struct {
+    int64_t first[3], second[6], third[3]; /* weighted sums of the means, of their products, and times their squares */
+    int64_t squares, level;                /* of the block at hand; the variance of still blocks */
+    int32_t base[3], sum[3];               /* the first sample, from which all is measured; sums of the block at hand */
+    int32_t centre[3], offset[3];          /* offset: with 4 fraction bits */
+    uint32_t weight, multiplier;
+    uint16_t count;                        /* samples of the block at hand */
+    uint8_t begun, exponent, down, spare[3];
+} plush_sensor;
+
+#endif /* PLUSH_CALIBRATE */
 /* A toy: everything about one stream. Fields from `answer` to `reading` may be read, none may be written. */
 typedef struct plush_toy {
     plush_answer answer;     /* the newest one; its `state` is that of the toy at any time */
@@ -191,6 +212,13 @@ typedef struct plush_toy {
     uint8_t *valid;          /* of each channel: whether it has had a valid value */
     int32_t *held, *before, *sample;
 
+#ifdef PLUSH_CALIBRATE
+    /* Self-calibration. */
+    uint8_t sensors;
+    const uint8_t *sensor_plan;
+    plush_sensor *sensor;
+
+#endif /* PLUSH_CALIBRATE */
     /* Inputs: those of the newest sample, for a vector layer without a gate; running means. */
     uint8_t means, mean_shift;
     uint16_t mean_samples;
@@ -270,7 +298,12 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values);
  * on where the last one was, or begins again after a gap. */
 void plush_silence(plush_toy *toy);
 
+#ifdef PLUSH_CALIBRATE
+/* Forgets the past, as after a gap: what is going on ends; the counts stay, and so do a fault and what was found out of
+ * the offset and scale of accelerometers, which only plush_begin() and plush_swap() forget. */
+#else
 /* Forgets the past, as after a gap: what is going on ends; the counts stay, and so does a fault. */
+#endif /* PLUSH_CALIBRATE */
 void plush_restart(plush_toy *toy);
 
 /* The label of a class, and of the model (its architecture and filters). */

@@ -103,6 +103,8 @@ int32_t __divsi3(int32_t v, int32_t by);
 int32_t __modsi3(int32_t v, int32_t by);
 uint64_t __muldi3(uint64_t a, uint64_t b);
 uint64_t __umulsidi3(uint32_t a, uint32_t b);
+uint64_t __udivdi3(uint64_t v, uint64_t by);
+int64_t __divdi3(int64_t v, int64_t by);
 
 uint32_t __udivsi3(uint32_t v, uint32_t by)
 {
@@ -153,4 +155,31 @@ uint64_t __muldi3(uint64_t a, uint64_t b)
     uint32_t cross = (uint32_t)(a >> 32) * (uint32_t)b + (uint32_t)a * (uint32_t)(b >> 32);
 
     return __umulsidi3((uint32_t)a, (uint32_t)b) + ((uint64_t)cross << 32);
+}
+
+/* Of models that calibrate themselves. */
+uint64_t __udivdi3(uint64_t v, uint64_t by)
+{
+    uint64_t quotient = 0;
+    uint32_t n = 0;
+
+    while (by <= v >> 1) {
+        by <<= 1;
+        n++;
+    }
+    for (n++; n > 0; n--, by >>= 1) {
+        quotient <<= 1;
+        if (v >= by) {
+            v -= by;
+            quotient |= 1u;
+        }
+    }
+    return quotient;
+}
+
+int64_t __divdi3(int64_t v, int64_t by)
+{
+    uint64_t quotient = __udivdi3(v < 0 ? 0u - (uint64_t)v : (uint64_t)v, by < 0 ? 0u - (uint64_t)by : (uint64_t)by);
+
+    return (int64_t)((v ^ by) < 0 ? 0u - quotient : quotient);
 }

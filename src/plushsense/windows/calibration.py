@@ -1,0 +1,215 @@
+"""Self-calibration: offset and scale of accelerometers, estimated from the samples so far, without labels.
+
+Held still, an accelerometer reads a vector of 1 g, whatever its direction: readings lie on a sphere whose centre is the
+offset of the sensor and whose radius is 1 g (autocalibration, van Hees et al. 2014, 10.1152/japplphysiol.00421.2014).
+Each axis of the vectors named in ``Layout.self_calibration`` becomes ``(reading - centre) * UNIT / radius``, so that
+readings with another gain and offset give the same numbers but for rounding. All in integers, and causal:
+
+1. Samples are taken in blocks of about 0.3 s. A block gives the mean m of the vector and its variance within the block.
+2. The weight of a block is ``(level / (variance + level))²``; the level follows the variance of the stillest blocks: it
+   falls by 1/4 where a block is stiller, else rises by 1/32, so that a sixth of the blocks is.
+3. Weighted sums of m, of the products of its components, and of ``|m|² m`` are kept; all are halved when the sum of
+   weights exceeds `MOST_WEIGHT`. With d the distance of the centre from the weighted mean of m, least squares ask for
+   ``A d = b``: A is the covariance of m, b half the covariance of ``|m - mean|²`` and m. Each block makes two
+   Gauss-Seidel sweeps from the previous centre, so that a direction which nothing is known of keeps what it had.
+4. The square of the radius is the mean of ``|m - centre|²``, but at least `LEAST_RADIUS` times the level, so that a
+   sensor that was not turned yet does not show its noise as movement.
+
+Until the first block is complete, the output is 0. The state survives gaps, and is cleared by a new stream. Quotients
+are rounded toward 0. ``deploy/c/plushsense.c`` computes the same.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plushsense.core.layouts import Layout
+
+UNIT = 2048  # of the output: 1 g
+MOST_OUTPUT = 32767
+MEAN_BITS = 12  # magnitude of the components of m: larger ones raise the exponent of all sums
+WEIGHT_BITS = 14
+MOST_WEIGHT = 1 << 22
+LEAST_RADIUS = 256
+FRACTION_BITS = 8  # of mean, covariance and centre
+OFFSET_BITS = 4  # fraction bits of the offset that is subtracted
+_MOST_VARIANCE = (1 << 47) - 1
+_VARIANCE_OF_STEPS = 256  # three times that of rounding to whole numbers, in the units of the variance
+_SWEEPS = 2
+_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_PLACE = ((0, 3, 4), (3, 1, 5), (4, 5, 2))  # of the product of two components among the pairs
+
+Ints = NDArray[np.int64]
+
+
+def _quotient(a: int, b: int) -> int:
+    """Return a / b for b > 0, rounded toward 0, as C does."""
+    return a // b if a >= 0 else -(-a // b)
+
+
+class SphereFit:
+    """The state of one accelerometer: sums over blocks, and the offset and scale that follow from them."""
+
+    def __init__(self, shift: int) -> None:
+        self._shift = shift  # binary logarithm of the samples in a block
+        self._base: list[int] | None = None  # the first sample, from which all is measured
+        self._count = 0
+        self._sum, self._squares = [0, 0, 0], 0
+        self._level = 0
+        self._exponent = 0
+        self._weight = 0
+        self._first, self._second, self._third = [0] * 3, [0] * 6, [0] * 3
+        self._centre = [0, 0, 0]
+        self.offset = [0, 0, 0]  # with `OFFSET_BITS`
+        self.multiplier = 0  # 0 before the first block, else 16 bits
+        self.down = 1
+
+    @property
+    def left(self) -> int:
+        """Number of samples until the block is complete."""
+        return (1 << self._shift) - self._count
+
+    def output(self, axis: int, x: int) -> int:
+        """Return a reading of an axis in steps of 1 / `UNIT` g."""
+        scaled = ((x << OFFSET_BITS) - self.offset[axis]) * self.multiplier + (1 << (self.down - 1)) >> self.down
+        return min(max(scaled, -MOST_OUTPUT), MOST_OUTPUT)
+
+    def outputs(self, x: Ints) -> Ints:
+        """Return readings (n, 3) in steps of 1 / `UNIT` g, with the current offset and scale."""
+        scaled = ((x << OFFSET_BITS) - np.array(self.offset)) * self.multiplier + (1 << (self.down - 1)) >> self.down
+        return np.asarray(np.clip(scaled, -MOST_OUTPUT, MOST_OUTPUT), dtype=np.int64)
+
+    def add(self, x: Sequence[int]) -> None:
+        """Add one sample (3,)."""
+        if self._base is None:
+            self._base = list(x)
+        y = [a - b for a, b in zip(x, self._base, strict=True)]
+        self._take(y, sum(v * v for v in y), 1)
+
+    def add_all(self, x: Ints) -> None:
+        """Add samples (n, 3) of one block, at most those that are `left`."""
+        if self._base is None:
+            self._base = x[0].tolist()
+        y = x - np.array(self._base)
+        self._take(y.sum(axis=0).tolist(), int((y * y).sum()), len(y))
+
+    def _take(self, total: list[int], squares: int, n: int) -> None:
+        self._sum = [a + b for a, b in zip(self._sum, total, strict=True)]
+        self._squares += squares
+        self._count += n
+        if self._count >> self._shift:
+            self._block()
+            self._count, self._sum, self._squares = 0, [0, 0, 0], 0
+
+    def _block(self) -> None:
+        """Take a complete block into account."""
+        variance = (self._squares << self._shift) - sum(v * v for v in self._sum) + _VARIANCE_OF_STEPS
+        variance = min(variance, _MOST_VARIANCE)
+        level = self._level or variance
+        share = (level << WEIGHT_BITS) // (variance + level)
+        self._level = level - (level >> 2) if variance < level else level + (level >> 5)
+        self._add_mean(share * share >> WEIGHT_BITS)
+        self._fit()
+
+    def _add_mean(self, w: int) -> None:
+        while max(map(abs, self._sum)) >> (self._exponent + MEAN_BITS):
+            self._exponent += 1
+            self._first = [_quotient(v, 2) for v in self._first]
+            self._second = [_quotient(v, 4) for v in self._second]
+            self._third = [_quotient(v, 8) for v in self._third]
+            self._centre = [_quotient(v, 2) for v in self._centre]
+        m = [_quotient(v, 1 << self._exponent) for v in self._sum]
+        square = sum(v * v for v in m)
+        self._weight += w
+        for i in range(3):
+            self._first[i] += w * m[i]
+            self._third[i] += w * m[i] * square
+        for i, (one, other) in enumerate(_PAIRS):
+            self._second[i] += w * m[one] * m[other]
+        if self._weight > MOST_WEIGHT:
+            self._weight >>= 1
+            self._first = [_quotient(v, 2) for v in self._first]
+            self._second = [_quotient(v, 2) for v in self._second]
+            self._third = [_quotient(v, 2) for v in self._third]
+
+    def _fit(self) -> None:
+        """Move the centre toward the solution, and derive offset and scale."""
+        one = 1 << FRACTION_BITS
+        n = max(self._weight, 1)
+        mean = [_quotient(v * one, n) for v in self._first]
+        second = [_quotient(v * one, n) for v in self._second]
+        square = sum(second[:3])
+        a = [s - _quotient(mean[i] * mean[j], one) for s, (i, j) in zip(second, _PAIRS, strict=True)]
+        b = [
+            _quotient(self._third[i], n) * one * one
+            - square * mean[i]
+            - 2 * sum(a[_PLACE[i][j]] * mean[j] for j in range(3))
+            for i in range(3)
+        ]
+        d = [c - m for c, m in zip(self._centre, mean, strict=True)]
+        most = 4 << (MEAN_BITS + FRACTION_BITS)
+        for _ in range(_SWEEPS):
+            for i in range(3):
+                j, k = (i + 1) % 3, (i + 2) % 3
+                rest = _quotient(b[i], 2) - a[_PLACE[i][j]] * d[j] - a[_PLACE[i][k]] * d[k]
+                d[i] = min(max(_quotient(rest, max(a[i], 0) + 1), -most), most)
+        self._centre = [m + v for m, v in zip(mean, d, strict=True)]
+        least = min(self._level >> (2 * self._exponent), 1 << 36) * LEAST_RADIUS * one * one
+        radius = math.isqrt(max(sum(a[:3]) * one + sum(v * v for v in d), least, one * one))
+        bits = radius.bit_length()
+        self.multiplier = (1 << (bits + 15)) // radius
+        self.down = bits + self._exponent - self._shift
+        to_raw = FRACTION_BITS + self._shift - OFFSET_BITS
+        assert self._base is not None
+        self.offset = [
+            (x << OFFSET_BITS) + _quotient(c << self._exponent, 1 << to_raw)
+            for x, c in zip(self._base, self._centre, strict=True)
+        ]
+
+
+class SelfCalibration:
+    """The self-calibration of all accelerometers that a layout names."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        self._zeros = layout.zero_int.tolist()
+        self._vectors = layout.calibrated_vectors
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all samples, as at the beginning of a new stream."""
+        self._fits = [SphereFit(self._layout.calibration_shift) for _ in self._vectors]
+
+    def copy(self) -> SelfCalibration:
+        """Return an independent copy with the same state."""
+        return copy.deepcopy(self)
+
+    def push(self, sample: list[int]) -> list[int]:
+        """Return one sample (C,) with calibrated axes, around the offsets of the layout."""
+        for axes, fit in zip(self._vectors, self._fits, strict=True):
+            x = [sample[axis] for axis in axes]
+            sample = list(sample)
+            for number, axis in enumerate(axes):
+                sample[axis] = self._zeros[axis] + fit.output(number, x[number])
+            fit.add(x)
+        return sample
+
+    def apply(self, data: Ints) -> Ints:
+        """Return consecutive samples (T, C) with calibrated axes; the same as `push` of each."""
+        if not self._vectors:
+            return data
+        out = data.copy()
+        for axes, fit in zip(self._vectors, self._fits, strict=True):
+            columns, at = list(axes), 0
+            x = data[:, columns]
+            while at < len(x):
+                part = x[at : at + fit.left]
+                out[at : at + len(part), columns] = fit.outputs(part) + self._layout.zero_int[columns]
+                at += len(part)
+                fit.add_all(part)
+        return out

@@ -1,0 +1,76 @@
+"""Self-calibration in C: bit for bit the integer model; each library takes its own models."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from plushsense.deploy.emit import LIBRARY, library_text
+from plushsense.deploy.golden import answers_of
+from plushsense.runtime.image import IntegerModel, image_head, memory_bytes
+from support.c_toy import Seat, seat
+from support.integers import any_frames, models, vector_model
+
+OK, OTHER_VERSION, DAMAGED = 0, 2, 3
+
+
+def calibrated_model() -> IntegerModel:
+    model = vector_model()
+    return replace(model, layout=replace(model.layout, self_calibration=("x", "y", "z")))
+
+
+@settings(max_examples=25)
+@given(models(longest=160, calibrated=True), st.integers(0, 1 << 30))
+def test_any_calibrated_model_any_stream(calibrated_library: Any, model: IntegerModel, seed: int) -> None:
+    image = model.to_bytes()
+    assert calibrated_library.plush_memory_bytes(image, len(image)) == memory_bytes(model)
+    frames = any_frames(model, seed)
+    toy = seat(calibrated_library, model)
+    assert np.array_equal(toy.push(frames), answers_of(model, frames))
+
+
+def test_what_was_found_out_survives_a_gap_but_no_other_model(calibrated_library: Any) -> None:
+    model = calibrated_model()
+    first, second = any_frames(model, 1, 500, start=0), any_frames(model, 2, 500, start=90_000)
+    both = np.concatenate([first, second])
+    toy = seat(calibrated_library, model)
+    whole = toy.push(both)
+    assert np.array_equal(whole, answers_of(model, both))
+    status, _ = toy.swap(model.to_bytes(), model.network.arch.classes)
+    assert status == OK
+    after = answers_of(model, second)
+    swapped = toy.push(second)
+    assert np.array_equal(swapped[:, 12:], after[:, 12:])
+    assert not np.array_equal(whole[-len(after) :, 12:], after[:, 12:]), "the first model had calibrated itself"
+
+
+def test_each_library_takes_its_own_models(c_library: Any, calibrated_library: Any) -> None:
+    model = calibrated_model()
+    assert seat(calibrated_library, model).status == OK
+    assert seat(c_library, model).status == seat(calibrated_library, vector_model()).status == OTHER_VERSION
+    for name in LIBRARY:
+        text, without = library_text(name, window=False, calibrate=True), library_text(name, window=False)
+        assert "PLUSH_CALIBRATE" not in text + without and "plush_sensor" in text and "plush_sensor" not in without
+    assert "#define PLUSH_IMAGE_VERSION 9\n" in library_text(LIBRARY[0], window=True, calibrate=True)
+
+
+def test_a_good_checksum_makes_no_calibrated_model(calibrated_library: Any) -> None:
+    model = calibrated_model()
+    body = model.to_bytes()[16:]
+    plan = bytes([1, 1, 2, 3, 5])
+    at = body.index(plan)
+    for what, change in {
+        "no sensor": bytes([0]),
+        "nine": bytes([9]),
+        "an unknown channel": bytes([1, 1, 2, 4]),
+        "an unlimited channel": bytes([1, 0]),
+        "a short block": bytes([1, 1, 2, 3, 1]),
+        "a long block": bytes([1, 1, 2, 3, 9]),
+    }.items():
+        wrong = body[:at] + change + body[at + len(change) :]
+        image = image_head(wrong, version=8) + wrong
+        assert Seat(calibrated_library, image, 4, 3).status == DAMAGED, what

@@ -1,0 +1,143 @@
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from plushsense.core.errors import LayoutError
+from plushsense.core.layouts import Layout, load_layout
+from plushsense.core.recorder_csv import Frames, format_rows, recording_filename, write_recording
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.store import Dataset
+from plushsense.runtime.health import HealthSettings
+from plushsense.runtime.machine import FrameReader, Sample
+from plushsense.windows.calibration import UNIT, SelfCalibration
+from plushsense.windows.clock import resample
+from plushsense.windows.cut import cut_windows
+from plushsense.windows.features import network_inputs
+from plushsense.windows.sessions import SessionReader
+
+PLAIN = load_layout("accel-3")
+WIDE = tuple(replace(c, valid_min=-262144.0, valid_max=262143.0) for c in PLAIN.channels)
+LAYOUT = replace(PLAIN, channels=WIDE, self_calibration=("x", "y", "z"))
+
+
+def readings(n: int, seed: int, radius: float = 8000.0) -> NDArray[np.int64]:
+    """Readings (n, 3) of a sensor that is held still in one direction after the other, and shaken between them."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(n // 150 + 1, 3))
+    x = np.repeat(x / np.linalg.norm(x, axis=1, keepdims=True), 150, axis=0)[:n]
+    shaken = (np.arange(n) // 75 % 2)[:, None]
+    return np.rint(radius * (x + rng.normal(size=(n, 3)) * np.where(shaken, 0.5, 0.004))).astype(np.int64)
+
+
+def frames(x: NDArray[np.int64], start: int = 0) -> Frames:
+    return Frames(x, start + 10 * np.arange(len(x)), 1_000_000 + start + 10 * np.arange(len(x)))
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 1 << 20), st.lists(st.integers(0, 700), max_size=4), st.integers(-60_000, 60_000), st.booleans())
+def test_blocks_and_single_samples_give_the_same(seed: int, cuts: list[int], offset: int, coarse: bool) -> None:
+    x = readings(700, seed, 60.0 if coarse else 9000.0) + offset
+    edges = [0, *sorted(cuts), len(x)]
+    batch, stream = SelfCalibration(LAYOUT), SelfCalibration(LAYOUT)
+    parts = [batch.apply(x[a:b]) for a, b in itertools.pairwise(edges)]
+    assert np.concatenate(parts).tolist() == [stream.push(row) for row in x.tolist()]
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(0.2, (330, 511, -900)), (5.0, (-60_000, 20_000, 9)), (1.37, (1, 2, 3))])
+def test_gain_and_offset_change_nothing(gain: float, offset: tuple[int, int, int]) -> None:
+    x = readings(4000, 3)
+    plain = SelfCalibration(LAYOUT).apply(x)
+    other = SelfCalibration(LAYOUT).apply(np.rint(x * gain + np.array(offset)).astype(np.int64))
+    # While there are hardly any directions, a rounded reading weighs more.
+    assert np.abs(other - plain)[1000:].max() <= 0.01 * UNIT
+    assert np.abs(other - plain).mean() < 1.0
+    still = plain[3000:].reshape(-1, 25, 3)[(np.arange(40) // 3) % 2 == 0]
+    assert np.median(np.linalg.norm(still, axis=2)) == pytest.approx(UNIT, rel=0.02), "held still, it reads 1 g"
+
+
+def test_at_rest_from_the_start_noise_is_not_movement() -> None:
+    x = np.rint(np.random.default_rng(1).normal((330, 512, 400), 0.7, (3000, 3))).astype(np.int64)
+    assert np.abs(SelfCalibration(LAYOUT).apply(x)).max() < 0.35 * UNIT
+
+
+def test_streams_and_segments_have_the_same_inputs_also_after_a_gap() -> None:
+    layout = replace(LAYOUT, inputs=("x", "y", "z")).for_vectors()
+    x = readings(1500, 4) + 700
+    stream = frames(x)
+    stream.device_ms[900:] += 3000
+    state = SelfCalibration(layout)
+    batch = [network_inputs(state.apply(s.data), layout) for s in resample(stream, layout)]
+    assert len(batch) == 2
+    reader = FrameReader(layout, HealthSettings(fault_ms=0))
+    rows = zip(stream.device_ms.tolist(), x.tolist(), strict=True)
+    samples = [item.inputs for ms, row in rows for item in reader.push(ms, row) if isinstance(item, Sample)]
+    assert samples == np.concatenate(batch).tolist()
+    reader.reset()
+    first = [item.inputs for item in reader.push(0, x[0].tolist()) if isinstance(item, Sample)]
+    assert first == [[0] * 6], "a new stream begins anew"
+
+
+def written(folder: Path, layout: Layout, gain: float = 1.0, offset: int = 0) -> Dataset:
+    """Ana has a stream with two recordings, Ben three recordings alone."""
+    ana, ben = folder / "src" / "ana", folder / "src" / "ben"
+    for place in (ana, ben):
+        place.mkdir(parents=True)
+    stream = frames(np.rint(readings(1600, 5) * gain + offset).astype(np.int64))
+    (ana / "fulldatastream.csv").write_text(format_rows(stream, PLAIN))
+    for label, first, rows in (("Wave", 700, 120), ("Shake", 1100, 300)):
+        part = stream.slice(first, first + rows)
+        name = recording_filename(label, 1_000_000 + 10 * (first + rows - 1), rows)
+        write_recording(ana / name, part, PLAIN)
+    alone = np.rint(readings(1200, 6) * gain + offset).astype(np.int64)
+    for label, at in (("Wave", 0), ("Shake", 1), ("Wave", 2)):
+        part = frames(alone[400 * at : 400 * at + 400], 100_000 * at)
+        write_recording(ben / recording_filename(label, 1_100_000 + 100_000 * at, 400), part, PLAIN)
+    return import_recordings(folder / "src", folder / "DS", layout=layout).dataset
+
+
+def test_the_past_of_the_session_is_used_and_nothing_else(tmp_path: Path) -> None:
+    dataset = written(tmp_path / "a", LAYOUT)
+    sessions = SessionReader(dataset)
+    stream = sessions.stream("ana/fulldatastream")[0].data
+    state = SelfCalibration(LAYOUT)
+    assert np.array_equal(stream, state.apply(resample(dataset.read_stream("ana/fulldatastream"), LAYOUT)[0].data))
+    for r in (r for r in dataset.used if r.subject == "ana"):
+        own = SessionReader(dataset).recording(r)[0].data
+        assert np.array_equal(own, stream[r.stream_row : r.stream_row + r.rows])
+    ben = sorted((r for r in dataset.used if r.subject == "ben"), key=lambda r: r.epoch_ms)
+    state = SelfCalibration(LAYOUT)
+    expected = [state.apply(resample(dataset.read(r), LAYOUT)[0].data) for r in ben]
+    for r, data in reversed(list(zip(ben, expected, strict=True))):
+        assert np.array_equal(sessions.recording(r)[0].data, data)
+    windows = cut_windows(dataset)
+    assert windows.self_calibration == "causal"
+    assert cut_windows(dataset.with_inputs(replace(LAYOUT, self_calibration=()))).self_calibration == ""
+    other = cut_windows(written(tmp_path / "b", LAYOUT, 4.0, -20_000))
+    assert np.abs(windows.x - other.x).max() <= 0.02 * UNIT
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"self_calibration": ("x", "y")}, "accepted are all three axes"),
+        ({"self_calibration": ("x", "y", "z"), "vectors": ()}, "here none"),
+        ({"channels": tuple(replace(c, valid_max=1e6) for c in WIDE)}, "within ±524288"),
+    ],
+)
+def test_what_cannot_calibrate_itself_is_refused(change: dict[str, object], words: str) -> None:
+    with pytest.raises(LayoutError, match=words):
+        replace(LAYOUT, **change)
+
+
+def test_a_layout_without_it_is_written_as_before() -> None:
+    assert "self_calibration" not in PLAIN.to_dict()
+    assert Layout.from_dict(PLAIN.to_dict()) == PLAIN
+    assert Layout.from_dict(LAYOUT.to_dict()) == LAYOUT
