@@ -95,7 +95,7 @@ def test_small_cores_need_no_long_division(
 
 def test_cppcheck(needs: Callable[..., None]) -> None:
     needs("cppcheck")
-    for define in ("-UPLUSH_PLAIN", "-DPLUSH_PLAIN", "-DPLUSH_WINDOW"):
+    for define in ("-UPLUSH_PLAIN", "-DPLUSH_PLAIN", "-DPLUSH_WINDOW", "-DPLUSH_CALIBRATE"):
         done = subprocess.run(
             [
                 "cppcheck",

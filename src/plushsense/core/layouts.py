@@ -169,8 +169,8 @@ class Layout:
             anew (1 to 60000, and at most 60000 samples).
         vectors: the axes of each three-axis sensor as a list of three channels of one kind. With an acceleration among
             them, the default network does not depend on how the toy is held.
-        self_calibration: axes of accelerometers whose offset and scale are estimated from the readings themselves
-            (`plushsense.windows.calibration`); their offsets in ``channels`` then do not matter (default: none).
+        self_calibration: axes of accelerometers whose zero and 1 g are found from the readings themselves, while they
+            come; their offsets in ``channels`` then do not matter. All three axes of vectors (default: none).
     """
 
     name: str

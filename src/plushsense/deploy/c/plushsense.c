@@ -2170,7 +2170,7 @@ PLUSH_SMALL static void divide(int64_t *sums, uint32_t n, int64_t by)
 /* The mean of a block, with its weight, into the sums. */
 PLUSH_SMALL static void add_mean(plush_sensor *s, int64_t weight)
 {
-    int64_t m[3], square = 0;
+    int64_t m[3], squared = 0;
     uint32_t top = 0, i, n = 3;
 
     for (i = 0; i < 3; i++)
@@ -2184,12 +2184,12 @@ PLUSH_SMALL static void add_mean(plush_sensor *s, int64_t weight)
     }
     for (i = 0; i < 3; i++) {
         m[i] = s->sum[i] / (INT32_C(1) << s->exponent);
-        square += m[i] * m[i];
+        squared += m[i] * m[i];
     }
     s->weight += (uint32_t)weight;
     for (i = 0; i < 3; i++) {
         s->first[i] += weight * m[i];
-        s->third[i] += weight * m[i] * square;
+        s->third[i] += weight * m[i] * squared;
         s->second[i] += weight * m[i] * m[i];
     }
     s->second[n++] += weight * m[0] * m[1];
@@ -2207,7 +2207,7 @@ PLUSH_SMALL static void add_mean(plush_sensor *s, int64_t weight)
 PLUSH_SMALL static void fit_sphere(plush_sensor *s, uint32_t shift)
 {
     static const uint8_t place[9] = {0, 3, 4, 3, 1, 5, 4, 5, 2};
-    int64_t n = s->weight != 0 ? (int64_t)s->weight : 1, mean[3], a[6], b[3], d[3], square = 0, least;
+    int64_t n = s->weight != 0 ? (int64_t)s->weight : 1, mean[3], a[6], b[3], d[3], squared = 0, least;
     uint64_t size = UINT64_C(1) << 16;
     uint32_t radius, bits = 0, i, j;
 
@@ -2216,13 +2216,13 @@ PLUSH_SMALL static void fit_sphere(plush_sensor *s, uint32_t shift)
     for (i = 0; i < 6; i++) {
         a[i] = s->second[i] * 256 / n;
         if (i < 3)
-            square += a[i];
+            squared += a[i];
     }
     for (i = 0; i < 3; i++)
         for (j = i; j < 3; j++)
             a[place[3 * i + j]] -= mean[i] * mean[j] / 256;
     for (i = 0; i < 3; i++) {
-        b[i] = s->third[i] / n * 65536 - square * mean[i];
+        b[i] = s->third[i] / n * 65536 - squared * mean[i];
         for (j = 0; j < 3; j++)
             b[i] -= 2 * (a[place[3 * i + j]] * mean[j]);
         b[i] /= 2;
@@ -2239,13 +2239,13 @@ PLUSH_SMALL static void fit_sphere(plush_sensor *s, uint32_t shift)
     }
     least = s->level >> (2 * s->exponent);
     least = (least < INT64_C(1) << 36 ? least : INT64_C(1) << 36) * LEAST_RADIUS * 65536;
-    square = (a[0] + a[1] + a[2]) * 256;
+    squared = (a[0] + a[1] + a[2]) * 256;
     for (i = 0; i < 3; i++)
-        square += d[i] * d[i];
-    if (square < least)
-        square = least;
-    if (square > (int64_t)size)
-        size = (uint64_t)square;
+        squared += d[i] * d[i];
+    if (squared < least)
+        squared = least;
+    if (squared > (int64_t)size)
+        size = (uint64_t)squared;
     radius = square_root(size);
     while (radius >> bits != 0)
         bits++;
