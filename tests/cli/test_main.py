@@ -106,10 +106,12 @@ def test_import_info_train_evaluate_report(cli: Cli, recordings: Path, tmp_path:
     trained = cli("train", ds, "--out", model, "--filters", "4,4,4", "--epochs", "8", "--json").json
     assert trained["bundle"] == str(model)
     assert len(trained["history"]) == 8
-    assert trained["scores"]["split"] == "cross-fitted-subjects"
+    assert trained["scores"]["split"] == "validation-subjects"
+    held = set(cli("info", model, "--json").json["provenance"]["validation_subjects"])
+    assert held
+    assert all(person in trained["scores"]["said"] for person in held)
     card = cli("info", model, "--json").json
     assert (card["receptive_field_s"], card["span_s"]) == (1.18, 2.47)
-    assert card["provenance"]["subjects"] == ["P1", "P2", "P3", "P4", "P5"]
     assert cli("info", model, "--json").json["provenance"]["dataset_hash"] == found["hash"]
     assert "already there" in cli("train", ds, "--out", model).err
     ran = cli("evaluate", ds, *SMALL, "--epochs", "40", "--json")

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 import plushsense as ps
-from plushsense.cli.train import decided
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
@@ -20,15 +19,15 @@ Cli = Callable[..., Any]
 SMALL = ("--filters", "4,4,4", "--epochs", "6")
 
 
-def test_train_fits_decisions_on_everybody_by_networks_of_others(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
+def test_train_fits_decisions_on_those_who_validate(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
     ran = cli("train", dataset.path, *SMALL, "--out", tmp_path / "m.plush", "--json")
     assert ran.status == 0, ran.err
     bundle = ps.load(tmp_path / "m.plush")
     spec = DecideSpec.from_dict(bundle.decision)
     fitted = spec.fitted
-    assert (fitted["people"], fitted["networks"], fitted["streams"]) == (5, 3, 5)
-    assert fitted["health"]["people"] == 5 and fitted["answers"]["coverage_left_out"] is not None
-    assert bundle.provenance["validation_subjects"] == []
+    assert fitted["people"] == len(bundle.provenance["validation_subjects"]) == 1
+    assert fitted["health"]["people"] == 5
+    assert fitted["streams"] == 1 and fitted["answers"]["coverage_left_out"] is None
     assert spec.known_margin is not None and spec.health.low
     assert ran.json["decision"]["fitted"] == fitted
     # Who they are stands in the provenance alone, which an export takes out.
@@ -43,10 +42,8 @@ def test_given_settings_stay_and_train_says_what_it_did(cli: Cli, dataset: Datas
     ran = cli("train", dataset.path, *SMALL, "--config", tmp_path / "run.toml", "--out", tmp_path / "m.plush")
     spec = DecideSpec.from_dict(ps.load(tmp_path / "m.plush").decision)
     assert (spec.smoothing_s, spec.enter) == (0.45, 0.85)
-    assert "Decisions cross-fitted on 5 people, each read by one of 3 networks of other people" in ran.out
-    assert decided({"fitted": {**spec.fitted, "people": 1, "networks": None}})[0].startswith(
-        "Decisions fitted on 1 person who was held back"
-    )
+    assert "Decisions fitted on 1 person who were held back" not in ran.out
+    assert "Decisions fitted on 1 person who was held back" in ran.out
     gate = spec.fitted["gate"]
     notices = f"it detects {100 * gate['recall']:.0f} % of" if "recall" in gate else gate["reason"]
     assert notices in ran.out, "what the gate's fit found, or why there is none"

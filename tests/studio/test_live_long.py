@@ -44,7 +44,7 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("reader")
     simulate(folder / "made", people=10, repetitions=1, dataset=folder / "set")
-    trained = ps.train(folder / "set", preset="people", epochs=30, patience=30, context="anywhere")
+    trained = ps.train(folder / "set", preset="people", epochs=30, context="anywhere")
     return trained.save(folder / "reader.plush")
 
 

@@ -112,13 +112,13 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     assert re.fullmatch(
         r"It reads about [\d.]+ of 10 touches of people it never met; guessing gives 0.6 of 10.", verdict
     )
-    # The figure of the sentence stands in the table, too.
+    # The curve ends at the figure of the sentence, which stands in the table, too.
     (figure,) = re.findall(r"^Accuracy ([\d.]+), macro-F1", done.locator('[data-test="result"]').inner_text())
     assert done.get_by_text("simulation", exact=True).is_visible()
     # The curve begins with the first epoch, though three runs drew it.
     (job,) = (json.loads(path.read_text(encoding="utf-8")) for path in (home / "work").glob("*.json"))
     assert [r["epoch"] for r in job["reports"] if r["stage"] == "training" and "epoch" in r] == list(range(1, 21))
-    assert [r["epoch"] for r in job["reports"] if r["stage"] == "cross_fitting"][-20:] == list(range(1, 21))
+    assert f"{job['reports'][-2]['accuracy']:.3f}" == figure
     page.locator('[data-column="kind"]').get_by_text("training").nth(1).wait_for()
     assert page.locator('[data-row$="by page.plush"] [data-column="accuracy"]').inner_text() == figure
     by_page = (home / "bundles" / "by page.plush").read_bytes()
@@ -128,7 +128,7 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     assert main(asked[1:]) == 0
     capsys.readouterr()
     assert out.read_bytes() == by_page
-    # Its confusions lead to the recordings of people whom the network that answered did not know.
+    # Its confusions lead to the recordings of the person that was held back.
     done.locator('[data-test="open-result"]').click()
     marked(page, "show-confusions").click()
     page.locator("[data-test=worst] [data-cell]").first.click()

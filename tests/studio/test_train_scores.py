@@ -58,7 +58,7 @@ def test_an_evaluation_has_the_same_figure_everywhere(home: Path, capsys: pytest
     assert "without recordings at rest" in report and "with recordings at rest" in report
     row = row_of(home, EVALUATION)
     assert (row.accuracy, row.rest) == (accuracy, rest)
-    assert np.mean([value for _, value in row.people if value is not None]) == pytest.approx(accuracy, abs=0.05)
+    assert np.mean([value for _, value in row.people if value is not None]) == pytest.approx(accuracy)
     details = StoredResults(Workspace(home)).details(row)
     assert details.pooled == pooled
     for language, point in (("en", "."), ("lv", ",")):
@@ -90,11 +90,12 @@ def test_a_training_has_the_same_figure_everywhere(home: Path, capsys: pytest.Ca
     printed = json.loads(capsys.readouterr().out)
     accuracy = printed["scores"]["accuracy"]
     last = printed["history"][-1]
-    # The score is that of networks of others, and nobody was there to validate the network itself.
-    assert printed["scores"]["split"] == "cross-fitted-subjects" and last["accuracy"] is None
+    # The last point of the curve is the score; over all windows it is another number, with another name.
+    assert last["accuracy"] == pytest.approx(accuracy) == pytest.approx(last["validation_accuracy_people"])
+    assert last["validation_accuracy"] > accuracy + 0.02
     results = StoredResults(Workspace(home))
     row = row_of(home, TRAINING)
-    assert (row.accuracy, row.spread, row.units) == (accuracy, "crossed", 6)
+    assert (row.accuracy, row.units) == (accuracy, 1)
     w = Words("lv")
     assert figure(w, accuracy) in figures(w, row)
     # Its confusions are computed from the recordings of the same person, and agree with the score.
@@ -103,7 +104,7 @@ def test_a_training_has_the_same_figure_everywhere(home: Path, capsys: pytest.Ca
     found = results.with_predictions(details)
     assert found.clickable and found.by_gesture is not None
     counts = np.array(found.by_gesture.counts)
-    assert np.trace(counts) / counts.sum() == pytest.approx(accuracy, abs=0.05)
+    assert np.trace(counts) / counts.sum() == pytest.approx(accuracy)
     i, j = (int(n) for n in np.argwhere(counts * (1 - np.eye(len(counts), dtype=int)))[0])
     labels = found.by_gesture.labels
     listed = results.misread(row, [labels[i]], [labels[j]])

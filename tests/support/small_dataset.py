@@ -107,5 +107,4 @@ def bundle(imported: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("bundle")
     made = shutil.copytree(imported, folder / "DS")
-    # With people who were held back, and without networks for cross-fitting, which take time.
-    return ps.train(made, epochs=10, patience=10, filters=(4, 4, 4)).save(folder / "model.plush")
+    return ps.train(made, epochs=10, filters=(4, 4, 4)).save(folder / "model.plush")

@@ -1,12 +1,10 @@
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ import pytest
 import plushsense as ps
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.store import Dataset
-from plushsense.workflow.api import simulate, validation_predictions
+from plushsense.workflow.api import simulate
 
 
 def test_the_public_api_is_small_and_all_of_its_names_load() -> None:
@@ -33,29 +31,8 @@ def test_every_function_that_the_documentation_lists_is_in_its_module() -> None:
     assert [f"{module}.{name}" for name, module in listed.items() if not hasattr(import_module(module), name)] == []
 
 
-def test_train_learns_from_everybody_and_scores_them_by_networks_of_others(dataset: Dataset) -> None:
-    rows: list[dict[str, Any]] = []
-    trained = ps.train(dataset, epochs=2, filters=(4, 4, 4), progress=lambda *at: rows.append(at[2]))
-    bundle = trained.bundle
-    assert (bundle.provenance["subjects"], bundle.provenance["validation_subjects"]) == (sorted(dataset.subjects), [])
-    assert [row.get("fold") for row in rows] == [None, None, 1, 1, 2, 2, 3, 3]
-    fitted = bundle.decision["fitted"]
-    assert (fitted["people"], fitted["networks"], fitted["streams"]) == (5, 3, 5)
-    assert trained.scores["split"] == "cross-fitted-subjects" and "all 5 people" in trained.scores["said"]
-    answered = validation_predictions(bundle, dataset)
-    assert set(answered.subject.tolist()) == set(dataset.subjects) and len(set(answered.fold.tolist())) == 3
-    assert len(answered) == trained.scores["windows"]
-    # They are answers of other networks than the one in the bundle.
-    scores = [(answered.predicted == answered.truth)[answered.subject == p].mean() for p in dataset.subjects]
-    assert np.mean(scores) == pytest.approx(trained.scores["accuracy"])
-    assert trained.figure().axes
-    shutil.rmtree(dataset.path / "cache")
-    with pytest.raises(DatasetError, match="no validation people"):
-        validation_predictions(bundle, dataset)
-
-
-def test_early_stopping_keeps_whole_people_apart_and_says_on_whom(dataset: Dataset) -> None:
-    trained = ps.train(dataset, epochs=2, filters=(4, 4, 4), patience=5)
+def test_train_keeps_whole_people_apart_and_says_on_whom(dataset: Dataset) -> None:
+    trained = ps.train(dataset, epochs=2, filters=(4, 4, 4))
     inside, watching = (set(trained.bundle.provenance[k]) for k in ("subjects", "validation_subjects"))
     assert inside & watching == set()
     assert inside | watching == set(dataset.subjects)
@@ -182,14 +159,12 @@ def test_nothing_that_is_scored_was_trained_on(people: int, kind: str, tmp_path:
     dataset = long_recordings(tmp_path, people, 4)
     windows = ps.cut_windows(dataset)
     assert len(windows) == 6 * len(dataset.recordings), "several windows a recording"
-    division = divide(windows, resolve(None, training={"patience": 9}))
-    trained, scored = (set(windows.recording[i].tolist()) for i in (division.train, division.folds[0].test))
+    division = divide(windows, resolve(None))
+    trained, scored = (set(windows.recording[i].tolist()) for i in (division.train, division.fold.test))
     assert trained
     assert scored
     assert not trained & scored
-    for fold in divide(windows, resolve(None)).folds:
-        assert not set(windows.recording[fold.train].tolist()) & set(windows.recording[fold.test].tolist())
-    trained = ps.train(dataset, epochs=1, filters=(2, 2, 2), patience=9)
+    trained = ps.train(dataset, epochs=1, filters=(2, 2, 2))
     assert trained.scores["split"] == kind
     assert not trained.scores["leaky"]
     if people < 3:
@@ -199,7 +174,7 @@ def test_nothing_that_is_scored_was_trained_on(people: int, kind: str, tmp_path:
 def test_the_toy_at_rest_does_not_flatter_a_training(tmp_path: Path) -> None:
     simulate(tmp_path / "raw", people=3, repetitions=1)
     dataset = ps.import_recordings(tmp_path / "raw", tmp_path / "DS", layout="plush-15").dataset
-    scores = ps.train(dataset, epochs=1, filters=(2, 2, 2), patience=9).scores
+    scores = ps.train(dataset, epochs=1, filters=(2, 2, 2)).scores
     assert scores["simulated"]
     assert scores["nobody"]["windows"] > 0
     assert scores["accuracy"] < 0.6, "after one epoch only rest is known, and rest is nobody's"

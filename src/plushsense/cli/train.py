@@ -67,11 +67,11 @@ def _reads(bundle: Bundle) -> str:
 
 def _counted(scores: Mapping[str, Any]) -> str:
     from plushsense.reports.wording import MEAN
-    from plushsense.workflow.preparation import BY_PEOPLE
+    from plushsense.workflow.preparation import WHOLE_PEOPLE
 
     rest = scores["nobody"]
     apart = f", whose accuracy is {figure(rest['accuracy'])}" if rest else ""
-    return f" ({MEAN}{apart})" if scores["split"] in BY_PEOPLE else ""
+    return f" ({MEAN}{apart})" if scores["split"] == WHOLE_PEOPLE else ""
 
 
 def decided(decision: Mapping[str, Any]) -> list[str]:
@@ -82,8 +82,6 @@ def decided(decision: Mapping[str, Any]) -> list[str]:
     people = "1 person" if fitted["people"] == 1 else f"{fitted['people']} people"
     events, answers = fitted["events"], fitted.get("answers")
     text = f"Decisions fitted on {people} who {'was' if fitted['people'] == 1 else 'were'} held back"
-    if fitted.get("networks"):
-        text = f"Decisions cross-fitted on {people}, each read by one of {fitted['networks']} networks of other people"
     if "cost" in events:
         text += f" ({fitted['gestures']} gestures in {60 * fitted['hours']:.0f} min of streams): an event's cost "
         text += f"{figure(events['cost_before'])} with the defaults, "

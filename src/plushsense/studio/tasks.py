@@ -300,9 +300,9 @@ def run_publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         try:
             Path(key).parent.mkdir(parents=True, exist_ok=True)
         except OSError as cause:
-            why = cause.strerror or str(cause)
+            file, why = Path(key).name, cause.strerror or str(cause)
             message = f"The key file '{key}' cannot be written: {why}."
-            raise DatasetError(message, reason="key_not_written", file=Path(key).name, why=why) from None
+            raise DatasetError(message, reason="key_not_written", file=file, why=why) from None
     options = {name: value for name, value in spec.items() if name not in ("dataset", "place")}
     options |= {"columns": tuple(spec.get("columns", ())), "key": key}
     return publish_dataset(spec["dataset"], spec["place"], **options, progress=reporter.stage).to_dict()
@@ -323,22 +323,20 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     out = Path(spec["out"])
     check_folder(out.parent, "A bundle")
     reporter.progress(stage="reading", share=0.0)
-    from plushsense.workflow.api import train, unfinished
-    from plushsense.workflow.networks import FIRST_NETWORK
-    from plushsense.workflow.preparation import MOST_GROUPS, cross_fitting_groups
 
-    clock, tuning, epochs = Clock(), int(spec.get("quantize_aware", 0)), config.training.epochs
-    first = epochs if config.windows.context == ANYWHERE and config.anywhere.hard_share > 0 else 0
-    one, groups = first + epochs + tuning, cross_fitting_groups(config, MOST_GROUPS)
+    from plushsense.workflow.api import FIRST_NETWORK, train, unfinished
+
+    clock, tuning = Clock(), int(spec.get("quantize_aware", 0))
+    hard = config.windows.context == ANYWHERE and config.anywhere.hard_share > 0
+    first = config.training.epochs if hard else 0
+    whole = first + config.training.epochs + tuning
 
     def epoch(at: int, of: int, row: dict[str, Any]) -> None:
-        what, fold = str(row.get("what", "")), int(row.get("fold", 0))
-        stage = "cross_fitting" if fold else {"": "training", FIRST_NETWORK: "first_network"}.get(what, "fine-tuning")
-        past = (0 if what.endswith(FIRST_NETWORK) else first) + (epochs if stage == "fine-tuning" else 0)
+        stage = {None: "training", FIRST_NETWORK: "first_network"}.get(row.get("what"), "fine-tuning")
+        done = at + {"training": first, "first_network": 0, "fine-tuning": first + config.training.epochs}[stage]
         scores = {k: row.get(k) for k in ("train_loss", "train_accuracy", "validation_loss", "accuracy")}
-        share = (fold * one + past + at) / (one * (1 + groups))
-        reporter.progress(stage=stage, epoch=at, epochs=of, **scores, **clock.at(share))
-        if at == of and fold == groups and past == first and not tuning:
+        reporter.progress(stage=stage, epoch=at, epochs=of, **scores, **clock.at(done / whole))
+        if at == of and stage == "training" and not tuning:
             reporter.progress(stage="deciding", epoch=at, epochs=of, share=1.0)
 
     done = train(
@@ -367,14 +365,14 @@ def run_make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     out = Path(spec["out"])
     reporter.progress(stage="reading", share=0.0)
 
-    from plushsense.trials.budget import BudgetProgress, make_network
+    from plushsense.trials.budget import TRAINING, BudgetProgress, make_network
     from plushsense.workflow.reporting import load_evaluation
 
     clock = Clock()
 
     def report(at: BudgetProgress) -> None:
         row = {key: value for key, value in at.row.items() if key != "learning_rate"}
-        stage = "cross_fitting" if "fold" in row else "first_network" if "what" in row else at.stage
+        stage = "first_network" if at.stage == TRAINING and "what" in row else at.stage
         reporter.progress(**row | {"stage": stage, "bundle": at.bundle}, **clock.at(at.share))
 
     settings = spec.get("settings")

@@ -32,8 +32,7 @@ from plushsense.trials.estimate import preview_evaluation
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import evaluate, train, unfinished
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.networks import FIRST_NETWORK
-from plushsense.workflow.preparation import Warn, cross_fitting_groups, silent
+from plushsense.workflow.preparation import Warn, silent
 from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, evaluation_id, journal_of, name_of, write_report
 
 TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
@@ -59,8 +58,7 @@ class TrainingCost:
         window_epoch_s: seconds to train on one window for one epoch.
         windows: number of windows of all people.
         side_by_side: number of folds that are trained at the same time.
-        networks: number of trainings on all people that the final network takes: 2 if a first network finds hard
-            negatives for it, else 1; with cross-fitting, times the number of groups.
+        networks: 2 if a first network finds hard negatives for the final one, else 1.
     """
 
     window_epoch_s: float
@@ -219,9 +217,6 @@ def make_network(
         streams = any(recording.stream_row >= 0 for recording in dataset.used)
         config = from_settings(context=ANYWHERE) if streams else from_settings()
     networks = 2 if config.anywhere.hard_share and config.windows.context == ANYWHERE else 1
-    # Each of the groups is left out of a network of the other people.
-    groups = max(1, cross_fitting_groups(config, _count_people(dataset)))
-    networks *= groups
     # A resumed run must not choose other folds because the computer is faster or slower than before.
     journal = journal_of(dataset, "budgets")
     key = job_id({"evaluation": evaluation_id(config, dataset), "out": out.name, "seconds": budget_s})
@@ -239,8 +234,7 @@ def make_network(
     whole = sum(_work(plan, networks))
     bundle = _saved_bundle(out.parent, stored["bundle"]) if stored is not None else None
     if bundle is None:
-        bundle, training_s = _train(dataset, config, out, whole, networks, groups, progress, warn)
-        training_s /= groups
+        bundle, training_s = _train(dataset, config, out, whole, networks, progress, warn)
         if cost is not None:
             plan = _adjusted(plan, cost, training_s, _USED * budget_s - (time.monotonic() - began))
             config, whole = _planned(config, plan), sum(_work(plan, networks))
@@ -332,26 +326,12 @@ def _work(plan: BudgetPlan, networks: int) -> list[float]:
 
 
 def _train(
-    dataset: Dataset,
-    config: RunConfig,
-    out: Path,
-    whole: float,
-    networks: int,
-    groups: int,
-    progress: Reporter,
-    warn: Warn,
+    dataset: Dataset, config: RunConfig, out: Path, whole: float, networks: int, progress: Reporter, warn: Warn
 ) -> tuple[Path, float]:
-    each = networks // groups
-    parts = groups if groups > 1 else 0
-
     def epoch_done(epoch: int, epochs: int, row: dict[str, Any]) -> None:
-        fold, first = row.get("fold", 0), str(row.get("what", "")).endswith(FIRST_NETWORK)
-        done = epoch / epochs + (0 if first else each - 1)
-        if fold:
-            # A network of the others takes as much less time as people are left out.
-            done = each + (1 - 1 / groups) * ((fold - 1) * each + done)
+        done = epoch / epochs + (networks - 1 if "what" not in row else 0)
         progress(BudgetProgress(TRAINING, done / whole, row | {"epoch": epoch, "epochs": epochs}))
-        if epoch == epochs and fold == parts and not first:
+        if epoch == epochs and "what" not in row:
             progress(BudgetProgress(DECIDING, done / whole, {}))
 
     done = train(dataset, config, journal=unfinished(dataset), progress=epoch_done, warn=warn)

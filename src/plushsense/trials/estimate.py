@@ -24,15 +24,7 @@ from plushsense.training.spec import TrainSpec
 from plushsense.trials.plan import PASSES, Plan, Task
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.config import RunConfig
-from plushsense.workflow.preparation import (
-    CROSS_FITTED,
-    Warn,
-    classes_for,
-    divide,
-    network_inputs_of,
-    silent,
-    windows_for,
-)
+from plushsense.workflow.preparation import Warn, classes_for, divide, network_inputs_of, silent, windows_for
 
 _BATCHES, _EPOCHS = 3, 3
 
@@ -50,9 +42,8 @@ def preview_training(
         scored = windows_for(dataset, network, config.scored_on, gestures)
     division = divide(windows, config, scored)
     rate = _seconds_a_mac(windows, network, config.training)
-    head = {"split": division.kind, "leaky": division.split.leaky, "context": config.windows.context}
-    sizes = [len(division.train), *(len(f.train) for f in division.folds if division.kind == CROSS_FITTED)]
-    return head | {"folds": len(sizes)} | _describe(dataset, network, config, windows, sizes, rate, 1)
+    head = {"split": division.kind, "leaky": division.split.leaky, "context": config.windows.context, "folds": 1}
+    return head | _describe(dataset, network, config, windows, [len(division.train)], rate, 1)
 
 
 def preview_evaluation(

@@ -141,7 +141,7 @@ def _long_wrong(
 COVERAGE = 0.9
 KNOWN_SHARE = 0.95
 # The search uses at most this much of the streams, for which it takes about 15 s.
-MOST_SEARCHED_S = 4 * 3600.0
+MOST_SEARCHED_S = 3600.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +179,6 @@ def fit_decisions(
     training: Iterable[str] = (),
     spec: DecideSpec | None = None,
     keep: Collection[str] = (),
-    networks: Sequence[tuple[Bundle, Collection[str]]] = (),
 ) -> DecideSpec:
     """Fit all decision settings; ``fitted`` of the result describes the data and the outcome.
 
@@ -195,11 +194,9 @@ def fit_decisions(
     Labelled steps are in the second half of a recording, as in the first half the network still reads earlier samples.
 
     Args:
-        subjects: people to whom the weights of the network that reads them were not fitted.
+        subjects: training people to whom the weights were not fitted.
         training: people to whom they were fitted, who are used for gate and health only.
         spec: start of the search; ``keep`` names the settings not to change.
-        networks: for cross-fitting: networks of the same kind, each with those of ``subjects`` whose recordings it
-            reads because it was trained on others; by default, ``bundle`` reads those of all.
 
     Raises:
         ConfigError: for a coverage or a share out of range.
@@ -219,10 +216,7 @@ def fit_decisions(
     if "gate" not in keep:
         fitted = fit_gate(dataset, bundle.gestures, everybody, false_alarms_per_hour=false_alarms_per_hour)
         spec, gate = replace(spec, gate=fitted.settings), fitted.report
-    reads = [(network, set(theirs)) for network, theirs in networks] or [(bundle, set(people))]
-    streams = [
-        h for network, theirs in reads for h in marked_streams(network, dataset, theirs, spec, share=len(people))
-    ]
+    streams = marked_streams(bundle, dataset, people, spec)
     idle = [k for k, gesture in enumerate(bundle.gestures.gestures) if gesture.idle]
     report: dict[str, Any] = {
         "people": len(people),
@@ -230,7 +224,6 @@ def fit_decisions(
         "hours": round(sum(h.trace.seconds for h in streams) / 3600, 3),
         "gestures": sum(t.gesture not in (OTHER, *idle) for h in streams for t in h.truths),
         "simulated": dataset.head.simulated,
-        "networks": len(networks) or None,
     }
     if streams:
         if "known_margin" not in keep:
@@ -251,7 +244,7 @@ def fit_decisions(
             "moved": {name: list(values) for name, values in tuned.moved.items()},
         }
     else:
-        labelled = joined([labelled_windows(network, dataset, theirs) for network, theirs in reads])
+        labelled = labelled_windows(bundle, dataset, people)
         report["events"] = {"on": "nothing: nobody who was held back has a stream", "moved": {}}
     if len(labelled.truth):
         if "known_margin" not in keep:
@@ -299,16 +292,13 @@ def marked_streams(
     subjects: Iterable[str],
     spec: DecideSpec,
     gestures: GestureSet | None = None,
-    share: int = 0,
 ) -> list[MarkedStream]:
     """Compute the traces of the streams of some people, with their marked recordings.
 
-    Streams without a marked recording are left out. Of more than `MOST_SEARCHED_S`, an equal part is used for each
-    person.
+    Streams without a marked recording are left out. Of more than an hour, an equal part is used for each person.
 
     Args:
         gestures: the set to which the indices of the truths refer; by default the network's own.
-        share: number of people among whom this time is shared; at least those who have streams here.
     """
     people = set(subjects)
     marked: dict[str, list[RecordingInfo]] = {}
@@ -316,7 +306,7 @@ def marked_streams(
         if r.stream_row >= 0:
             marked.setdefault(r.stream, []).append(r)
     streams = [s for s in dataset.streams if s.subject in people and s.id in marked]
-    share_s = MOST_SEARCHED_S / max(len({s.subject for s in streams}), share, 1)
+    share_s = MOST_SEARCHED_S / max(len({s.subject for s in streams}), 1)
     left = {s.subject: round(share_s * dataset.layout.rate_hz) for s in streams}
     out = []
     for stream in streams:
@@ -389,13 +379,6 @@ def labelled_windows(bundle: Bundle, dataset: Dataset, subjects: Iterable[str]) 
     shares = softmax(logits)
     known = known_score(logits, np.array([g.idle for g in bundle.gestures.gestures]))
     return LabelledSteps(shares, known, windows.y, windows.subject, windows.recording)
-
-
-def joined(parts: Sequence[LabelledSteps]) -> LabelledSteps:
-    """Join the labelled steps of different people; their recordings are numbered anew."""
-    whole = LabelledSteps(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(LabelledSteps)))
-    offsets = np.cumsum([0, *(int(p.recording.max(initial=-1)) + 1 for p in parts)])[:-1]
-    return replace(whole, recording=whole.recording + np.repeat(offsets, [len(p.truth) for p in parts]))
 
 
 def _ints(values: Sequence[int]) -> Ints:

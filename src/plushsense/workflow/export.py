@@ -25,7 +25,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.runtime.image import image_check, patch_bytes
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
-from plushsense.workflow.preparation import BY_PEOPLE, Warn, silent, windows_for
+from plushsense.workflow.preparation import WHOLE_PEOPLE, Warn, silent, windows_for
 
 _TRIED = 512  # maximum of windows on which a conversion is compared with the network
 
@@ -66,7 +66,7 @@ def training_windows(
         )
     # Windows of `NOBODY` are used both for training and for validation.
     people = {str(s) for s in origin.get("subjects", ())} - {NOBODY}
-    if origin.get("split") not in BY_PEOPLE or not people:
+    if origin.get("split") != WHOLE_PEOPLE or not people:
         raise BundleError(
             "The bundle does not name the people of its training windows "
             f"(split '{origin.get('split', 'unknown')}'), which calibration needs: train it again.",

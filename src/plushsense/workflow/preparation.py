@@ -14,7 +14,7 @@ from plushsense.core.gestures import NOBODY, GestureSet, merge_names
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.proposals import median_gesture_s
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
-from plushsense.evaluation.crossval import fold_windows, train_on_validation
+from plushsense.evaluation.crossval import fold_windows
 from plushsense.models.arch import Arch, parse_symbol, symbol_within
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
 from plushsense.training.spec import TrainSpec
@@ -230,54 +230,26 @@ def outside_streams(windows: WindowSet, dataset: Dataset, people: Collection[str
     return ~np.isin(windows.stream, np.array(theirs, dtype=np.str_))
 
 
-WHOLE_PEOPLE, CROSS_FITTED = "validation-subjects", "cross-fitted-subjects"
-BY_PEOPLE = WHOLE_PEOPLE, CROSS_FITTED
-"""Kinds of `TrainValidationSplit` with which nobody is scored by a network that was trained on that person."""
-
-MOST_GROUPS = 3
-"""Number of groups for cross-fitting; with fewer people, each is a group."""
+WHOLE_PEOPLE = "validation-subjects"
 
 
 @dataclass(frozen=True)
 class TrainValidationSplit:
-    """The train/validation split of a single training; ``train`` and ``watch`` are indices of the windows of each.
-
-    ``folds`` are scored. In cross-fitting there are several, each with a network of its own; otherwise there is one,
-    and it is scored by the network that was trained on ``train``.
-    """
+    """The train/validation split of a single training; ``train`` and ``watch`` are indices of the windows of each."""
 
     split: Split
     kind: str
     description: str
-    folds: tuple[Fold, ...]
+    fold: Fold
     train: NDArray[np.int64]
     watch: NDArray[np.int64]
 
-    @property
-    def held_back(self) -> tuple[str, ...]:
-        """People on whom the network is not trained."""
-        return self.folds[0].subjects if self.kind == WHOLE_PEOPLE else ()
-
-
-def cross_fitting_groups(config: RunConfig, people: int) -> int:
-    """Return the number of groups for cross-fitting; 0 if people, recordings or windows are held out instead."""
-    return (
-        min(people, MOST_GROUPS)
-        if people >= 3 and config.training.patience is None and config.preset != "search"
-        else 0
-    )
-
 
 def divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = None) -> TrainValidationSplit:
-    """Divide windows for one training: which to train on, which to watch, and which to score.
+    """Hold out people for validation; with fewer than three, recordings; with the preset ``search``, windows.
 
-    With early stopping, people are held out for validation. Without, nobody is: the network is trained on everybody,
-    and in cross-fitting, each of at most `MOST_GROUPS` groups of people is scored by a network that was trained on the
-    others. With fewer than three people, recordings are held out; with the preset ``search``, windows.
-
-    ``watch`` and the ``test`` of the folds are indices into ``scored``, windows of the same recordings that may be cut
-    with other settings (default: ``windows``). Except with ``search``, no scored recording is trained on by the network
-    that scores it.
+    ``watch`` and the fold's ``test`` are indices into ``scored``, windows of the same recordings that may be cut with
+    other settings (default: ``windows``). Except with ``search``, no scored recording is trained on.
     """
     scored = windows if scored is None else scored
     seed = config.evaluation.seed
@@ -286,14 +258,8 @@ def divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = Non
         split = parse_split("windows:holdout")
         fold = fold_windows(windows, scored, split, seed)[0]
         description = "15 % of the windows, drawn at random: leaky, windows of one recording are on both sides"
-        return TrainValidationSplit(split, split.text, description, (fold,), fold.train, fold.validation)
+        return TrainValidationSplit(split, split.text, description, fold, fold.train, fold.validation)
     people = set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}
-    if groups := cross_fitting_groups(config, len(people)):
-        split = parse_split(f"by-subject:{groups}")
-        folds = tuple(train_on_validation(fold_windows(windows, scored, split, seed)))
-        description = f"all {len(people)} people, each scored by one of {len(folds)} networks of other people"
-        everybody = np.arange(len(windows))
-        return TrainValidationSplit(split, CROSS_FITTED, description, folds, everybody, everybody[:0])
     if len(people) >= 3:
         split = parse_split(f"by-subject:{min(len(people), round(1 / VALIDATION_SHARE))}")
         kind, description = WHOLE_PEOPLE, f"people who were not trained on{stops}: "
@@ -306,4 +272,4 @@ def divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = Non
     if split.apart:
         description += ", ".join(fold.subjects)
     rest = np.sort(np.concatenate([fold.train, fold.validation]))
-    return TrainValidationSplit(split, kind, description, (fold,), rest, fold.test)
+    return TrainValidationSplit(split, kind, description, fold, rest, fold.test)

@@ -25,7 +25,6 @@ from plushsense.studio.app.shell import (
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.review.review import Reviews
 from plushsense.studio.pages.train.results import (
-    CROSSED,
     EVALUATION,
     HELD_BACK,
     TRAINING,
@@ -102,7 +101,7 @@ class ResultDetailsView:
                 self._people(d)
 
     async def _compute(self) -> None:
-        """Show the confusions of a training on people whom the network that answered did not know."""
+        """Compute the confusions of a training from the recordings of its validation people."""
         d = self._details
         if d is None:
             return
@@ -118,7 +117,7 @@ class ResultDetailsView:
         w, facts = self._words, d.facts
         checked = sorted(set(facts.get("validation_subjects", [])) - {NOBODY, UNKNOWN_SUBJECT})
         text = w(
-            {HELD_BACK: "train.facts_training", CROSSED: "train.facts_crossed"}.get(d.row.spread, "train.facts_same"),
+            "train.facts_training" if d.row.spread == HELD_BACK else "train.facts_same",
             trained=counted(w, "with_people", len(set(facts.get("subjects", [])) - {NOBODY, UNKNOWN_SUBJECT})),
             checked=counted(w, "with_people", len(checked)),
             names=", ".join(checked) or "–",

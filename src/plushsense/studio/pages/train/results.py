@@ -24,7 +24,7 @@ from plushsense.studio.app.workspace import Workspace, file_stamps
 from plushsense.trials.tables import SUMMARY as SWEEP
 from plushsense.trials.tables import TRIALS_CSV, prediction_files
 from plushsense.windows.cut import ANYWHERE
-from plushsense.workflow.preparation import BY_PEOPLE, CROSS_FITTED, WHOLE_PEOPLE
+from plushsense.workflow.preparation import WHOLE_PEOPLE
 from plushsense.workflow.reporting import LEARNING, PREDICTIONS, SCORES, load_evaluation
 
 
@@ -84,8 +84,8 @@ def context_text(words: Words, context: str) -> str:
 
 
 EVALUATION, TRIAL, TRAINING = "evaluation", "trial", "training"
-SUBJECTS, FOLDS, TRAININGS, HELD_BACK, CROSSED = "subjects", "folds", "trainings", "held_back", "crossed"
-_UNITS = {SUBJECTS: "people", FOLDS: "folds", TRAININGS: "trainings", HELD_BACK: "people", CROSSED: "people"}
+SUBJECTS, FOLDS, TRAININGS, HELD_BACK = "subjects", "folds", "trainings", "held_back"
+_UNITS = {SUBJECTS: "people", FOLDS: "folds", TRAININGS: "trainings", HELD_BACK: "people"}
 _HASH = 6
 
 
@@ -99,8 +99,7 @@ class ResultRow:
         trial: number within a sweep, or "".
         dataset: folder of the data set, "" if it is not in this studio; ``data`` is its name.
         spread: over what mean and standard deviation are computed: ``units`` of `SUBJECTS`, `FOLDS` or `TRAININGS`
-            (folds times seeds), or for a single training the people `HELD_BACK`, or all people in cross-fitting
-            (`CROSSED`).
+            (folds times seeds), or for a single training the people `HELD_BACK`.
         macs: number of multiply-accumulate operations per decision, every 50 ms.
         when_s: time of the result, in seconds since 1970.
         classes: number of gestures that the network tells apart.
@@ -239,11 +238,6 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
         # As in evaluations, networks trained on any context are scored in the context "stream".
         context = f"{ANYWHERE} → stream"
     held_back = sorted(known_people(origin, ["validation_subjects"]))
-    # In cross-fitting, everybody was scored, by networks of other people.
-    crossed = sorted(known_people(origin, ["subjects"])) if split == CROSS_FITTED else []
-    spread = {WHOLE_PEOPLE: (HELD_BACK, len(held_back)), CROSS_FITTED: (CROSSED, len(crossed))}.get(
-        split, (TRAININGS, 1)
-    )
     return [
         ResultRow(
             str(path),
@@ -259,8 +253,8 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
             bool(scores.get("leaky")),
             bool(origin.get("simulated")),
             str(training.get("seed", "?")),
-            # Otherwise, the network was trained on the people it was scored on.
-            *spread,
+            # Unless whole people were held back, the network was trained on the people it was scored on.
+            *((HELD_BACK, len(held_back)) if split == WHOLE_PEOPLE else (TRAININGS, 1)),
             scores.get("accuracy"),
             None,
             scores.get("macro_f1"),
@@ -268,9 +262,9 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
             arch.parameters,
             arch.macs_per_step,
             path.stat().st_mtime,
-            (str(origin.get("dataset_hash", ""))[:_HASH], *bundle.gestures.labels, *held_back, *crossed),
+            (str(origin.get("dataset_hash", ""))[:_HASH], *bundle.gestures.labels, *held_back),
             len(bundle.gestures),
-            rest=_rest(scores.get("nobody"), split in BY_PEOPLE),
+            rest=_rest(scores.get("nobody"), split == WHOLE_PEOPLE),
         )
     ]
 
@@ -412,7 +406,7 @@ class StoredResults:
         bundle = Bundle.load(row.path)
         affects = {g.label: g.affect for g in bundle.gestures.gestures}
         facts = {**bundle.provenance, "fitted": bundle.decision.get("fitted")}
-        later = bool(row.dataset) and row.spread in (HELD_BACK, CROSSED)
+        later = bool(row.dataset) and row.spread == HELD_BACK
         return ResultDetails(row, affects=affects, facts=facts, later=later)
 
     def with_predictions(self, details: ResultDetails) -> ResultDetails:

@@ -9,7 +9,6 @@ from markupsafe import Markup
 
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.train.results import (
-    CROSSED,
     EVALUATION,
     HELD_BACK,
     SUBJECTS,
@@ -45,7 +44,7 @@ def limits(w: Words, row: ResultRow) -> list[str]:
     found: list[str] = []
     if row.leaky or row.accuracy is None:
         return found
-    people = row.units if row.spread in (SUBJECTS, HELD_BACK, CROSSED) else 0
+    people = row.units if row.spread in (SUBJECTS, HELD_BACK) else 0
     if row.interval is not None and row.spread == SUBJECTS:
         low, high = (w.number(10 * max(0.0, edge), 1) for edge in row.interval)
         found.append(w("train.verdict.interval", people=counted(w, "people", people), low=low, high=high))
@@ -62,7 +61,7 @@ def limits(w: Words, row: ResultRow) -> list[str]:
 
 def _is_apart(row: ResultRow) -> bool:
     """Return whether nobody in the test was trained on."""
-    return row.split.startswith(("leave-one-subject-out", "by-subject", "validation-subjects", "cross-fitted-subjects"))
+    return row.split.startswith(("leave-one-subject-out", "by-subject", "validation-subjects"))
 
 
 def _more_people(w: Words, learning: Mapping[str, Any] | None) -> str:
