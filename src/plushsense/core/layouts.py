@@ -29,7 +29,7 @@ BINARY, COUNT = "binary", "count"
 DERIVED_KINDS = ("magnitude", "gravity")
 MOST_GAP_MS, MOST_GAP_SAMPLES, MOST_GAP_VALUES = 60_000, 60_000, 2_000_000
 MOST_CHANNELS = 4096  # as many as a network may read; also of the entries of every other list
-_SIZES = (1e-15, 1e15)  # of a step, and of a scale, which may be negative
+_SIZES = (1e-30, 1e30)  # of a step, and of a scale, which may be negative
 _INT32 = (-2147483648.0, 2147483647.0)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -23,6 +24,7 @@ LOCK = MARKS + ".lock"
 """Lock file of a data set, see `locked`."""
 # Much longer than it takes to delete a large cache on a slow disk.
 _LOCK_S = 600.0
+_NO_LOCKS = (errno.EROFS, errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 _MARKS_S = 30.0
 ACTIONS = ("trim", "untrim", "exclude", "include", "accept", "unaccept", "label", "unlabel", "relabel")
 HANDLING, REST, PRACTICE = "handling", "rest", "practice:"
@@ -163,6 +165,7 @@ def locked(folder: Path, timeout_s: float = _LOCK_S) -> Iterator[None]:
 
     Raises:
         DatasetError: if another program holds the lock for longer than ``timeout_s``.
+        OSError: if the lock's file cannot be made for another reason.
     """
     lock = FileLock(folder / LOCK, timeout=timeout_s)
     try:
@@ -173,8 +176,11 @@ def locked(folder: Path, timeout_s: float = _LOCK_S) -> Iterator[None]:
             reason="dataset_locked",
             folder=folder.name,
         ) from None
-    except (OSError, NotImplementedError):
+    except NotImplementedError:
         pass
+    except OSError as cause:
+        if not isinstance(cause, PermissionError) and cause.errno not in _NO_LOCKS:
+            raise
     try:
         yield
     finally:

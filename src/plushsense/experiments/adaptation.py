@@ -352,7 +352,8 @@ def adapt(
     if corrections:
         features = done.bundle.network().features(done.bundle.scaler.apply(adapting.x))
         corrected = correct(done.bundle, corrections, Examples(features, adapting.y, adapting.recording))
-    dataset.generation.check()
+    if not dataset.path.is_relative_to(place):  # the one made of a folder is gone by now
+        dataset.generation.check()
     return Adapted(done, person, use, tested, left_out, dataset.head.simulated, corrected)
 
 
