@@ -41,9 +41,9 @@ def test_every_gesture_is_prompted_made_kept_and_scored(workspace: Workspace) ->
     commands = [
         # The toy's own reaction is noted just after the gesture.
         (lambda status: status.phase == "after", lambda: validation.react("positive")),
-        # A pause in that moment would repeat a trial that was made.
+        # A pause in that moment waits for the next trial: the one that was made is not repeated.
         (lambda status: status.phase == "after", validation.pause),
-        (lambda status: (status.done, status.phase) == (1, "countdown"), validation.pause),
+        (lambda status: (status.done, status.phase) == (1, "doing"), validation.pause),
         # A trial that is skipped does not count.
         (lambda status: (status.label, status.phase) == ("Tail pull", "countdown"), validation.skip),
     ]
@@ -61,7 +61,11 @@ def test_every_gesture_is_prompted_made_kept_and_scored(workspace: Workspace) ->
     until(lambda: validation.status.phase == "paused")
     at = reader.now.t_s
     until(lambda: reader.now.t_s > at + 2.0 * GESTURE_S)
-    assert (validation.status.phase, validation.status.done) == ("paused", 1)
+    status = validation.status
+    assert (status.phase, status.done, status.at) == ("paused", 1, 1)
+    validation.pause()
+    until(lambda: validation.status.phase == "paused")
+    assert (validation.status.done, validation.status.at) == (1, 1)
     validation.pause()
     until(lambda: validation.status.phase == "")
     assert commands == []

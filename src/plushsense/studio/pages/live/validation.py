@@ -65,6 +65,11 @@ class ValidationStatus:
     result: Path | None = None
     failed: PlushSenseError | None = None
 
+    @property
+    def can_pause(self) -> bool:
+        """Whether there is a trial to wait for; after the last one there is none."""
+        return self.phase in ("countdown", "doing", "paused") or (self.phase == "after" and self.at + 1 < self.total)
+
 
 @dataclass
 class _Run:
@@ -131,11 +136,13 @@ class Validation:
         """Stop the prompts, or continue with the countdown of the same trial; after a trial, wait for the next one."""
         with self._lock:
             run = self._run
-            if run is None or self.status.phase not in ("countdown", "doing", "paused"):
+            if run is None or not self.status.can_pause:
                 return
             if self.status.phase == "paused":
                 self._prompt(run, self.status.at, self._clips.recorded_s, None)
             else:
+                if self.status.phase == "after":
+                    self._next(run, self._clips.recorded_s, None)
                 self.status = replace(self.status, phase="paused", left_s=0)
         self.changed.notify()
 

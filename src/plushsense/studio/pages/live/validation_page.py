@@ -116,8 +116,8 @@ class _ValidationPanel:
         where = {"n": status.at + 1, "total": status.total, "repetition": status.repetition}
         self._trial.set_text(words("validation.trial", **where) if led else "")
         self._pause.set_text(words("validation.go_on" if status.phase == "paused" else "validation.pause"))
-        for control in (self._pause, self._skip):
-            control.set_enabled(status.phase in ("countdown", "doing", "paused"))
+        self._pause.set_enabled(status.can_pause)
+        self._skip.set_enabled(status.phase in ("countdown", "doing", "paused"))
         self._reactions.set_visibility(status.reactions is not None)
         if status.reactions is not None:
             self._noted_count.set_text(words("validation.noted_count", n=status.reactions))
