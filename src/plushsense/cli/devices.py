@@ -1,15 +1,19 @@
-"""Implement ``plushsense devices [--lsl-out URL]``, ``toy --serial-pty|--tcp PORT|--lsl NAME`` and ``simulate OUT``."""
+"""Implement ``plushsense devices [--lsl-out URL]``, ``toy`` on a port or into a folder, and ``simulate OUT``."""
 
 from __future__ import annotations
 
 import argparse
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, say, table
 from plushsense.cli.settings import listed, report_stages
 from plushsense.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from plushsense.devices.virtual.stream import ToySpec
 
 
 def run(args: argparse.Namespace) -> int:
@@ -51,10 +55,11 @@ def _publish(args: argparse.Namespace) -> int:
 def run_toy(args: argparse.Namespace) -> int:
     from plushsense.core.layouts import load_layout
     from plushsense.devices.virtual.server import ToyServer
-    from plushsense.devices.virtual.stream import LogPrompts, PerformedGesture, ToySpec
+    from plushsense.devices.virtual.stream import LogPrompts, PerformedGesture
 
-    gestures = tuple(listed(args.gestures or ""))
-    spec = ToySpec(args.person, args.seed, lost=args.lost, garbled=args.garbled, glitch=args.glitch, gestures=gestures)
+    spec = _toy_spec(args)
+    if args.out is not None:
+        return _play_to_folder(args, spec)
     try:
         truth = Path(args.truth).open("a", encoding="utf-8") if args.truth else None
     except OSError as error:
@@ -62,7 +67,8 @@ def run_toy(args: argparse.Namespace) -> int:
 
     def ready(url: str) -> None:
         emit(args, {"url": url}, url)
-        say(f"virtual toy, person {args.person}; read it with  plushsense live --device {url} --model ...; Ctrl-C ends")
+        who = f"person {spec.person}" if spec.scenario is None else f"scenario {args.scenario}"
+        say(f"virtual toy, {who}; read it with  plushsense live --device {url} --model ...; Ctrl-C ends")
 
     def performed(gesture: PerformedGesture) -> None:
         say(f"{gesture.start_ms / 1000:9.1f} s  {gesture.label}")
@@ -96,6 +102,39 @@ def run_toy(args: argparse.Namespace) -> int:
         say(f"published {counters.sent} frames")  # LSL does not report who received them
     else:
         say(f"sent {counters.sent} lines; {counters.dropped} had no reader")
+    return 0
+
+
+def _toy_spec(args: argparse.Namespace) -> ToySpec:
+    from plushsense.devices.virtual.scenario import load_scenario
+    from plushsense.devices.virtual.stream import ToySpec
+
+    shares = {name: getattr(args, name) for name in ("lost", "garbled", "glitch")}
+    if args.scenario is None:
+        person, seed = (default if given is None else given for given, default in ((args.person, 101), (args.seed, 1)))
+        return ToySpec(person, seed, gestures=tuple(listed(args.gestures or "")), **shares)
+    for option in ("person", "gestures"):
+        if getattr(args, option) is not None:
+            raise ConfigError(f"The scenario says the {option}: leave out --{option}, or --scenario.")
+    return ToySpec.of(load_scenario(args.scenario), args.seed, **shares)
+
+
+def _play_to_folder(args: argparse.Namespace, spec: ToySpec) -> int:
+    from plushsense.recording.simulate import RECORDED, play_to_folder
+
+    for option in ("follow", "truth"):
+        if getattr(args, option) is not None:
+            raise ConfigError(f"--out writes a scenario as it is, with its truth: leave out --{option}.")
+    if args.scenario is None:
+        raise ConfigError("--out needs a toy that ends: add --scenario FILE.")
+    played = play_to_folder(spec, args.out, args.layout)
+    counters = ", ".join(f"{name} {number}" for name, number in played.counters.to_dict().items())
+    emit(
+        args,
+        played.to_dict(),
+        f"{args.out}: {played.seconds:.1f} s, {played.gestures} gestures of {len(played.people)} virtual people; "
+        f"{counters}. Replay it as replay://{args.out}, or import {Path(args.out) / RECORDED}. A simulation.",
+    )
     return 0
 
 

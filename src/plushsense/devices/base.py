@@ -116,6 +116,14 @@ class Device(ABC):
         """What to do if the toy sends lines that do not fit the layout; "" if they do, or nothing has been received."""
         return ""
 
+    def reopen(self) -> Device | None:
+        """Return a device that goes on after a lost connection; None: it must be opened anew by its URL.
+
+        Raises:
+            DeviceError: if the toy is not connected yet.
+        """
+        return None
+
     def _shut(self) -> None:  # noqa: B027, RUF100
         """Release resources; called only once."""
 

@@ -19,6 +19,7 @@ from plushsense.core.layouts import DEVICE_MS, Layout, StreamColumns
 from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Device, Frame, LossCounter, now_ms
 from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
+from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.devices.virtual.server import ToyCounters, ToyServer
 from plushsense.devices.virtual.stream import PerformedGesture, VirtualDevice
 
@@ -387,7 +388,8 @@ def serve_lsl(name: str, server: ToyServer) -> ToyCounters:
     toy.on_performed = begun
     if server.prompts is not None:
         toy.follow(server.prompts)
-    with toy, LslOutlet(toy.layout, name) as outlet:
+    device = ReconnectingDevice("virtual://", server.layout, lambda: toy, ends=True)
+    with device, LslOutlet(toy.layout, name) as outlet:
         server.on_ready(outlet.url)
-        counters.sent = forward(toy, outlet, server.stop)
+        counters.sent = forward(device, outlet, server.stop)
     return counters

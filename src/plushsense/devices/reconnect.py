@@ -156,7 +156,7 @@ class ReconnectingDevice(Device):
                 continue
             result: Device | Exception
             try:
-                result = self._open_inner()
+                result = gone.reopen() or self._open_inner()
             except DeviceError:
                 pause = True
                 continue

@@ -2,15 +2,17 @@
 
 Each person's folder contains ``<label>_<epoch ms>_<rows>.csv`` for each recording, and ``fulldatastream.csv`` for the
 whole session, which ends with some handling that is no gesture; recordings of the toy at rest are in the folder
-``none``. Results on these recordings do not apply to a real toy.
+``none``. The files of a scenario are such folders, too. Results on these recordings do not apply to a real toy.
 """
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +29,10 @@ from plushsense.core.recorder_csv import (
     format_rows,
     recording_filename,
 )
+from plushsense.devices.base import Counters
 from plushsense.devices.virtual.motions import AT_REST
 from plushsense.devices.virtual.session import GESTURES, Episode, VirtualSession
-from plushsense.devices.virtual.stream import channel_columns
+from plushsense.devices.virtual.stream import PerformedGesture, ToySpec, channel_columns, received
 from plushsense.devices.virtual.world import WORLD, World, draw_person
 
 START_MS = 1_760_000_000_000
@@ -192,3 +195,100 @@ def simulate(
             if progress is not None:
                 progress(done, len(sessions), name)
     return SimulationSummary(str(folder), people, recordings, rows, stream_rows, lost, seed)
+
+
+RECORDED = "recordings"
+TRUTH = "truth.jsonl"
+"""Names of the people's folders and of the true gestures in the folder of a scenario."""
+
+
+@dataclass(frozen=True)
+class PlayedScenario:
+    """What `play_to_folder` has written: the true gestures, and what a reader of the toy counts."""
+
+    folder: str
+    people: tuple[int, ...]
+    gestures: int
+    seconds: float
+    counters: Counters
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return asdict(self)
+
+
+def play_to_folder(spec: ToySpec, out: str | os.PathLike[str], layout: Layout | str = "plush-15") -> PlayedScenario:
+    """Play the scenario of a virtual toy into a folder, as its lines are read without waiting.
+
+    ``fulldatastream.csv`` is the whole stream (``replay://OUT``), ``truth.jsonl`` has the true gestures, and
+    ``recordings/`` a folder for each person, to import: the rows received while this person had the toy as a session's
+    stream, and a recording of each true gesture, from its first to its last sample.
+
+    Args:
+        spec: a toy with a scenario.
+        out: a new or empty folder.
+
+    Raises:
+        ConfigError: for a toy without a scenario, or a layout that the virtual toy does not support.
+        DatasetError: if the folder is not empty.
+    """
+    if spec.scenario is None:
+        raise ConfigError("A toy that is played into a folder needs an end: give it a scenario.")
+    resolved = layout if isinstance(layout, Layout) else load_layout(layout)
+    log = _PlayLog()
+    for line, frames, counters in received(spec, resolved):
+        log.counters, log.passed_ms = counters, line.passed_ms
+        if line.begins is not None:
+            log.truth.append(line.begins)
+        for frame in frames:
+            log.rows.append(frame.values)
+            log.clocks.append((frame.device_ms, START_MS + line.passed_ms))
+            log.people.append(line.person)
+    stream = log.frames(resolved)
+    with new_folder(Path(out), DatasetError) as work:
+        mark = f"Scenario '{spec.scenario.name}' of the virtual toy, seed {spec.seed}. Nobody touched anything.\n"
+        (work / SIMULATION_MARK).write_text(mark, "utf-8")
+        truth = "".join(json.dumps(made.to_dict(), ensure_ascii=False) + "\n" for made in log.truth)
+        (work / TRUTH).write_text(truth, encoding="utf-8", newline="\n")
+        _write(work, _Take(stream, [], 0), resolved)
+        people = np.array(log.people, dtype=np.int64)
+        for who in sorted(set(log.people)):
+            mine = people == who
+            take = _Take(_rows_of(stream, mine), log.cuts(who, stream, mine), 0)
+            _write(work / RECORDED / f"P{who:02d}", take, resolved)
+    return PlayedScenario(
+        str(out), tuple(sorted(set(log.people))), len(log.truth), log.passed_ms / 1000.0, log.counters
+    )
+
+
+class _PlayLog:
+    """What a reader receives from a toy that plays a scenario; ``people`` has the person with the toy at each row."""
+
+    def __init__(self) -> None:
+        self.rows: list[tuple[int, ...]] = []
+        self.clocks: list[tuple[int, int]] = []
+        self.people: list[int] = []
+        self.truth: list[PerformedGesture] = []
+        self.counters = Counters()
+        self.passed_ms = 0
+
+    def frames(self, layout: Layout) -> Frames:
+        values = np.array(self.rows, dtype=np.int64).reshape(-1, layout.n_channels)
+        clocks = np.array(self.clocks, dtype=np.int64).reshape(-1, 2)
+        return Frames(values, clocks[:, 0], clocks[:, 1])
+
+    def cuts(self, who: int, stream: Frames, mine: NDArray[np.bool_]) -> list[tuple[str, int, int]]:
+        """Return label and rows, of this person's stream, of each gesture of which anything was received."""
+        assert stream.host_ms is not None
+        passed = stream.host_ms[mine] - START_MS
+        spans = [
+            (made.label, *np.searchsorted(passed, np.array([made.start_s, made.end_s + 1e-4]) * 1000.0).tolist())
+            for made in self.truth
+            if made.person == who
+        ]
+        return [(label, start, stop) for label, start, stop in spans if stop > start]
+
+
+def _rows_of(frames: Frames, chosen: NDArray[np.bool_]) -> Frames:
+    assert frames.host_ms is not None
+    return Frames(frames.values[chosen], frames.device_ms[chosen], frames.host_ms[chosen])

@@ -97,12 +97,15 @@ class Climate:
         electrode: (9,) relative offset of each electrode in this session.
         waves: (k, 3) amplitude, frequency in hertz, and phase of each part of the drift.
         axis: (3,) gain of each accelerometer axis.
+        course: times in seconds with their level, in order, between which the level changes evenly; () for a constant
+            ``level``.
     """
 
     level: float
     electrode: Floats
     waves: Floats
     axis: Floats
+    course: tuple[tuple[float, float], ...] = ()
 
     @classmethod
     def draw(cls, rng: np.random.Generator, world: World, spread: float = 1.0) -> Climate:
@@ -120,7 +123,10 @@ class Climate:
         """Return the relative change of the baselines (n,) at the times ``seconds`` (n,)."""
         amplitude, hz, phase = self.waves.T
         drift = (amplitude * np.sin(2 * math.pi * seconds[:, None] * hz + phase)).sum(axis=1)
-        return np.asarray(world.humidity_session * self.level + world.humidity_drift * drift)
+        level: Floats | float = self.level
+        if self.course:
+            level = np.interp(seconds, [at for at, _ in self.course], [level for _, level in self.course])
+        return np.asarray(world.humidity_session * level + world.humidity_drift * drift)
 
 
 def _mixing(world: World) -> Floats:

@@ -21,6 +21,8 @@ _STALL_S = 0.5
 """Time after which lines are dropped if nobody reads them, as on a real serial line."""
 _FAST_STALL_S = 10.0
 """The same for a toy faster than real time, which must wait for readers that are slowed by writing a file."""
+_NAME_S = 2.0
+"""How long a toy that was disconnected waits for the name of its pseudo terminal, which its reader may still use."""
 _FAST_QUEUE = 512
 """Limit of unread bytes of such a toy on a pseudo terminal, whose buffer would hold seconds of data."""
 
@@ -106,7 +108,8 @@ class ToyServer:
     def serve_tcp(self, port: int) -> ToyCounters:
         """Serve on ``127.0.0.1:port`` (0: any free port), to one reader at a time, until `stop` is set.
 
-        Unless ``speed`` is 0, the toy continues while nobody is connected, as a real one does.
+        Unless ``speed`` is 0, the toy continues while nobody is connected, as a real one does. While a scenario
+        disconnects the toy, nobody listens on the port.
 
         Raises:
             DeviceError: if the port is in use or not allowed.
@@ -117,54 +120,58 @@ class ToyServer:
         if not self.speed >= 0.0:
             raise ConfigError(f"The toy's speed is {self.speed}; it must be 0 (as fast as possible) or above.")
         stream = ToyStream(self.spec, self.layout, self.prompts)
-        try:
-            server = socket.create_server((HOST, port))
-        except OSError as cause:
-            raise DeviceError(
-                f"The toy cannot listen on port {port} of {HOST}: {cause.strerror or cause}; choose another port."
-            ) from None
         counters = ToyCounters()
-        with server:
-            server.setblocking(False)
-            self.on_ready(f"tcp://{HOST}:{server.getsockname()[1]}")
-            client: socket.socket | None = None
-            outlet: _Outlet | None = None
+        listening = _listen(port)
+        port = listening.getsockname()[1]
+        server: socket.socket | None = listening
+        client: socket.socket | None = None
+        outlet: _Outlet | None = None
+        self.on_ready(f"tcp://{HOST}:{port}")
 
-            def send(data: bytes) -> bool:
-                nonlocal client, outlet
-                while client is None and not self.stop.is_set():
-                    try:
-                        client, _ = server.accept()
-                    except BlockingIOError:
-                        if self.speed > 0.0:
-                            return False
-                        select.select([server], [], [], 0.05)
-                        continue
-                    client.setblocking(False)
-                    client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    outlet = _Outlet(client.send, client.fileno(), self._stall_s)
-                    counters.connections += 1
-                if client is None or outlet is None:
-                    return False
+        def send(data: bytes) -> bool:
+            nonlocal server, client, outlet
+            if server is None:
+                server = _listen(port)
+            while client is None and not self.stop.is_set():
                 try:
-                    return outlet.send(data, self.stop)
-                except OSError:  # the reader has disconnected: accept the next one
-                    client.close()
-                    client = outlet = None
-                    return False
-
+                    client, _ = server.accept()
+                except BlockingIOError:
+                    if self.speed > 0.0:
+                        return False
+                    select.select([server], [], [], 0.05)
+                    continue
+                client.setblocking(False)
+                client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                outlet = _Outlet(client.send, client.fileno(), self._stall_s)
+                counters.connections += 1
+            if client is None or outlet is None:
+                return False
             try:
-                self._run(stream, send, counters)
-            finally:
-                if client is not None:
-                    client.close()
+                return outlet.send(data, self.stop)
+            except OSError:  # the reader has disconnected: accept the next one
+                client.close()
+                client = outlet = None
+                return False
+
+        def disconnect() -> None:
+            nonlocal server, client, outlet
+            for end in (client, server):
+                if end is not None:
+                    end.close()
+            server = client = outlet = None
+
+        try:
+            self._run(stream, send, counters, disconnect)
+        finally:
+            disconnect()
         return counters
 
     def serve_pty(self) -> ToyCounters:
         """Serve on a pseudo terminal that looks like a serial port, until `stop` is set. Linux and macOS.
 
         A speed of 0 is refused, since perhaps nobody reads the port. A toy faster than real time waits up to 10 s for a
-        slow reader, so that its speed causes no losses.
+        slow reader, so that its speed causes no losses. After a scenario has disconnected the toy, the port may have
+        another name, which ``on_ready`` is called with.
 
         Raises:
             DeviceError: on Windows, which has no pseudo terminals.
@@ -179,34 +186,60 @@ class ToyServer:
             raise ConfigError(f"The toy's speed on a pseudo terminal is {self.speed:g}; it must be above 0.")
         stream = ToyStream(self.spec, self.layout, self.prompts)
         counters = ToyCounters()
-        master, slave = pty.openpty()
-        try:
+        fast = self.speed > 1.0
+        outlet: _Outlet | None = None
+        ends: tuple[int, int] = (-1, -1)
+        name = ""
+
+        def plug() -> _Outlet:
+            nonlocal ends, name
+            master, slave = ends = _open_pty(pty.openpty, name)
             # Raw mode: no echo, unchanged line ends. The slave stays open, so that readers may come and go.
             tty.setraw(slave)
             os.set_blocking(master, False)
-            fast = self.speed > 1.0
-            outlet = _Outlet(
+            if os.ttyname(slave) != name:
+                name = os.ttyname(slave)
+                self.on_ready(f"serial://{name}")
+            return _Outlet(
                 lambda data: os.write(master, data),
                 master,
                 self._stall_s,
                 absent=not fast,
                 unread=(lambda: _unread(slave)) if fast else None,
             )
-            self.on_ready(f"serial://{os.ttyname(slave)}")
-            self._run(stream, lambda data: outlet.send(data, self.stop), counters)
+
+        def send(data: bytes) -> bool:
+            nonlocal outlet
+            outlet = outlet or plug()
+            return outlet.send(data, self.stop)
+
+        def disconnect() -> None:
+            nonlocal outlet
+            if outlet is not None:
+                outlet = None
+                for end in ends:
+                    os.close(end)
+
+        outlet = plug()
+        try:
+            self._run(stream, send, counters, disconnect)
         finally:
-            os.close(master)
-            os.close(slave)
+            disconnect()
         return counters
 
     @property
     def _stall_s(self) -> float:
         return _STALL_S if self.speed <= 1.0 else _FAST_STALL_S
 
-    def _run(self, stream: ToyStream, send: Callable[[bytes], bool], counters: ToyCounters) -> None:
-        """Send each line when it is due by the device clock."""
+    def _run(
+        self,
+        stream: ToyStream,
+        send: Callable[[bytes], bool],
+        counters: ToyCounters,
+        disconnect: Callable[[], None],
+    ) -> None:
+        """Send each line when it is due, and call ``disconnect`` while the toy shall not be connected."""
         pacer = Pacer(self.speed)
-        first_ms: int | None = None
         batch, lines = bytearray(), 0
         largest = 4096 if self.speed <= 1.0 else _FAST_QUEUE
 
@@ -225,11 +258,9 @@ class ToyServer:
         for line in stream:
             if self.stop.is_set():
                 break
-            if first_ms is None:
-                first_ms = line.device_ms
-            if self.seconds and line.device_ms - first_ms >= self.seconds * 1000.0:
+            if self.seconds and line.passed_ms >= self.seconds * 1000.0:
                 break
-            due = pacer.due_s(line.device_ms)
+            due = pacer.due_s(line.passed_ms)
             if due > 0.0 or len(batch) > largest:
                 flush()
                 if due > 0.0 and self.stop.wait(due):
@@ -237,9 +268,36 @@ class ToyServer:
             if line.begins is not None:
                 counters.gestures += 1
                 self.on_performed(line.begins)
+            if not line.connected:
+                flush()
+                disconnect()
             batch += line.data
-            lines += bool(line.data)
+            lines += max(line.data.count(b"\n"), bool(line.data))
         flush()
+
+
+def _listen(port: int) -> socket.socket:
+    """Listen on a port of this computer; raise DeviceError if that is not possible."""
+    try:
+        server = socket.create_server((HOST, port))
+    except OSError as cause:
+        raise DeviceError(
+            f"The toy cannot listen on port {port} of {HOST}: {cause.strerror or cause}; choose another port."
+        ) from None
+    server.setblocking(False)
+    return server
+
+
+def _open_pty(openpty: Callable[[], tuple[int, int]], name: str) -> tuple[int, int]:
+    """Open a pseudo terminal, of this ``name`` if it is free again within `_NAME_S`; "" for any."""
+    until = time.monotonic() + _NAME_S
+    while True:
+        ends = openpty()
+        if not name or os.ttyname(ends[1]) == name or time.monotonic() > until:
+            return ends
+        for end in ends:
+            os.close(end)
+        time.sleep(0.01)
 
 
 def _unread(slave: int) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,6 +115,16 @@ class VirtualSession:
         self._climate = Climate.draw(self._rng, self.world, spread)
         self._down: Floats = self._hands.upright()
         self.clock_ms = int(self._rng.integers(5_000, 60_000))
+
+    def hand_over(self, person: Person) -> None:
+        """Let another person take the toy; clock, humidity and the toy's position continue."""
+        if person.number != self._who.number:
+            self.person = self._who = person
+            self._hands = Hands(person, self.world, self._rng)
+
+    def set_humidity(self, course: Iterable[tuple[float, float]]) -> None:
+        """Let the humidity follow pairs of a time in seconds and a level, instead of the level of the session."""
+        self._climate = replace(self._climate, course=tuple(course))
 
     # Episodes -------------------------------------------------------------------------------------------------
 
