@@ -29,6 +29,8 @@ from plushsense.dataset.importing.pattern import ImportPattern, read_pattern
 from plushsense.dataset.importing.sources import MAPPING_COLUMNS
 from plushsense.dataset.labelling import COLUMNS as LABEL_COLUMNS
 from plushsense.dataset.store import PEOPLE_COLUMNS, DatasetHead
+from plushsense.devices.virtual.faults import FAULTS
+from plushsense.devices.virtual.scenario import ACTIONS, Scenario, load_scenario
 from plushsense.experiments.search.halving import DEFAULTS as SEARCH_DEFAULTS
 from plushsense.experiments.search.halving import SearchSpec, Space, load_search
 from plushsense.experiments.search.halving import problems as search_problems
@@ -94,6 +96,19 @@ def _search_defaults() -> str:
     )
 
 
+def _actions_and_faults() -> str:
+    """Return the actions of parts and the kinds of faults of a scenario as tables."""
+
+    def code(keys: tuple[str, ...]) -> str:
+        return ", ".join(f"`{key}`" for key in keys) or "none"
+
+    text = "## What happens in a part\n\n" + _row("`do`", "further keys", "what happens") + _row(*["---"] * 3)
+    text += "".join(_row(f"`{name}`", code(keys), what) for name, (keys, what) in ACTIONS.items())
+    text += "\n## Kinds of faults\n\nAll have `at_s` and `duration_s`. Faults of one moment apply in this order.\n\n"
+    text += _row("`kind`", "further keys", "what goes wrong", "what a reader sees") + _row(*["---"] * 4)
+    return text + "".join(_row(f"`{n}`", code(f.keys), f.what, f.effect) for n, f in FAULTS.items())
+
+
 FILES = {
     "layout": FileKind(
         "Layout file: the channels of a toy",
@@ -124,6 +139,15 @@ FILES = {
         "[`live`](../live.md) takes it.",
         {"": ReactionsFile},
         load_reactions,
+    ),
+    "scenario": FileKind(
+        "Scenario file: an afternoon of the virtual toy",
+        "A scenario says what happens to the virtual toy: people, gestures, humidity and faults. `--scenario FILE` of "
+        "[`toy`](../virtual-toy.md) and `verify` takes it, and `virtual://?scenario=FILE` is a toy that plays it. "
+        "Worked scenarios are in `examples/scenarios/`.",
+        {"": Scenario},
+        load_scenario,
+        _actions_and_faults,
     ),
     "import": FileKind(
         "Import pattern: files of other projects",

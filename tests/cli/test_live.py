@@ -81,7 +81,7 @@ def test_over_a_serial_port(plush_bundle: Path, pty_possible: None, tmp_path: Pa
     check(decisions, summary, 16)
     performed = [json.loads(line) for line in truth.read_text().splitlines()]
     assert performed
-    assert set(performed[0]) == {"label", "start_ms", "end_ms"}
+    assert set(performed[0]) == {"label", "start_ms", "end_ms", "person", "start_s", "end_s"}
 
 
 def test_over_tcp(plush_bundle: Path, tmp_path: Path) -> None:

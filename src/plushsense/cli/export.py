@@ -95,6 +95,8 @@ def run_verify(args: argparse.Namespace) -> int:
     from plushsense.deploy.proof.device import verify_device
     from plushsense.deploy.proof.vectors import Export
     from plushsense.deploy.proof.verify import verify
+    from plushsense.devices.virtual.scenario import load_scenario
+    from plushsense.devices.virtual.stream import ToySpec
 
     if args.subject and not args.dataset:
         raise ConfigError("--subject chooses people of a data set: give --dataset too.")
@@ -111,6 +113,8 @@ def run_verify(args: argparse.Namespace) -> int:
             warn(f"these recordings make {sum(v.samples for v in vectors):,} samples, not {args.samples:,}")
     else:
         vectors = export.made_up(args.samples or 0)
+    if args.scenario:
+        vectors += export.played(ToySpec.of(load_scenario(args.scenario)))
     progress = ProgressReporter("verify")
     if args.device:
         done = verify_device(export, args.device, vectors, progress=progress)

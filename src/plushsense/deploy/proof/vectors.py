@@ -35,6 +35,7 @@ from plushsense.deploy.golden import COLUMNS, HEAD, TRACKING, answers_of, column
 from plushsense.deploy.package import foreign_files, package_files
 from plushsense.deploy.proof.scenarios import patches_of, scenarios_of
 from plushsense.deploy.quantize import integer_model
+from plushsense.devices.virtual.stream import ToySpec, received
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.fixed import Ints
 from plushsense.runtime.image import IntegerModel, memory_bytes
@@ -336,6 +337,19 @@ class Export:
             raise ConfigError(message, reason="vectors_empty", name=dataset.head.name)
         name = "simulated recordings" if dataset.head.simulated else "recordings"
         return [self.answered(name, part) for part in in_parts(frames)]
+
+
+    def played(self, toy: ToySpec) -> list[Vectors]:
+        """Play the scenario of a virtual toy: the frames that a reader receives, with the clocks that the toy sends.
+
+        It has nothing to do with the test scenarios of `scenarios`, which are variants of the model.
+
+        Raises:
+            ConfigError: for a model whose layout the virtual toy does not support.
+        """
+        rows = [(f.device_ms, *f.values) for _, frames, _ in received(toy, self.model.layout) for f in frames]
+        frames = np.array(rows, dtype=np.int64).reshape(-1, 1 + len(self.model.layout.channels))
+        return [self.answered("virtual toy", part) for part in in_parts(frames)]
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,8 @@ FAULTS: dict[str, FaultKind] = {
     "garbled": FaultKind(
         ("share",),
         "this share of the lines is cut, joined to the next line, or has noise in it",
-        "each counts as malformed, and its frame as lost; of two joined lines both are lost",
+        "most count as malformed, and their frames as lost; joined lines sometimes have as many numbers as a frame, "
+        "but wrong ones, which no reader notices",
     ),
     "junk": FaultKind(
         ("share",),
@@ -126,7 +127,7 @@ class Fault:
         at_s: when it begins, in seconds from the first line (0 to 1000000).
         duration_s: how long it lasts (above 0 to 1000000; default: 1).
         share: share of the lines or frames that are affected, drawn at random (above 0 to 1; default: all of them).
-        channels: names of the affected channels, which are those of plush-15 (default: all; of ``glitch`` the
+        channels: names of the affected channels, which are those of plush-15 (default: all, of ``glitch`` the
             electrodes).
         value: what dead channels read, in raw counts (-1000000 to 1000000; default: 0).
         counts: standard deviation of the noise of noisy channels, in raw counts (above 0 to 100000; default: 300).

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 from plushsense.core.errors import ConfigError, nearest
@@ -136,11 +135,11 @@ class Scenario:
         glitch: share of the frames in which an electrode always reads nonsense (0 to 0.9; default: 0.00002).
         wrap_s: time from the first line to the wrap of the toy's clock, which counts milliseconds in 32 bits, as after
             49.7 days; a reset before it begins at 0 again (above 0 to 1000000; default: no wrap).
-        humidity: moments with their humidity, in order (default: drawn with the seed).
+        humidity: moments with their humidity (default: drawn with the seed).
         faults: what goes wrong, and when.
 
     Raises:
-        ConfigError: for a value out of its range, no part, or moments that are not in order.
+        ConfigError: for a value out of its range, or no part.
     """
 
     parts: tuple[Part, ...]
@@ -165,9 +164,6 @@ class Scenario:
             if value is not None and not 0.0 <= value <= 0.9:
                 raise ConfigError(f"{key} is {value:g}; accepted is a share from 0 to 0.9.")
         _length("wrap_s", self.wrap_s)
-        times = [point.at_s for point in self.humidity]
-        if any(after <= before for before, after in pairwise(times)):
-            raise ConfigError("the moments of humidity are not in order: sort them by at_s, one a moment.")
 
     @property
     def people(self) -> tuple[int, ...]:

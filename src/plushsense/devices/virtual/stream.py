@@ -209,7 +209,7 @@ class ToyStream:
         self._faults = FaultyToy((), spec.seed)
         if (scenario := spec.scenario) is not None:
             self._faults = FaultyToy(scenario.faults, spec.seed, scenario.wrap_s)
-            self._session.set_humidity((point.at_s, point.level) for point in scenario.humidity)
+            self._session.set_humidity(sorted((point.at_s, point.level) for point in scenario.humidity))
         self._first_ms: int | None = None
         self._clock_shift = 0
 
@@ -408,8 +408,8 @@ class VirtualDevice(PacedDevice):
                 self.on_performed(line.begins)
         return line
 
-    def reopen(self) -> Self:
-        """Return this device, open again and with new counters, once the toy is connected again.
+    def reopen(self) -> Self | None:
+        """Return this device, open again and with new counters, once the toy is connected again; None after its end.
 
         Raises:
             DeviceError: before that.
@@ -418,6 +418,8 @@ class VirtualDevice(PacedDevice):
             if self._pacer.due_s(self._next.passed_ms) > 0.0:
                 raise DeviceError(f"'{self.url}' is not connected.", reason="toy_unreachable", url=self.url)
             self._take()
+        if self._next_ms() is None:
+            return None
         self.closed = False
         self.counters = Counters()
         self._parser = LineParser(self.layout, self.counters)
