@@ -20,7 +20,9 @@ from plushsense.devices import ble
 from plushsense.devices.ble import UART_SERVICE, UART_TX, BleBackends, BleDevice, BleTarget
 from plushsense.devices.opening import list_devices, open_device, parse_url
 from plushsense.devices.reconnect import ReconnectingDevice
-from plushsense.devices.virtual.stream import ToySpec, ToyStream
+from plushsense.devices.virtual.faults import Fault
+from plushsense.devices.virtual.scenario import Part, Scenario
+from plushsense.devices.virtual.stream import ToySpec, ToyStream, received
 from plushsense.devices.wire import LineParser
 
 try:
@@ -169,6 +171,39 @@ def test_what_the_toy_says_is_read_however_it_is_cut(sizes: tuple[int, ...]) -> 
         assert device.counters.malformed > 3 and device.counters.lost > 3
         assert abs(frames[-1].host_ms - time.time() * 1000) < 5000
     assert device.read() is None
+
+
+def test_a_scenario_is_read_over_bluetooth_as_anywhere() -> None:
+    faults = (
+        Fault("torn", 1.0, 1.0, share=0.3),
+        Fault("stall", 2.5, 0.5),
+        Fault("disconnect", 4.0, 0.5),
+        Fault("unended", 5.0, 0.2),
+        Fault("reset", 6.0, 0.5),
+    )
+    scenario = Scenario((Part("perform", 3, gestures=("Hold strong",)),), wrap_s=3.5, faults=faults)
+    spec = ToySpec.of(scenario)
+    expected = [(f.device_ms, f.values) for _, frames, _ in received(spec, PLUSH) for f in frames]
+    lines = list(ToyStream(spec, PLUSH))
+    got: list[tuple[int, tuple[int, ...]]] = []
+    with ReconnectingDevice("ble://test", PLUSH, opened) as device:
+        for connected, stretch in itertools.groupby(lines, key=lambda line: line.connected):
+            if not connected:
+                Air.clients[-1].drop()
+                end = time.monotonic() + 60
+                while len(Air.clients) < 2 or Air.clients[1].callback is None or device.state != "connected":
+                    assert not device.read()
+                    assert time.monotonic() < end
+                continue
+            data = b"".join(line.data for line in stretch)
+            count = len(LineParser(PLUSH, joining=True).feed(data))
+            Air.clients[-1].play(data)
+            got += [(f.device_ms, f.values) for f in take(device, count)]
+        assert device.counters.reconnects == 1
+    # A radio may join in the middle of a line, so that the first one of each connection is left out.
+    missing = [n for n, frame in enumerate(expected) if frame not in got]
+    assert len(missing) == 2 and missing[0] == 0
+    assert got == [frame for n, frame in enumerate(expected) if n not in missing]
 
 
 @pytest.mark.parametrize("address", [ADDRESS, ADDRESS.lower(), ADDRESS.replace(":", "-")])

@@ -14,9 +14,14 @@ from typing import Any
 import pytest
 
 from plushsense.core.errors import ConfigError, DeviceError
+from plushsense.core.layouts import load_layout
+from plushsense.devices.base import Device
 from plushsense.devices.opening import open_device
+from plushsense.devices.reconnect import ReconnectingDevice
+from plushsense.devices.virtual.faults import Fault
+from plushsense.devices.virtual.scenario import Part, Scenario
 from plushsense.devices.virtual.server import ToyCounters, ToyServer
-from plushsense.devices.virtual.stream import PerformedGesture, ToySpec
+from plushsense.devices.virtual.stream import PerformedGesture, ToySpec, VirtualDevice
 
 needs_pty = pytest.mark.usefixtures("pty_possible")
 
@@ -207,3 +212,84 @@ def test_windows_has_no_pty(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "win32")
     with pytest.raises(DeviceError, match="toy --tcp"):
         ToyServer().serve_pty()
+
+
+FAULTS = (
+    Fault("stall", 0.5, 0.5),
+    Fault("torn", 1.0, 0.5, share=0.5),
+    Fault("flood", 2.0, 0.2, times=5),
+    Fault("junk", 2.5, 0.5),
+    Fault("reset", 4.0, 0.3),
+    Fault("unended", 5.0, 0.2, bytes=3000),
+)
+BREAK = Fault("disconnect", 6.0, 0.5)
+
+
+def scenario_with(*faults: Fault) -> ToySpec:
+    parts = (Part("perform", 4, gestures=("Tail hit 1",)), Part("perform", 9, gestures=("Tail pull",)))
+    return ToySpec.of(Scenario(parts, seed=6, wrap_s=2.2, faults=faults))
+
+
+def all_of(device: Device) -> list[tuple[int, tuple[int, ...]]]:
+    return [(frame.device_ms, frame.values) for frame in device]
+
+
+def in_process(spec: ToySpec) -> tuple[list[tuple[int, tuple[int, ...]]], list[PerformedGesture], dict[str, int]]:
+    with VirtualDevice("virtual://", load_layout("plush-15"), spec, speed=0.0) as device:
+        return all_of(device), device.performed, device.counters.to_dict()
+
+
+def test_a_scenario_over_tcp_is_the_one_in_this_process() -> None:
+    spec = scenario_with(*FAULTS)
+    frames, made, counters = in_process(spec)
+    assert counters["malformed"] > 60 and [g.person for g in made] == [4, 9]
+    with toy(over_tcp, spec, speed=0) as running, open_device(running.url) as device:
+        assert all_of(device) == frames
+        assert device.counters.to_dict() == counters
+    assert running.performed == made
+
+
+@needs_pty
+def test_a_scenario_over_a_serial_port_is_the_one_in_this_process() -> None:
+    spec = scenario_with(*FAULTS)
+    frames, made, counters = in_process(spec)
+    got: list[tuple[int, tuple[int, ...]]] = []
+    with toy(ToyServer.serve_pty, spec, speed=20) as running, open_device(running.url) as device:
+        with pytest.raises(DeviceError, match="unplugged"):  # at the end of the toy
+            for frame in device:
+                got.append((frame.device_ms, frame.values))
+        # The first line may have begun before, and the last ones may still have been on their way when the port closed.
+        assert got == frames[1 : 1 + len(got)]
+        assert len(got) > len(frames) - 50
+        assert device.counters.to_dict() == counters | {"frames": len(got)}
+    assert running.performed == made
+    assert running.counters is not None and running.counters.dropped == 0
+
+
+def test_a_scenario_breaks_a_connection_and_takes_it_up_again() -> None:
+    spec = scenario_with(*FAULTS, BREAK)
+    with toy(over_tcp, spec, speed=0) as running, open_device(running.url, reconnect=True) as device:
+        got: list[tuple[int, tuple[int, ...]]] = []
+        assert isinstance(device, ReconnectingDevice)
+        while running.counters is None or not device.counters.reconnects or device.state == "connected":
+            got += [(frame.device_ms, frame.values) for frame in device.read() or []]
+    expected = in_process(scenario_with(*FAULTS))[0]
+    first = next(n for n, pair in enumerate(expected) if n >= len(got) or pair != got[n])
+    assert got == expected[:first] + expected[first + 50 :], "half a second is missing"
+    assert running.counters is not None and running.counters.connections == 2
+
+
+@needs_pty
+def test_a_scenario_unplugs_a_serial_port() -> None:
+    with (
+        toy(ToyServer.serve_pty, scenario_with(BREAK), speed=20) as running,
+        open_device(running.url) as device,
+        pytest.raises(DeviceError, match="unplugged"),
+    ):
+        for frame in device:
+            last = frame
+    assert running.url.startswith("serial://")
+    frames = [ms for ms, _ in in_process(scenario_with())[0]]
+    assert (
+        sum(frames[n + 1] - frames[n] for n in range(frames.index(last.device_ms)) if frames[n + 1] > frames[n]) > 5900
+    )

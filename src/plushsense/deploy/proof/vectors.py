@@ -338,7 +338,6 @@ class Export:
         name = "simulated recordings" if dataset.head.simulated else "recordings"
         return [self.answered(name, part) for part in in_parts(frames)]
 
-
     def played(self, toy: ToySpec) -> list[Vectors]:
         """Play the scenario of a virtual toy: the frames that a reader receives, with the clocks that the toy sends.
 

@@ -23,6 +23,7 @@ _FAST_STALL_S = 10.0
 """The same for a toy faster than real time, which must wait for readers that are slowed by writing a file."""
 _NAME_S = 2.0
 """How long a toy that was disconnected waits for the name of its pseudo terminal, which its reader may still use."""
+_LAST_S = 0.05
 _FAST_QUEUE = 512
 """Limit of unread bytes of such a toy on a pseudo terminal, whose buffer would hold seconds of data."""
 
@@ -53,9 +54,7 @@ class _Outlet:
         whole = self._rest + data
         pending = whole
         deadline = time.monotonic() + (0.0 if self.absent else self.stall_s)
-        if self.unread is not None and not self.absent:
-            while self.unread() > _FAST_QUEUE and time.monotonic() < deadline and not stop.wait(0.0005):
-                pass
+        self.wait_for_reader(_FAST_QUEUE, stop)
         while pending:
             try:
                 pending = pending[self.write(pending) :]
@@ -73,6 +72,13 @@ class _Outlet:
                 return False
         self._rest = b""
         return True
+
+    def wait_for_reader(self, most: int, stop: threading.Event) -> None:
+        """Wait until at most ``most`` bytes are unread, if that is known and there is a reader."""
+        deadline = time.monotonic() + self.stall_s
+        if self.unread is not None and not self.absent:
+            while self.unread() > most and time.monotonic() < deadline and not stop.wait(0.0005):
+                pass
 
 
 def _ignore(_: object) -> None:
@@ -216,6 +222,10 @@ class ToyServer:
         def disconnect() -> None:
             nonlocal outlet
             if outlet is not None:
+                # Closing discards what was not read, and the last bytes take a moment to arrive.
+                outlet.wait_for_reader(0, self.stop)
+                self.stop.wait(_LAST_S if fast else 0.0)
+                outlet.wait_for_reader(0, self.stop)
                 outlet = None
                 for end in ends:
                     os.close(end)
