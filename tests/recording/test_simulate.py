@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections import Counter
 from pathlib import Path
 
@@ -12,11 +13,16 @@ import pytest
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import parse_name, read_recording, read_stream
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.index import open_dataset
+from plushsense.devices.opening import open_device
+from plushsense.devices.virtual.scenario import load_scenario
 from plushsense.devices.virtual.session import GESTURES
 from plushsense.devices.virtual.stream import ToySpec
-from plushsense.recording.simulate import simulate
+from plushsense.recording.simulate import play_to_folder, simulate
 
 PLUSH = load_layout("plush-15")
+SCENARIO = Path(__file__).resolve().parents[2] / "examples" / "files" / "scenario.toml"
 
 
 @pytest.fixture(scope="module")
@@ -141,3 +147,46 @@ def test_a_virtual_toy_of_a_negative_person_is_refused() -> None:
     for given in ({"person": -1}, {"seed": -1}, {"session": -1}):
         with pytest.raises(ConfigError, match=r"is -1; a whole number from 0"):
             ToySpec(**given)
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("played") / "afternoon"
+    result = play_to_folder(ToySpec.of(load_scenario(SCENARIO)), out)
+    assert (result.people, result.counters.reconnects) == ((1, 7, 12), 1)
+    return out
+
+
+def test_a_scenario_in_a_folder_is_what_the_device_reads(played: Path) -> None:
+    with open_device(f"virtual://?scenario={SCENARIO}&speed=0", reconnect=True) as toy:
+        frames = [(frame.device_ms, frame.values) for frame in toy]
+    with open_device(f"replay://{played}?speed=0") as replay:
+        assert [(frame.device_ms, frame.values) for frame in replay] == frames
+    other = played.parent / "again"
+    play_to_folder(ToySpec.of(load_scenario(SCENARIO)), other)
+    for path in sorted(played.rglob("*")):
+        if path.is_file():
+            assert (other / path.relative_to(played)).read_bytes() == path.read_bytes(), path.name
+
+
+def test_the_truth_of_a_scenario_is_imported_person_by_person(played: Path, tmp_path: Path) -> None:
+    truth = [json.loads(line) for line in (played / "truth.jsonl").read_text(encoding="utf-8").splitlines()]
+    assert Counter(made["person"] for made in truth) == {7: 3, 12: 4}
+    result = import_recordings(played / "recordings", tmp_path / "ds", layout="plush-15")
+    dataset = open_dataset(tmp_path / "ds")
+    assert dataset.head.simulated and not result.rejected
+    found = Counter((r.subject, r.gesture) for r in dataset.recordings)
+    assert found == Counter((f"P{made['person']:02d}", made["label"]) for made in truth)
+    starts = {r.start_ms for r in dataset.recordings}
+    assert all(any(0 <= start - made["start_ms"] < 100 for start in starts) for made in truth), "but for lost frames"
+    assert all(r.stream_row >= 0 for r in dataset.recordings), "each lies in the stream of its person"
+    assert len(dataset.streams) == 3
+
+
+def test_a_toy_without_an_end_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="give it a scenario"):
+        play_to_folder(ToySpec(), tmp_path / "out")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("here")
+    with pytest.raises(DatasetError, match="empty"):
+        play_to_folder(ToySpec.of(load_scenario(SCENARIO)), tmp_path / "full")
