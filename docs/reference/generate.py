@@ -30,7 +30,7 @@ from plushsense.dataset.importing.sources import MAPPING_COLUMNS
 from plushsense.dataset.labelling import COLUMNS as LABEL_COLUMNS
 from plushsense.dataset.store import PEOPLE_COLUMNS, DatasetHead
 from plushsense.devices.virtual.faults import FAULTS
-from plushsense.devices.virtual.scenario import ACTIONS, Scenario, load_scenario
+from plushsense.devices.virtual.scenario import ACTIONS, ToyScenario, load_scenario
 from plushsense.experiments.search.halving import DEFAULTS as SEARCH_DEFAULTS
 from plushsense.experiments.search.halving import SearchSpec, Space, load_search
 from plushsense.experiments.search.halving import problems as search_problems
@@ -145,7 +145,7 @@ FILES = {
         "A scenario says what happens to the virtual toy: people, gestures, humidity and faults. `--scenario FILE` of "
         "[`toy`](../virtual-toy.md) and `verify` takes it, and `virtual://?scenario=FILE` is a toy that plays it. "
         "Worked scenarios are in `examples/scenarios/`.",
-        {"": Scenario},
+        {"": ToyScenario},
         load_scenario,
         _actions_and_faults,
     ),

@@ -21,7 +21,7 @@ from plushsense.devices.ble import UART_SERVICE, UART_TX, BleBackends, BleDevice
 from plushsense.devices.opening import list_devices, open_device, parse_url
 from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.devices.virtual.faults import Fault
-from plushsense.devices.virtual.scenario import Part, Scenario
+from plushsense.devices.virtual.scenario import ScenarioPart, ToyScenario
 from plushsense.devices.virtual.stream import ToySpec, ToyStream, received
 from plushsense.devices.wire import LineParser
 
@@ -181,7 +181,7 @@ def test_a_scenario_is_read_over_bluetooth_as_anywhere() -> None:
         Fault("unended", 5.0, 0.2),
         Fault("reset", 6.0, 0.5),
     )
-    scenario = Scenario((Part("perform", 3, gestures=("Hold strong",)),), wrap_s=3.5, faults=faults)
+    scenario = ToyScenario((ScenarioPart("perform", 3, gestures=("Hold strong",)),), wrap_s=3.5, faults=faults)
     spec = ToySpec.of(scenario)
     expected = [(f.device_ms, f.values) for _, frames, _ in received(spec, PLUSH) for f in frames]
     lines = list(ToyStream(spec, PLUSH))

@@ -12,7 +12,7 @@ from plushsense.core.errors import ConfigError
 from plushsense.core.layouts import load_layout
 from plushsense.devices.base import Counters
 from plushsense.devices.virtual.faults import CLOCK, FAULTS, Fault
-from plushsense.devices.virtual.scenario import Part, Scenario
+from plushsense.devices.virtual.scenario import ScenarioPart, ToyScenario
 from plushsense.devices.virtual.stream import ToySpec, received
 from plushsense.devices.virtual.world import CHANNELS
 
@@ -32,8 +32,8 @@ class Reading:
 
 def reading(*faults: Fault, layout: str = "plush-15", **more: float) -> Reading:
     """A toy that nobody touches for six seconds, with these faults and no others."""
-    parts = (Part("idle", duration_s=6.0),)
-    scenario = Scenario(parts, lost=0.0, garbled=0.0, glitch=0.0, faults=faults, **more)
+    parts = (ScenarioPart("idle", duration_s=6.0),)
+    scenario = ToyScenario(parts, lost=0.0, garbled=0.0, glitch=0.0, faults=faults, **more)
     frames: list[Row] = []
     passed = []
     total = Counters()

@@ -13,7 +13,7 @@ from plushsense.core.layouts import load_layout
 from plushsense.devices.base import Frame
 from plushsense.devices.opening import open_device
 from plushsense.devices.reconnect import ReconnectingDevice
-from plushsense.devices.virtual.scenario import HumidityPoint, Part, Scenario, load_scenario
+from plushsense.devices.virtual.scenario import HumidityPoint, ScenarioPart, ToyScenario, load_scenario
 from plushsense.devices.virtual.stream import Prompt, ToyLine, ToySpec, ToyStream, VirtualDevice
 from plushsense.devices.virtual.world import CHANNELS
 
@@ -22,7 +22,7 @@ PLUSH = load_layout("plush-15")
 QUIET = {"lost": 0.0, "garbled": 0.0, "glitch": 0.0}
 
 
-def lines(scenario: Scenario, seed: int | None = None) -> list[ToyLine]:
+def lines(scenario: ToyScenario, seed: int | None = None) -> list[ToyLine]:
     return list(ToyStream(ToySpec.of(scenario, seed), PLUSH))
 
 
@@ -41,12 +41,12 @@ def test_the_same_seed_plays_the_same_and_another_does_not() -> None:
 
 def test_people_take_turns_and_the_toy_goes_on() -> None:
     parts = (
-        Part("perform", 7, gestures=("Hold strong",)),
-        Part("idle", duration_s=2.0),
-        Part("handle", 12, repetitions=2),
-        Part("perform", gestures=("Tail hit 1",), repetitions=2),
+        ScenarioPart("perform", 7, gestures=("Hold strong",)),
+        ScenarioPart("idle", duration_s=2.0),
+        ScenarioPart("handle", 12, repetitions=2),
+        ScenarioPart("perform", gestures=("Tail hit 1",), repetitions=2),
     )
-    scenario = Scenario(parts, repeat=2, **QUIET)
+    scenario = ToyScenario(parts, repeat=2, **QUIET)
     assert scenario.people == (7, 7, 12, 12)
     played = lines(scenario)
     made = [line.begins for line in played if line.begins is not None]
@@ -64,19 +64,19 @@ def test_people_take_turns_and_the_toy_goes_on() -> None:
 
 
 def test_play_lasts_as_long_as_it_says_and_is_of_those_gestures() -> None:
-    played = lines(Scenario((Part("play", 3, 40.0, ("Back stroke 1", "Tail pull")),), **QUIET))
+    played = lines(ToyScenario((ScenarioPart("play", 3, 40.0, ("Back stroke 1", "Tail pull")),), **QUIET))
     made = [line.begins for line in played if line.begins is not None]
     assert [g.label for g in made] == (["Back stroke 1", "Tail pull"] * len(made))[: len(made)]
     assert 40.0 <= played[-1].passed_ms / 1000 < 60.0
     assert made[-1].start_s < 60.0
-    mixed = [line.begins for line in lines(Scenario((Part("play", 3, 120.0),), **QUIET)) if line.begins is not None]
-    assert len({g.label for g in mixed}) > 5
+    mixed = lines(ToyScenario((ScenarioPart("play", 3, 120.0),), **QUIET))
+    assert len({line.begins.label for line in mixed if line.begins is not None}) > 5
 
 
 def test_the_weather_changes() -> None:
     def belly(*points: tuple[float, float]) -> np.ndarray:
         course = tuple(HumidityPoint(*point) for point in points)
-        played = lines(Scenario((Part("idle", duration_s=30.0),), humidity=course, **QUIET))
+        played = lines(ToyScenario((ScenarioPart("idle", duration_s=30.0),), humidity=course, **QUIET))
         return np.array([int(line.data.split()[CHANNELS.index("belly")]) for line in played])
 
     dry, humid = belly((0.0, -1.0)), belly((0.0, 1.0))
@@ -166,7 +166,7 @@ def test_prompts_replace_the_parts_and_faults_go_on() -> None:
 
 
 def test_a_prompted_gesture_begins_in_time_by_a_clock_that_was_reset() -> None:
-    scenario = Scenario((Part("idle"),), wrap_s=5.0, **QUIET)
+    scenario = ToyScenario((ScenarioPart("idle"),), wrap_s=5.0, **QUIET)
     asked: list[Prompt] = []
     stream = ToyStream(ToySpec.of(scenario), PLUSH, lambda: asked.pop() if asked else None)
     begins = None

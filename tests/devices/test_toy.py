@@ -19,7 +19,7 @@ from plushsense.devices.base import Device
 from plushsense.devices.opening import open_device
 from plushsense.devices.reconnect import ReconnectingDevice
 from plushsense.devices.virtual.faults import Fault
-from plushsense.devices.virtual.scenario import Part, Scenario
+from plushsense.devices.virtual.scenario import ScenarioPart, ToyScenario
 from plushsense.devices.virtual.server import ToyCounters, ToyServer
 from plushsense.devices.virtual.stream import PerformedGesture, ToySpec, VirtualDevice
 
@@ -226,8 +226,8 @@ BREAK = Fault("disconnect", 6.0, 0.5)
 
 
 def scenario_with(*faults: Fault) -> ToySpec:
-    parts = (Part("perform", 4, gestures=("Tail hit 1",)), Part("perform", 9, gestures=("Tail pull",)))
-    return ToySpec.of(Scenario(parts, seed=6, wrap_s=2.2, faults=faults))
+    parts = (ScenarioPart("perform", 4, gestures=("Tail hit 1",)), ScenarioPart("perform", 9, gestures=("Tail pull",)))
+    return ToySpec.of(ToyScenario(parts, seed=6, wrap_s=2.2, faults=faults))
 
 
 def all_of(device: Device) -> list[tuple[int, tuple[int, ...]]]:

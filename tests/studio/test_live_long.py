@@ -57,8 +57,7 @@ def played(bundle: Bundle) -> tuple[list[tuple[str, float, float]], list[tuple[f
         for decision in run_live(device, classifier_of(bundle, None, "float")):
             for e in decision.events:
                 events[e.number] = (events.get(e.number, (e.since_s,))[0], e.affect, e.gesture)
-        zero = device.first_ms or 0
-        done = [(p.label, (p.start_ms - zero) / 1000.0, (p.end_ms - zero) / 1000.0) for p in device.performed]
+        done = [(p.label, p.start_s, p.end_s) for p in device.performed]
     return done, list(events.values())
 
 

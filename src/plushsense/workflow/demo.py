@@ -119,11 +119,9 @@ def _live(bundle: Path, seconds: float) -> dict[str, Any]:
         live = run_live(device, classifier, seconds=seconds)
         decisions = list(live)
         summary = live.summary().to_dict()
-        first_ms = device.first_ms or 0
         gestures = []
         for performed in device.performed:
-            end = (performed.end_ms - first_ms) / 1000.0
-            begin = (performed.start_ms - first_ms) / 1000.0
+            begin, end = performed.start_s, performed.end_s
             during = [d for d in decisions if begin <= d.t_s <= end and d.gesture is not None]
             if during and end <= summary["seconds"]:
                 last = during[-1]

@@ -41,7 +41,7 @@ def _length(name: str, value: float | None) -> None:
 
 
 @dataclass(frozen=True)
-class Part:
+class ScenarioPart:
     """A part of an afternoon. Parts follow each other.
 
     Attributes:
@@ -121,7 +121,7 @@ class HumidityPoint:
 
 
 @dataclass(frozen=True)
-class Scenario:
+class ToyScenario:
     """What happens to a virtual toy from its first line to its last: people, gestures, humidity and faults.
 
     Attributes:
@@ -142,7 +142,7 @@ class Scenario:
         ConfigError: for a value out of its range, or no part.
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[ScenarioPart, ...]
     name: str = "own"
     title: str = ""
     seed: int = 1
@@ -181,10 +181,10 @@ class Scenario:
                 yield from part.episodes(session)
 
 
-def load_scenario(path: str | Path) -> Scenario:
+def load_scenario(path: str | Path) -> ToyScenario:
     """Load the TOML file of a scenario.
 
     Raises:
         ConfigError: for a missing file, an unknown key or an invalid value.
     """
-    return load_table(read_toml(Path(path), "scenario", ConfigError), Scenario, f"scenario '{path}'", ConfigError)
+    return load_table(read_toml(Path(path), "scenario", ConfigError), ToyScenario, f"scenario '{path}'", ConfigError)

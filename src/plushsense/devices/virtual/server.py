@@ -114,8 +114,8 @@ class ToyServer:
     def serve_tcp(self, port: int) -> ToyCounters:
         """Serve on ``127.0.0.1:port`` (0: any free port), to one reader at a time, until `stop` is set.
 
-        Unless ``speed`` is 0, the toy continues while nobody is connected, as a real one does. While a scenario
-        disconnects the toy, nobody listens on the port.
+        Unless ``speed`` is 0, the toy continues while nobody is connected, as a real one does, but a scenario begins
+        with the first reader. While a scenario disconnects the toy, nobody listens on the port.
 
         Raises:
             DeviceError: if the port is in use or not allowed.
@@ -142,7 +142,7 @@ class ToyServer:
                 try:
                     client, _ = server.accept()
                 except BlockingIOError:
-                    if self.speed > 0.0:
+                    if data and self.speed > 0.0:
                         return False
                     select.select([server], [], [], 0.05)
                     continue
@@ -167,6 +167,8 @@ class ToyServer:
             server = client = outlet = None
 
         try:
+            if self.spec.scenario is not None:
+                send(b"")  # waits for the first reader
             self._run(stream, send, counters, disconnect)
         finally:
             disconnect()

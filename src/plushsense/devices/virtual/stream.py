@@ -17,7 +17,7 @@ from plushsense.devices.base import Counters, Frame, PacedDevice, now_ms
 from plushsense.devices.opening import DeviceAddress
 from plushsense.devices.virtual.faults import FaultyToy, garble
 from plushsense.devices.virtual.motions import PICK_S, split_label
-from plushsense.devices.virtual.scenario import Scenario, load_scenario
+from plushsense.devices.virtual.scenario import ToyScenario, load_scenario
 from plushsense.devices.virtual.session import GESTURES, Episode, VirtualSession, check_gesture
 from plushsense.devices.virtual.world import CHANNELS, WORLD, World, draw_person
 from plushsense.devices.wire import LineParser, ParsedLine
@@ -139,12 +139,12 @@ class ToySpec:
     glitch: float | None = None
     gestures: tuple[str, ...] = ()
     world: World = WORLD
-    scenario: Scenario | None = None
+    scenario: ToyScenario | None = None
 
     @classmethod
     def of(
         cls,
-        scenario: Scenario,
+        scenario: ToyScenario,
         seed: int | None = None,
         lost: float | None = None,
         garbled: float | None = None,
@@ -304,8 +304,7 @@ class VirtualDevice(PacedDevice):
 
     Its frames end after ``seconds`` or with its scenario. Reading raises DeviceError while a scenario disconnects it.
 
-    ``performed`` are the gestures that its person has made; ``on_performed`` is called with each. ``first_ms`` is the
-    device clock at the first line, from which a live run counts its times; None before that.
+    ``performed`` are the gestures that its person has made; ``on_performed`` is called with each.
 
     Args:
         speed: 1 for real time, 0 for as fast as frames are read.
@@ -322,7 +321,6 @@ class VirtualDevice(PacedDevice):
         self._prompt: Prompt | None = None
         self._parser = LineParser(layout, self.counters)
         self._seconds = seconds
-        self.first_ms: int | None = None
         self._next: ToyLine | None = None
 
     def play_ahead(self) -> None:
@@ -372,8 +370,6 @@ class VirtualDevice(PacedDevice):
             self._next = next(self._lines, None)
             if self._next is None:
                 return None
-        if self.first_ms is None:
-            self.first_ms = self._next.device_ms
         at = self._next.passed_ms
         return None if self._seconds and at >= self._seconds * 1000.0 else at
 

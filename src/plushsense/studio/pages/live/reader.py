@@ -416,11 +416,9 @@ class LiveReader:
 
     def _add_performed(self, device: VirtualDevice, made: PerformedGesture) -> None:
         """Note a gesture that the virtual person begins; called in the reader thread."""
-        first_ms = device.first_ms or 0
         with self._lock:
             number = len(self._performed) + 1
-            begin_s, end_s = ((ms - first_ms) / 1000.0 for ms in (made.start_ms, made.end_ms))
-            self._performed.append(Performed(number, made.label, begin_s, end_s))
+            self._performed.append(Performed(number, made.label, made.start_s, made.end_s))
             self.now = replace(self.now, performed=number, next_gesture=device.prompted)
 
     def _performed_in(self, begin_s: float, end_s: float) -> str | None:
