@@ -104,7 +104,10 @@ def _actions_and_faults() -> str:
 
     text = "## What happens in a part\n\n" + _row("`do`", "further keys", "what happens") + _row(*["---"] * 3)
     text += "".join(_row(f"`{name}`", code(keys), what) for name, (keys, what) in ACTIONS.items())
-    text += "\n## Kinds of faults\n\nAll have `at_s` and `duration_s`. Faults of one moment apply in this order.\n\n"
+    text += (
+        "\n## Kinds of faults\n\nAll have `at_s`, `duration_s` and `every_s`. Those of one moment apply in this order."
+    )
+    text += "\n\n"
     text += _row("`kind`", "further keys", "what goes wrong", "what a reader sees") + _row(*["---"] * 4)
     return text + "".join(_row(f"`{n}`", code(f.keys), f.what, f.effect) for n, f in FAULTS.items())
 

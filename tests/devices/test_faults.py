@@ -211,6 +211,22 @@ def test_the_clock_wraps_at_32_bits(clean: Reading) -> None:
     assert sum(np.diff(clocks) < 0) == 1 and max(clocks[-100:]) < 5000
 
 
+def test_a_fault_comes_again_and_again(clean: Reading) -> None:
+    lost = reading(Fault("lost", 1.0, 0.1, every_s=0.5))
+    assert lost.counters.lost == pytest.approx(100, abs=10)
+    assert len(lost.frames) + lost.counters.lost == len(clean.frames)
+    assert reading(Fault("disconnect", 1.0, 0.1, every_s=1.0)).counters.reconnects == 5
+    resets = [ms for ms, _ in reading(Fault("reset", 1.0, 0.2, every_s=1.0), Fault("reset", 1.5, 0.2)).frames]
+    assert resets.count(0) == 6
+    stalls = reading(Fault("stall", 1.0, 0.3, every_s=1.0))
+    assert stalls.frames == clean.frames
+    assert len(set(stalls.passed_ms)) == pytest.approx(len(clean.frames) - 5 * 30, abs=10)
+    ears = channel(reading(Fault("stuck", 1.0, 0.5, every_s=1.0, channels=("ears",))).frames, "ears")
+    changed = np.flatnonzero(ears != channel(clean.frames, "ears"))
+    assert set((np.array(clean.passed_ms)[changed] - 1000) // 1000) == {0, 1, 2, 3, 4}
+    assert ((np.array(clean.passed_ms)[changed] - 1000) % 1000).max() < 500
+
+
 def test_one_fault_does_not_change_another() -> None:
     glitch, torn = Fault("glitch", 1.0, 1.0, share=0.5), Fault("torn", 4.0, 1.0, share=0.5)
     both, alone = reading(glitch, torn), reading(glitch)
@@ -235,7 +251,7 @@ def test_firmware_without_a_clock_shows_no_reset() -> None:
         ({"kind": "lost", "at_s": 1.0, "share": 1.5}, "share is 1.5; accepted is above 0 to 1"),
         (
             {"kind": "stall", "at_s": 1.0, "share": 0.5},
-            "'stall' has no share; it has at_s, duration_s: leave share out",
+            "'stall' has no share; it has at_s, duration_s, every_s: leave share out",
         ),
         ({"kind": "dead", "at_s": 1.0, "channels": ("ear",)}, "no channel 'ear'.*Did you mean 'ears'"),
         ({"kind": "flood", "at_s": 1.0, "times": 1}, "times is 1; accepted are whole numbers from 2 to 1000"),

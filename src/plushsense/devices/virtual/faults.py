@@ -24,7 +24,7 @@ _NOISE = bytes(range(128, 256)) + b"#?~\x00\x7f"
 class FaultKind:
     """A kind of fault: what happens, and the effect, which is what a program that reads the toy counts and reports.
 
-    ``keys`` are those that it has besides ``kind``, ``at_s`` and ``duration_s``.
+    ``keys`` are those that it has besides ``kind``, ``at_s``, ``duration_s`` and ``every_s``.
     """
 
     keys: tuple[str, ...]
@@ -113,6 +113,7 @@ FAULTS: dict[str, FaultKind] = {
 }
 """The faults by name. Those of one moment apply in this order, whatever their order in a file."""
 
+_SENSORS = ("stuck", "dead", "noisy", "glitch")
 _DEFAULTS = {"duration_s": 1.0, "share": 1.0, "times": 10, "value": 0, "counts": 300.0}
 _RANGES = {"times": (2, 1000), "bytes": (1, 100_000), "value": (-1_000_000, 1_000_000)}
 _LONGEST_S = 1e6
@@ -126,6 +127,8 @@ class Fault:
         kind: what goes wrong, see below (one of `FAULTS`).
         at_s: when it begins, in seconds from the first line (0 to 1000000).
         duration_s: how long it lasts (above 0 to 1000000; default: 1).
+        every_s: time from one beginning to the next, of a fault that comes again and again (above 0 to 1000000;
+            default: it comes once).
         share: share of the lines or frames that are affected, drawn at random (above 0 to 1; default: all of them).
         channels: names of the affected channels, which are those of plush-15 (default: all, of ``glitch`` the
             electrodes).
@@ -141,6 +144,7 @@ class Fault:
     kind: str
     at_s: float
     duration_s: float | None = None
+    every_s: float | None = None
     share: float | None = None
     channels: tuple[str, ...] = ()
     value: int | None = None
@@ -156,11 +160,11 @@ class Fault:
         own = FAULTS[self.kind].keys
         for key in ("share", "channels", "value", "counts", "times", "bytes"):
             if key not in own and getattr(self, key) not in (None, ()):
-                has = ", ".join(("at_s", "duration_s", *own))
+                has = ", ".join(("at_s", "duration_s", "every_s", *own))
                 raise ConfigError(f"a fault of the kind '{self.kind}' has no {key}; it has {has}: leave {key} out.")
         if not 0.0 <= self.at_s <= _LONGEST_S:
             raise ConfigError(f"at_s is {self.at_s:g}; accepted are 0 to {_LONGEST_S:.0f} seconds.")
-        for key, most in (("duration_s", _LONGEST_S), ("share", 1.0), ("counts", 100_000.0)):
+        for key, most in (("duration_s", _LONGEST_S), ("every_s", _LONGEST_S), ("share", 1.0), ("counts", 100_000.0)):
             value = getattr(self, key)
             if value is not None and not 0.0 < value <= most:
                 raise ConfigError(f"{key} is {value:g}; accepted is above 0 to {most:.0f}.")
@@ -179,15 +183,15 @@ class Fault:
         value = getattr(self, key)
         return float(_DEFAULTS[key] if value is None else value)
 
-    @property
-    def begin_ms(self) -> float:
-        """Milliseconds from the first line to the beginning."""
-        return 1000.0 * self.at_s
+    def turns(self, passed_ms: Ints, late_s: float = 0.0) -> Ints:
+        """Return how often this fault has begun (n,) at times since the first line, or had begun ``late_s`` before."""
+        late = passed_ms - 1000.0 * (self.at_s + late_s)
+        turns = late >= 0.0 if self.every_s is None else np.maximum(0, late // (1000.0 * self.every_s) + 1)
+        return np.asarray(turns, dtype=np.int64)
 
-    @property
-    def end_ms(self) -> float:
-        """Milliseconds from the first line to the end."""
-        return 1000.0 * (self.at_s + self.setting("duration_s"))
+    def active(self, passed_ms: Ints) -> NDArray[np.bool_]:
+        """Return whether this fault lasts (n,) at times since the first line."""
+        return np.asarray(self.turns(passed_ms) > self.turns(passed_ms, self.setting("duration_s")))
 
     def columns(self) -> Ints:
         """Return the indices of the affected channels among those of the virtual toy."""
@@ -224,22 +228,28 @@ class FaultyToy:
         self._rng = {n: np.random.default_rng([seed, n, 0xFA17]) for n, _ in self._faults}
         self._wrap_ms = None if wrap_s is None else round(1000.0 * wrap_s)
         self._shift: int | None = None
-        self._started: dict[int, int] = {}
-        self._kept: dict[int, Ints] = {}
+        self._started = (-1.0, 0)
+        self._kept: dict[int, tuple[int, Ints]] = {}
         self._held: dict[int, bytearray] = {}
 
     def readings(self, values: Ints, passed_ms: Ints) -> Ints:
         """Return the readings (n, 13) with the faults of the sensors; ``passed_ms`` (n,) is since the first line."""
         changed = values
         for n, fault in self._faults:
-            rows = np.flatnonzero((passed_ms >= fault.begin_ms) & (passed_ms < fault.end_ms))
-            if fault.kind not in ("stuck", "dead", "noisy", "glitch") or not len(rows):
+            if fault.kind not in _SENSORS:
+                continue
+            rows = np.flatnonzero(fault.active(passed_ms))
+            if not len(rows):
                 continue
             changed = changed.copy() if changed is values else changed
             rng, columns = self._rng[n], fault.columns()
             if fault.kind == "stuck":
-                kept = self._kept.setdefault(n, changed[rows[0]].copy())
-                changed[np.ix_(rows, columns)] = kept[columns]
+                turns = fault.turns(passed_ms)[rows]
+                for turn in np.unique(turns).tolist():
+                    stuck = rows[turns == turn]
+                    if n not in self._kept or self._kept[n][0] != turn:
+                        self._kept[n] = turn, changed[stuck[0]].copy()
+                    changed[np.ix_(stuck, columns)] = self._kept[n][1][columns]
             elif fault.kind == "dead":
                 changed[np.ix_(rows, columns)] = int(fault.setting("value"))
             elif fault.kind == "noisy":
@@ -255,22 +265,31 @@ class FaultyToy:
         if self._shift is None:
             self._shift = 0 if self._wrap_ms is None else CLOCK - self._wrap_ms - int(session_ms[0] - passed_ms[0])
         sent = session_ms + self._shift
-        for n, fault in sorted(self._faults, key=lambda pair: pair[1].end_ms):
-            after = passed_ms >= fault.end_ms
-            if fault.kind == "reset" and after.any():
-                self._started.setdefault(n, int(session_ms[np.argmax(after)]))
-                sent = np.where(after, session_ms - self._started[n], sent)
+        started_s = np.full(len(sent), -1.0)  # of the last restart
+        for _, fault in self._faults:
+            if fault.kind == "reset":
+                silent_s = fault.setting("duration_s")
+                turns = fault.turns(passed_ms, silent_s)
+                ends_s = fault.at_s + silent_s + (turns - 1) * (fault.every_s or 0.0)
+                started_s = np.where(turns > 0, np.maximum(started_s, ends_s), started_s)
+        for at in np.unique(started_s[started_s >= 0.0]).tolist():
+            after = started_s == at
+            if self._started[0] != at:
+                self._started = at, int(session_ms[np.argmax(after)])
+            sent = np.where(after, session_ms - self._started[1], sent)
         return np.asarray(sent % CLOCK)
 
     def lines(self, lines: list[bytes], passed_ms: Ints) -> list[bool]:
         """Change the lines of these samples in place; return for each whether the toy is connected then."""
         connected = [True] * len(lines)
         for n, fault in self._faults:
+            if fault.kind in _SENSORS:
+                continue
             if fault.kind == "stall":
                 self._hold(n, fault, lines, passed_ms)
                 continue
-            rows = np.flatnonzero((passed_ms >= fault.begin_ms) & (passed_ms < fault.end_ms))
-            if "share" in FAULTS[fault.kind].keys and fault.kind != "glitch":
+            rows = np.flatnonzero(fault.active(passed_ms))
+            if "share" in FAULTS[fault.kind].keys:
                 rows = rows[self._rng[n].random(len(rows)) < fault.setting("share")]
             for at in rows.tolist():
                 if fault.kind == "disconnect":
@@ -301,14 +320,13 @@ class FaultyToy:
     def _hold(self, n: int, fault: Fault, lines: list[bytes], passed_ms: Ints) -> None:
         """Hold back the lines of a stall, and put them before the first line after it."""
         held = self._held.setdefault(n, bytearray())
-        for at in np.flatnonzero((passed_ms >= fault.begin_ms) & (passed_ms < fault.end_ms)).tolist():
-            held += lines[at]
-            lines[at] = b""
-        after = passed_ms >= fault.end_ms
-        if held and after.any():
-            at = int(np.argmax(after))
-            lines[at] = bytes(held) + lines[at]
-            held.clear()
+        for at, holding in enumerate(fault.active(passed_ms).tolist()):
+            if holding:
+                held += lines[at]
+                lines[at] = b""
+            elif held:
+                lines[at] = bytes(held) + lines[at]
+                held.clear()
 
     def held(self) -> bytes:
         """Return the lines that a stall still holds back when the toy ends."""
