@@ -13,7 +13,7 @@ from plushsense.core.layouts import load_layout
 from plushsense.devices.base import Counters
 from plushsense.devices.virtual.faults import CLOCK, FAULTS, Fault
 from plushsense.devices.virtual.scenario import ScenarioPart, ToyScenario
-from plushsense.devices.virtual.stream import ToySpec, received
+from plushsense.devices.virtual.stream import ToySpec, ToyStream, received
 from plushsense.devices.virtual.world import CHANNELS
 
 PLUSH = load_layout("plush-15")
@@ -236,6 +236,13 @@ def test_one_fault_does_not_change_another() -> None:
     # Those of one moment have their own order.
     lost, flood = Fault("lost", 1.0, 1.0), Fault("flood", 1.0, 1.0)
     assert reading(lost, flood).frames == reading(flood, lost).frames
+
+
+def test_floods_do_not_multiply_without_end() -> None:
+    parts = (ScenarioPart("idle", duration_s=0.2),)
+    floods = tuple(Fault("flood", 0.0, 0.1, times=1000) for _ in range(3))
+    lines = ToyStream(ToySpec.of(ToyScenario(parts, faults=floods)), PLUSH)
+    assert 900_000 < max(len(line.data) for line in lines) <= 1_000_000
 
 
 def test_firmware_without_a_clock_shows_no_reset() -> None:

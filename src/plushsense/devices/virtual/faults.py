@@ -117,6 +117,8 @@ _SENSORS = ("stuck", "dead", "noisy", "glitch")
 _DEFAULTS = {"duration_s": 1.0, "share": 1.0, "times": 10, "value": 0, "counts": 300.0}
 _RANGES = {"times": (2, 1000), "bytes": (1, 100_000), "value": (-1_000_000, 1_000_000)}
 _LONGEST_S = 1e6
+_MOST_BYTES = 1_000_000  # in place of one line, if floods multiply
+_HELD_BYTES = 64_000_000  # in a stall; what comes after that is lost
 
 
 @dataclass(frozen=True)
@@ -312,7 +314,8 @@ class FaultyToy:
             fields = line.split()
             return b" ".join(fields[: int(rng.integers(1, len(fields)))]) + b"\n"
         if kind in ("duplicated", "flood"):
-            return line * (2 if kind == "duplicated" else int(fault.setting("times")))
+            times = 2 if kind == "duplicated" else int(fault.setting("times"))
+            return line * min(times, max(1, _MOST_BYTES // len(line)))
         if kind == "unended":
             return line.rstrip(b"\n") if fault.bytes is None else b"8" * fault.bytes
         return line
@@ -322,7 +325,7 @@ class FaultyToy:
         held = self._held.setdefault(n, bytearray())
         for at, holding in enumerate(fault.active(passed_ms).tolist()):
             if holding:
-                held += lines[at]
+                held += lines[at] if len(held) < _HELD_BYTES else b""
                 lines[at] = b""
             elif held:
                 lines[at] = bytes(held) + lines[at]
