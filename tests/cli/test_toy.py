@@ -66,6 +66,7 @@ def test_settings_that_do_not_go_together_are_refused(cli: Any, tmp_path: Path) 
     for words, sentence in (
         (("--out", tmp_path / "x"), "--out needs a toy that ends: add --scenario FILE"),
         (("--scenario", file, "--out", tmp_path / "x", "--truth", "t"), "leave out --truth"),
+        (("--scenario", file, "--out", tmp_path / "x", "--speed", 5), "leave out --speed"),
         (("--scenario", file, "--tcp", 0, "--person", 3), "The scenario says the person: leave out --person"),
         (("--scenario", tmp_path / "none.toml", "--tcp", 0), "There is no scenario file"),
     ):

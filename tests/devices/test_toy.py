@@ -249,6 +249,13 @@ def test_a_scenario_over_tcp_is_the_one_in_this_process() -> None:
     assert running.performed == made
 
 
+def test_a_scenario_over_tcp_begins_with_its_reader() -> None:
+    spec = scenario_with()
+    with toy(over_tcp, spec, speed=1000) as running, open_device(running.url) as device:
+        first = next(iter(device))
+    assert (first.device_ms, first.values) == in_process(spec)[0][0]
+
+
 @needs_pty
 def test_a_scenario_over_a_serial_port_is_the_one_in_this_process() -> None:
     spec = scenario_with(*FAULTS)

@@ -127,6 +127,9 @@ def _play_to_folder(args: argparse.Namespace, spec: ToySpec) -> int:
             raise ConfigError(f"--out writes a scenario as it is, with its truth: leave out --{option}.")
     if args.scenario is None:
         raise ConfigError("--out needs a toy that ends: add --scenario FILE.")
+    for option, value in (("seconds", args.seconds), ("speed", args.speed - 1.0)):
+        if value:
+            raise ConfigError(f"--out plays the whole scenario without waiting: leave out --{option}.")
     played = play_to_folder(spec, args.out, args.layout)
     counters = ", ".join(f"{name} {number}" for name, number in played.counters.to_dict().items())
     emit(
