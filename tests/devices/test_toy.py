@@ -296,7 +296,5 @@ def test_a_scenario_unplugs_a_serial_port() -> None:
         for frame in device:
             last = frame
     assert running.url.startswith("serial://")
-    frames = [ms for ms, _ in in_process(scenario_with())[0]]
-    assert (
-        sum(frames[n + 1] - frames[n] for n in range(frames.index(last.device_ms)) if frames[n + 1] > frames[n]) > 5900
-    )
+    before = [ms for ms, _ in in_process(scenario_with())[0]].index(last.device_ms)
+    assert 400 < before <= 600, "it breaks off after 6 s"
