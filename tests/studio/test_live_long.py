@@ -71,15 +71,12 @@ def test_every_gesture_is_seen_with_its_affect_and_nothing_grows(
     browser = look()
     page = browser.open(f"{server.url}/live")
     marked(page, "start").click()
-    seen: dict[str, dict[str, str]] = {}
     memory: list[tuple[float, float]] = []
     heap: list[tuple[float, float]] = []
     began = time.monotonic()
     linux = Path("/proc/self/statm").exists()
     while True:
         ended = "have ended" in marked(page, "about").inner_text()
-        for row in marked(page, "events").locator("li[data-id]").evaluate_all(_ROWS):
-            seen[row["id"]] = row
         now = time.monotonic() - began
         memory.append((now, float(bench.resident_bytes(pid)) if linux else 0.0))
         heap.append((now, float(bench.heap_bytes(page))))
@@ -88,13 +85,16 @@ def test_every_gesture_is_seen_with_its_affect_and_nothing_grows(
         assert now < TOY_S + 60.0, "the toy did not come to its end"
         page.wait_for_timeout(1000)
     told = page.evaluate("() => [window.plushsenseLive.updates, window.plushsenseLive.samples]")
+    seen: list[dict[str, Any]] = page.evaluate("() => [...window.plushsenseLive.spans.values()]")
 
-    # The page shows what the library says of the same bytes, event by event.
-    shown = [seen[key] for key in sorted(seen, key=int)]
+    # The page has what the library says of the same bytes, event by event, and displays the latest, the newest first.
     assert [(round(at, 1), affect, gesture) for at, affect, gesture in wanted] == [
-        (round(float(s["from"]), 1), s["affect"], s["gesture"] or None) for s in shown
+        (round(s["from"], 1), s["affect"], s["gesture"] or None) for s in seen
     ]
-    assert all(s["to"] for s in seen.values()), "at the end every event has ended"
+    assert all(s["to"] is not None for s in seen), "at the end every event has ended"
+    rows = marked(page, "events").locator("li[data-id]").evaluate_all(_ROWS)
+    assert [row["id"] for row in rows] == [str(s["id"]) for s in reversed(seen[-len(rows) :])]
+    assert all(row["affect"] in row["badge"] for row in rows)
 
     # And that is what the person did.
     gestures = load_gestures("plush-18")
@@ -104,8 +104,8 @@ def test_every_gesture_is_seen_with_its_affect_and_nothing_grows(
         if gesture is None or gesture.idle or end > TOY_S - LATE_S - 2.5:
             continue
         made.add(label)
-        over = [s for s in seen.values() if float(s["from"]) < end + LATE_S and float(s["to"]) > begin]
-        if not any(s["affect"] == gesture.affect and gesture.affect in s["badge"] for s in over):
+        over = [s for s in seen if s["from"] < end + LATE_S and s["to"] > begin]
+        if not any(s["affect"] == gesture.affect for s in over):
             missed.append((label, begin))
     total = sum(1 for label, _, end in done if label in made and end <= TOY_S - LATE_S - 2.5)
     assert len(missed) <= total // 50, missed

@@ -107,4 +107,5 @@ def bundle(imported: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("bundle")
     made = shutil.copytree(imported, folder / "DS")
-    return ps.train(made, epochs=10, filters=(4, 4, 4)).save(folder / "model.plush")
+    # With a patience there is no second training, on everybody, which takes time.
+    return ps.train(made, epochs=10, patience=10, filters=(4, 4, 4)).save(folder / "model.plush")

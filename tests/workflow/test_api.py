@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,8 @@ import pytest
 import plushsense as ps
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.store import Dataset
-from plushsense.workflow.api import simulate
+from plushsense.workflow.api import simulate, validation_predictions
+from plushsense.workflow.networks import REFIT
 
 
 def test_the_public_api_is_small_and_all_of_its_names_load() -> None:
@@ -31,8 +34,31 @@ def test_every_function_that_the_documentation_lists_is_in_its_module() -> None:
     assert [f"{module}.{name}" for name, module in listed.items() if not hasattr(import_module(module), name)] == []
 
 
-def test_train_keeps_whole_people_apart_and_says_on_whom(dataset: Dataset) -> None:
-    trained = ps.train(dataset, epochs=2, filters=(4, 4, 4))
+def test_train_learns_from_everybody_once_scores_and_decisions_are_found(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows: list[dict[str, Any]] = []
+    trained = ps.train(dataset, epochs=2, filters=(4, 4, 4), progress=lambda *at: rows.append(at[2]))
+    monkeypatch.setattr("plushsense.workflow.preparation.refits", lambda *_: False)
+    held_back = ps.train(dataset, epochs=2, filters=(4, 4, 4))
+    origin, before = trained.bundle.provenance, held_back.bundle.provenance
+    assert (origin["subjects"], origin["refit"], before["refit"]) == (sorted(dataset.subjects), True, False)
+    assert origin["validation_subjects"] == before["validation_subjects"] != []
+    assert [row.get("what") for row in rows] == [None, None, REFIT, REFIT]
+    assert trained.scores["accuracy"] == held_back.scores["accuracy"]
+    assert trained.bundle.decision == held_back.bundle.decision and trained.history == held_back.history
+    assert any(not np.array_equal(w, held_back.bundle.weights[k]) for k, w in trained.bundle.weights.items())
+    # The answers on the people who were held back are those of the network that did not know them.
+    answers = validation_predictions(trained.bundle, dataset)
+    assert set(answers.subject.tolist()) == set(origin["validation_subjects"])
+    assert np.array_equal(answers.predicted, validation_predictions(held_back.bundle, dataset).predicted)
+    shutil.rmtree(dataset.path / "cache")
+    with pytest.raises(DatasetError, match="no validation people"):
+        validation_predictions(trained.bundle, dataset)
+
+
+def test_early_stopping_keeps_whole_people_apart_and_says_on_whom(dataset: Dataset) -> None:
+    trained = ps.train(dataset, epochs=2, filters=(4, 4, 4), patience=5)
     inside, watching = (set(trained.bundle.provenance[k]) for k in ("subjects", "validation_subjects"))
     assert inside & watching == set()
     assert inside | watching == set(dataset.subjects)
@@ -62,7 +88,7 @@ def test_the_papers_preset_is_mirrored_loops(dataset: Dataset) -> None:
 
 def test_trained_anywhere_knows_idleness_and_is_scored_on_gestures(dataset: Dataset) -> None:
     said: list[str] = []
-    kwargs = {"epochs": 1, "filters": (4, 4, 4), "pool_s": 0.5}
+    kwargs = {"epochs": 1, "filters": (4, 4, 4), "pool_s": 0.5, "patience": 9}
     trained = ps.train(dataset, context="anywhere", every_s=0.5, idle_share=0.25, warn=said.append, **kwargs)
     bundle = trained.bundle
     assert bundle.gestures.labels == ("Fast", "Rest", "Slow", "Idle")
@@ -72,8 +98,6 @@ def test_trained_anywhere_knows_idleness_and_is_scored_on_gestures(dataset: Data
     assert bundle.arch.pool == 50
     assert bundle.provenance["context"]["anywhere"] > 50
     assert (bundle.windowing["context"], bundle.windowing["anywhere"]["idle_share"]) == ("anywhere", 0.25)
-    inside, watching = (set(bundle.provenance[k]) for k in ("subjects", "validation_subjects"))
-    assert inside & watching == set() and inside | watching == set(dataset.subjects)
     ordinary = ps.train(dataset, **kwargs)
     assert trained.scores["windows"] == ordinary.scores["windows"], "gestures with their real past, nothing else"
 
@@ -164,7 +188,7 @@ def test_nothing_that_is_scored_was_trained_on(people: int, kind: str, tmp_path:
     assert trained
     assert scored
     assert not trained & scored
-    trained = ps.train(dataset, epochs=1, filters=(2, 2, 2))
+    trained = ps.train(dataset, epochs=1, filters=(2, 2, 2), patience=9)
     assert trained.scores["split"] == kind
     assert not trained.scores["leaky"]
     if people < 3:
@@ -174,7 +198,7 @@ def test_nothing_that_is_scored_was_trained_on(people: int, kind: str, tmp_path:
 def test_the_toy_at_rest_does_not_flatter_a_training(tmp_path: Path) -> None:
     simulate(tmp_path / "raw", people=3, repetitions=1)
     dataset = ps.import_recordings(tmp_path / "raw", tmp_path / "DS", layout="plush-15").dataset
-    scores = ps.train(dataset, epochs=1, filters=(2, 2, 2)).scores
+    scores = ps.train(dataset, epochs=1, filters=(2, 2, 2), patience=9).scores
     assert scores["simulated"]
     assert scores["nobody"]["windows"] > 0
     assert scores["accuracy"] < 0.6, "after one epoch only rest is known, and rest is nobody's"

@@ -19,7 +19,7 @@ from plushsense.workflow.preparation import choose_classes, windows_for
 
 
 def test_training_calibrates_on_the_windows_it_trained_on_and_no_others(dataset: Dataset) -> None:
-    bundle = ps.train(dataset, epochs=1, filters=(4, 4, 4)).bundle
+    bundle = ps.train(dataset, epochs=1, filters=(4, 4, 4), patience=9).bundle
     spec = WindowSpec(**bundle.windowing)
     windows = windows_for(dataset.with_inputs(bundle.layout), bundle.arch, spec, choose_classes(dataset, "all"))
     trained_on = np.isin(windows.subject, bundle.provenance["subjects"])

@@ -147,7 +147,7 @@ def test_who_is_forgotten_meanwhile_does_not_come_back(
 def test_nor_in_the_state_of_a_training(
     folder: Path, run: Callable[[Dataset, Path, Hook], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("plushsense.workflow.api._SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr("plushsense.workflow.networks._SAVE_EVERY_S", 0.0)
     hook = forgetting(folder, lambda *_: True)
     with pytest.raises(ForgottenError, match=REFUSED):
         run(open_dataset(folder), folder / "evaluations" / "mine", hook)

@@ -399,6 +399,7 @@ def _warn_of_training(bundle: Bundle, person: str, warn: Warn) -> None:
         people = bundle.provenance.get(key, ())
         if isinstance(people, list | tuple) and person in people:
             warn(f"the bundle was {used} on a person {person}: if it is the same one, the scores before are too high")
+            return
 
 
 def _recordings_of(dataset: Dataset, person: str, bundle: Bundle, warn: Warn) -> tuple[Dataset, dict[str, str]]:

@@ -324,19 +324,23 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     check_folder(out.parent, "A bundle")
     reporter.progress(stage="reading", share=0.0)
 
-    from plushsense.workflow.api import FIRST_NETWORK, train, unfinished
+    from plushsense.workflow.api import train, unfinished
+    from plushsense.workflow.networks import FIRST_NETWORK, REFIT
+    from plushsense.workflow.preparation import refits
 
-    clock, tuning = Clock(), int(spec.get("quantize_aware", 0))
-    hard = config.windows.context == ANYWHERE and config.anywhere.hard_share > 0
-    first = config.training.epochs if hard else 0
-    whole = first + config.training.epochs + tuning
+    clock, tuning, epochs = Clock(), int(spec.get("quantize_aware", 0)), config.training.epochs
+    first = epochs if config.windows.context == ANYWHERE and config.anywhere.hard_share > 0 else 0
+    each, again = first + epochs + tuning, refits(config, len(open_dataset(spec["dataset"]).subjects))
 
     def epoch(at: int, of: int, row: dict[str, Any]) -> None:
-        stage = {None: "training", FIRST_NETWORK: "first_network"}.get(row.get("what"), "fine-tuning")
-        done = at + {"training": first, "first_network": 0, "fine-tuning": first + config.training.epochs}[stage]
+        what = str(row.get("what", ""))
+        second, part = what.startswith(REFIT), what.removeprefix(REFIT).lstrip(", ")
+        past = {"": first, FIRST_NETWORK: 0}.get(part, first + epochs)
+        stage = "refitting" if second else {"": "training", FIRST_NETWORK: "first_network"}.get(part, "fine-tuning")
         scores = {k: row.get(k) for k in ("train_loss", "train_accuracy", "validation_loss", "accuracy")}
-        reporter.progress(stage=stage, epoch=at, epochs=of, **scores, **clock.at(done / whole))
-        if at == of and stage == "training" and not tuning:
+        share = (each * second + past + at) / (each * (1 + again))
+        reporter.progress(stage=stage, epoch=at, epochs=of, **scores, **clock.at(share))
+        if at == of and second == again and past == first and not tuning:
             reporter.progress(stage="deciding", epoch=at, epochs=of, share=1.0)
 
     done = train(
@@ -365,14 +369,16 @@ def run_make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     out = Path(spec["out"])
     reporter.progress(stage="reading", share=0.0)
 
-    from plushsense.trials.budget import TRAINING, BudgetProgress, make_network
+    from plushsense.trials.budget import BudgetProgress, make_network
+    from plushsense.workflow.networks import FIRST_NETWORK, REFIT
     from plushsense.workflow.reporting import load_evaluation
 
     clock = Clock()
 
     def report(at: BudgetProgress) -> None:
         row = {key: value for key, value in at.row.items() if key != "learning_rate"}
-        stage = "first_network" if at.stage == TRAINING and "what" in row else at.stage
+        what = str(row.get("what", ""))
+        stage = "refitting" if what.startswith(REFIT) else "first_network" if what == FIRST_NETWORK else at.stage
         reporter.progress(**row | {"stage": stage, "bundle": at.bundle}, **clock.at(at.share))
 
     settings = spec.get("settings")

@@ -32,7 +32,8 @@ from plushsense.trials.estimate import preview_evaluation
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import evaluate, train, unfinished
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, silent
+from plushsense.workflow.networks import FIRST_NETWORK, REFIT
+from plushsense.workflow.preparation import Warn, refits, silent
 from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, evaluation_id, journal_of, name_of, write_report
 
 TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
@@ -58,7 +59,8 @@ class TrainingCost:
         window_epoch_s: seconds to train on one window for one epoch.
         windows: number of windows of all people.
         side_by_side: number of folds that are trained at the same time.
-        networks: 2 if a first network finds hard negatives for the final one, else 1.
+        networks: number of trainings that the final network takes: 2 if people are first held out for its decision
+            settings, else 1; twice as many if another network finds hard negatives for each.
     """
 
     window_epoch_s: float
@@ -217,6 +219,8 @@ def make_network(
         streams = any(recording.stream_row >= 0 for recording in dataset.used)
         config = from_settings(context=ANYWHERE) if streams else from_settings()
     networks = 2 if config.anywhere.hard_share and config.windows.context == ANYWHERE else 1
+    again = refits(config, _count_people(dataset))
+    networks *= 1 + again
     # A resumed run must not choose other folds because the computer is faster or slower than before.
     journal = journal_of(dataset, "budgets")
     key = job_id({"evaluation": evaluation_id(config, dataset), "out": out.name, "seconds": budget_s})
@@ -234,7 +238,7 @@ def make_network(
     whole = sum(_work(plan, networks))
     bundle = _saved_bundle(out.parent, stored["bundle"]) if stored is not None else None
     if bundle is None:
-        bundle, training_s = _train(dataset, config, out, whole, networks, progress, warn)
+        bundle, training_s = _train(dataset, config, out, whole, networks, again, progress, warn)
         if cost is not None:
             plan = _adjusted(plan, cost, training_s, _USED * budget_s - (time.monotonic() - began))
             config, whole = _planned(config, plan), sum(_work(plan, networks))
@@ -326,12 +330,23 @@ def _work(plan: BudgetPlan, networks: int) -> list[float]:
 
 
 def _train(
-    dataset: Dataset, config: RunConfig, out: Path, whole: float, networks: int, progress: Reporter, warn: Warn
+    dataset: Dataset,
+    config: RunConfig,
+    out: Path,
+    whole: float,
+    networks: int,
+    again: bool,
+    progress: Reporter,
+    warn: Warn,
 ) -> tuple[Path, float]:
+    each = networks // (1 + again)
+
     def epoch_done(epoch: int, epochs: int, row: dict[str, Any]) -> None:
-        done = epoch / epochs + (networks - 1 if "what" not in row else 0)
+        what = str(row.get("what", ""))
+        second, first_network = what.startswith(REFIT), what.endswith(FIRST_NETWORK)
+        done = epoch / epochs + each * second + (0 if first_network else each - 1)
         progress(BudgetProgress(TRAINING, done / whole, row | {"epoch": epoch, "epochs": epochs}))
-        if epoch == epochs and "what" not in row:
+        if epoch == epochs and second == again and not first_network:
             progress(BudgetProgress(DECIDING, done / whole, {}))
 
     done = train(dataset, config, journal=unfinished(dataset), progress=epoch_done, warn=warn)

@@ -43,7 +43,8 @@ def preview_training(
     division = divide(windows, config, scored)
     rate = _seconds_a_mac(windows, network, config.training)
     head = {"split": division.kind, "leaky": division.split.leaky, "context": config.windows.context, "folds": 1}
-    return head | _describe(dataset, network, config, windows, [len(division.train)], rate, 1)
+    sizes = [len(division.train), *([len(windows)] if division.refit else [])]
+    return head | _describe(dataset, network, config, windows, sizes, rate, 1)
 
 
 def preview_evaluation(

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, fields, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zlib import crc32
@@ -31,7 +31,7 @@ from plushsense.deploy.quantize import (
     quantize,
     refuse_undeployable,
 )
-from plushsense.evaluation.crossval import EpochProgress, Evaluation, FoldOutput, windows_fingerprint
+from plushsense.evaluation.crossval import EpochProgress, Evaluation, FoldOutput
 from plushsense.evaluation.crossval import evaluate as crossvalidate
 from plushsense.evaluation.leakage import warn_of_copies
 from plushsense.evaluation.scores import FoldRecord, Predictions, gather_predictions, with_accuracy
@@ -47,14 +47,13 @@ from plushsense.training.spec import TrainSpec
 from plushsense.tuning.decisions import fit_decisions as fit_on_people
 from plushsense.windows.cut import ANYWHERE, WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
+from plushsense.workflow.networks import KEPT_S, REFIT, NetworkTrainer
 from plushsense.workflow.preparation import (
     WHOLE_PEOPLE,
     Warn,
-    add_hard_negatives,
     classes_for,
     divide,
     network_inputs_of,
-    outside_streams,
     silent,
     warn_of_files_twice,
     warn_of_single_people,
@@ -65,15 +64,10 @@ from plushsense.workflow.reporting import check_place, journal_of, save_evaluati
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from plushsense.training.engine import FitState
 
-
-# Age at which unfinished trainings are deleted: most are never resumed, and they contain data on people.
-_KEPT_S = 30 * 24 * 3600.0
-_SAVE_EVERY_S = 0.5
 # Number of windows that are predicted at once.
 _BATCH = 256
-FIRST_NETWORK = "first network"
+_PREDICTIONS = "validation"
 # Training warns if float and 8-bit predictions agree on a smaller share of the validation windows than this.
 _AGREEMENT = 0.95
 
@@ -84,39 +78,6 @@ def unfinished(dataset: Dataset | str | os.PathLike[str]) -> Journal:
         return journal_of(dataset, UNFINISHED)
     folder = Path(dataset)
     return Journal(folder / CACHE / UNFINISHED, Generation.of(folder).writing)
-
-
-class ResumableTraining:
-    """The state of one training in a journal, under an id derived from everything that the outcome depends on."""
-
-    def __init__(self, journal: Journal, network: Arch, spec: TrainSpec, train: WindowSet, watched: WindowSet) -> None:
-        from plushsense.training.fit import resolve_device
-
-        self._journal, self.before_s, self._began = journal, 0.0, time.monotonic()
-
-        settings = {"arch": network.to_dict(), "training": resolve_device(spec).key(), "vectors": train.vectors}
-        journal.prune(_KEPT_S)
-        fingerprints = [windows_fingerprint(train), windows_fingerprint(watched)]
-        self._job = job_id({"what": "training", **settings, "windows": fingerprints})
-
-    def load(self) -> FitState | None:
-        """Return the saved state, or None."""
-        entry = self._journal.find(self._job)
-        if entry is None:
-            return None
-        from plushsense.training.engine import FitState
-
-        self.before_s = float(entry["seconds"])
-        return FitState.from_arrays(entry)
-
-    def save(self, state: FitState) -> None:
-        """Save the state; do nothing if the journal cannot be written."""
-        spent = self.before_s + time.monotonic() - self._began
-        keep_if_possible(self._journal, self._job, {**state.to_arrays(), "seconds": spent})
-
-    def discard(self) -> None:
-        """Delete the saved state."""
-        self._journal.discard(self._job)
 
 
 @dataclass(frozen=True)
@@ -197,8 +158,10 @@ def train(
 ) -> Trained:
     """Train one network on a data set.
 
-    15 % of the people, chosen by the seed, are held out for validation, and the network is scored on them. With early
-    stopping they also determine when to stop, so that the scores are slightly too high; `evaluate` scores all people.
+    15 % of the people, chosen by the seed, are held out for validation: the network is scored on them, and the decision
+    settings are fitted. Then it is trained again in the same way, on everybody, and this network is returned; so the
+    scores are those of a network of fewer people. With early stopping, the validation people determine when to stop,
+    so that the scores are slightly too high, and there is no second training. `evaluate` scores all people.
     The preset ``search`` splits windows as the paper does (70/15/15), which is leaky and marked as such.
     ``context="anywhere"`` trains for live use (see `windows.anywhere`): idleness is a class, and the scored windows are
     those of whole gestures with the real signal before them.
@@ -212,8 +175,9 @@ def train(
         journal: stores the progress of the training (see `unfinished`), so that an interrupted one resumes and gives
             the same bundle. The steps after the training are repeated.
         progress: called with (epoch, maximum of epochs, the epoch's row), first for the epochs before an interruption.
-            Rows of the first network that finds hard negatives (``hard_share`` of the context "anywhere"), and of the
-            fine-tuning, have ``what``. The others have ``accuracy``, that of validation as ``scores`` counts it.
+            Rows of the first network that finds hard negatives (``hard_share`` of the context "anywhere"), of the
+            fine-tuning and of the training on everybody have ``what`` (see `workflow.networks`). The others have
+            ``accuracy``, that of validation as ``scores`` counts it.
         warn: called with a sentence for everything that is left out, and if 8-bit arithmetic changes many predictions.
     """
     given = config or from_settings(arch=arch, filters=filters, **settings)
@@ -230,60 +194,42 @@ def train(
     if config.scored_on != config.windows:
         scored = windows_for(dataset, network, config.scored_on, gestures)
     division = divide(windows, config, scored)
-    train_at, test_at = division.train, division.fold.test
-    if division.kind == WHOLE_PEOPLE:
-        # Decisions are fitted on whole streams of the validation people, which may contain recordings at rest.
-        train_at = train_at[outside_streams(windows, dataset, division.fold.subjects)[train_at]]
-    from plushsense.training.fit import fit, predict
+    from plushsense.training.fit import predict
 
-    train_on, watched = windows.take(train_at), scored.take(division.watch)
-    apart = division.split.apart
-    epoch_done = _reporting(progress, apart)
-    if division.kind == WHOLE_PEOPLE:
-        train_on = add_hard_negatives(
-            train_on, dataset, network, config.windows, config.anywhere, gestures, config.training,
-            division.fold.subjects, _reporting(progress, apart, what=FIRST_NETWORK),
-        )  # fmt: skip
-    state = None if journal is None else ResumableTraining(journal, network, config.training, train_on, watched)
-    start = state.load() if state else None
-    for row in start.history if start is not None else ():
-        epoch_done(row["epoch"], config.training.epochs, row)
-    fitted = fit(
-        train_on, watched, network, config.training, epoch_done,
-        start=start, save=state.save if state else None, save_every_s=_SAVE_EVERY_S,
+    trainer = NetworkTrainer(
+        dataset, config, network, gestures, windows, division.kind == WHOLE_PEOPLE, quantize_aware, journal,
+        _reporting(progress, division.split.apart),
     )  # fmt: skip
-    weights, scaler = fitted.weights, fitted.scaler
-    kept = calibration(network, weights, scaler, windows.x[train_at])
-    if quantize_aware:
-        from plushsense.training.quantized import fine_tune
-
-        tuned = fine_tune(train_on, network, weights, scaler, kept, config.training, quantize_aware, epoch_done)
-        weights = tuned.weights
-    test = scored.take(test_at)
-    sizes = (len(train_at), len(division.watch), len(test_at))
+    checked = trainer.train(division.train, scored.take(division.watch), division.fold.subjects)
+    final = checked
+    if division.refit:
+        final = trainer.train(np.arange(len(windows)), scored.take(division.watch[:0]), what=REFIT)
+    fitted = checked.fitted
+    test = scored.take(division.fold.test)
+    sizes = (len(checked.at), len(division.watch), len(test))
     record = FoldRecord(division.fold.name, division.fold.subjects, sizes, len(fitted.history), fitted.seconds)
 
-    def score(probabilities: NDArray[np.float32]) -> tuple[NDArray[np.int64], dict[str, Any], dict[str, Any]]:
-        predictions = gather_predictions(scored, [(division.fold.name, test_at)], [probabilities])
+    def score(probabilities: NDArray[np.float32]) -> tuple[Predictions, dict[str, Any], dict[str, Any]]:
+        predictions = gather_predictions(scored, [(division.fold.name, division.fold.test)], [probabilities])
         found = score_predictions(predictions, [record], scored.affects, division.split.apart)
-        return predictions.predicted, {name: found[name]["mean"] for name in ("accuracy", "macro_f1")}, found["nobody"]
+        return predictions, {name: found[name]["mean"] for name in ("accuracy", "macro_f1")}, found["nobody"]
 
-    predicted, means, nobody = score(predict(network, weights, scaler, test, config.training.device))
+    predictions, means, nobody = score(predict(network, checked.weights, fitted.scaler, test, config.training.device))
     scores: dict[str, Any] = {
         "split": division.kind,
         "leaky": division.split.leaky,
         "said": division.description,
-        "windows": len(test_at),
+        "windows": len(test),
         **means,
         "nobody": nobody,
         "best_epoch": fitted.best_epoch,
         "simulated": dataset.head.simulated,
         "int8": None,
     }
-    if kept:
-        integer = quantize(network, weights, scaler, Ranges.from_dict(kept))
+    if checked.ranges:
+        integer = quantize(network, checked.weights, fitted.scaler, Ranges.from_dict(checked.ranges))
         deployed, means, _ = score(integer_probabilities(integer, test.x))
-        agreement = float((deployed == predicted).mean())
+        agreement = float((deployed.predicted == predictions.predicted).mean())
         scores["int8"] = {**means, "agreement": agreement}
         if agreement < _AGREEMENT:
             advice = "more epochs of --quantize-aware" if quantize_aware else "--quantize-aware 10"
@@ -292,9 +238,9 @@ def train(
             warn(Sentence(sentence, "bits_change", percent=changed))
     bundle = Bundle(
         arch=network,
-        weights=weights,
+        weights=final.weights,
         layout=dataset.layout,
-        scaler=scaler,
+        scaler=final.fitted.scaler,
         gestures=gestures,
         windowing=_windowing(config),
         decision=config.live.to_dict(),
@@ -302,9 +248,10 @@ def train(
             "dataset": dataset.head.name,
             "dataset_hash": dataset.hash,
             "simulated": dataset.head.simulated,
-            "subjects": sorted({str(s) for s in windows.subject[train_at]}),
+            "subjects": sorted({str(s) for s in windows.subject[final.at]}),
             "validation_subjects": sorted({str(s) for s in scored.subject[division.watch]}),
             "split": division.kind,
+            "refit": division.refit,
             "context": dict(sorted(Counter(windows.context.tolist()).items())),
             "preset": config.preset,
             "training": config.training.to_dict(),
@@ -312,42 +259,58 @@ def train(
             "scores": scores,
             "code_version": __version__,
         },
-        calibration=kept,
+        calibration=final.ranges,
     )
     if fit_decisions:
-        bundle = _with_decisions(bundle, dataset, config.live, warn)
-    if state:
-        state.discard()
+        reader = replace(bundle, weights=checked.weights, scaler=fitted.scaler)
+        bundle = replace(bundle, decision=_decisions(reader, dataset, config.live, warn))
+    if division.refit:
+        _keep_predictions(bundle, dataset, predictions)
+    trainer.discard()
     # `forget` cannot find an unsaved bundle: raise an error if a person was removed during the training.
     dataset.generation.check()
-    history = with_accuracy(fitted.history, apart)
-    seconds = fitted.seconds + (state.before_s if state else 0.0)
+    history = with_accuracy(fitted.history, division.split.apart)
+    seconds = checked.seconds + (final.seconds if division.refit else 0.0)
     return Trained(bundle, history, scores, seconds, dataset.generation)
 
 
-def _reporting(progress: EpochProgress | None, apart: bool, **more: str) -> EpochProgress:
-    """Return a callback for the epochs of a training, which adds ``accuracy`` and ``more`` to their rows."""
+def _reporting(progress: EpochProgress | None, apart: bool) -> EpochProgress:
+    """Return a callback for the epochs of a training, which adds ``accuracy`` to their rows."""
 
     def report(epoch: int, epochs: int, row: dict[str, Any]) -> None:
         if progress is not None:
-            progress(epoch, epochs, with_accuracy([row], apart)[0] | more)
+            progress(epoch, epochs, with_accuracy([row], apart)[0])
 
     return report
 
 
-def _with_decisions(bundle: Bundle, dataset: Dataset, given: DecideSpec, warn: Warn) -> Bundle:
-    """Return the bundle with decision settings fitted on its validation people; unchanged if it has none."""
+def _decisions(bundle: Bundle, dataset: Dataset, given: DecideSpec, warn: Warn) -> dict[str, Any]:
+    """Return decision settings fitted on the validation people of the bundle; its own if it has none.
+
+    The weights of ``bundle`` must not have been fitted to these people.
+    """
     if bundle.provenance["split"] != WHOLE_PEOPLE:
         sentence = "decision settings are the defaults: fitting them needs whole people held out for validation"
         warn(Sentence(sentence, "no_decisions"))
-        return bundle
+        return bundle.decision
     validated, trained = (
         set(bundle.provenance[key]) - {NOBODY, UNKNOWN_SUBJECT} for key in ("validation_subjects", "subjects")
     )
     plain = DecideSpec()
     keep = {f.name for f in fields(DecideSpec) if getattr(given, f.name) != getattr(plain, f.name)}
-    decided = fit_on_people(bundle, dataset, validated, training=trained, spec=given, keep=keep)
-    return replace(bundle, decision=decided.to_dict())
+    return fit_on_people(bundle, dataset, validated, training=trained, spec=given, keep=keep).to_dict()
+
+
+def _predictions_id(bundle: Bundle) -> str:
+    weights = {name: sha256(np.ascontiguousarray(w).tobytes()).hexdigest() for name, w in bundle.weights.items()}
+    return job_id({"what": _PREDICTIONS, "dataset": bundle.provenance["dataset_hash"], "weights": weights})
+
+
+def _keep_predictions(bundle: Bundle, dataset: Dataset, predictions: Predictions) -> None:
+    """Store what the network that did not know the validation people answered, for `validation_predictions`."""
+    journal = journal_of(dataset, _PREDICTIONS)
+    journal.prune(KEPT_S)
+    keep_if_possible(journal, _predictions_id(bundle), {**vars(predictions)})
 
 
 def _windowing(config: RunConfig) -> dict[str, Any]:
@@ -433,17 +396,20 @@ def evaluate(
 
 
 def validation_predictions(bundle: Bundle, dataset: Dataset | str | os.PathLike[str]) -> Predictions:
-    """Compute what a trained network answers on the recordings of its validation people, as `train` scored it.
+    """Return what a network answered on the recordings of its validation people, as `train` scored it.
 
-    Recordings at rest are left out: which of them were held out is not stored.
+    If the network in the bundle was then trained on everybody (``refit``), these are the stored answers of the one
+    before, which are kept for 30 days; otherwise they are computed. Recordings at rest are left out.
 
     Raises:
-        DatasetError: if the bundle has no validation people, the data set was changed since the training (reason
-            ``data_changed``), or has none of their recordings.
+        DatasetError: if the bundle has no validation people or their answers are gone, the data set was changed since
+            the training (reason ``data_changed``), or has none of their recordings.
     """
     dataset = as_dataset(dataset)
     people = known_people(bundle.provenance, ["validation_subjects"])
-    if bundle.provenance.get("split") != WHOLE_PEOPLE or not people:
+    stored = journal_of(dataset, _PREDICTIONS).find(_predictions_id(bundle)) if bundle.provenance.get("refit") else None
+    lost = bundle.provenance.get("refit") and stored is None
+    if bundle.provenance.get("split") != WHOLE_PEOPLE or not people or lost:
         raise DatasetError("This network has no validation people: evaluate it instead.", reason="no_validation_people")
     if bundle.provenance.get("dataset_hash") != dataset.hash:
         raise DatasetError(
@@ -451,6 +417,10 @@ def validation_predictions(bundle: Bundle, dataset: Dataset | str | os.PathLike[
             reason="data_changed",
             name=dataset.head.name,
         )
+    if stored is not None:
+        known = ~np.isin(stored["subject"], [NOBODY, UNKNOWN_SUBJECT])
+        arrays = {key: value[known] for key, value in stored.items() if key != "labels"}
+        return Predictions(labels=tuple(stored["labels"]), **arrays)
     dataset = dataset.with_inputs(bundle.layout).with_gestures(bundle.gestures)
     # All recordings are cut, because how long a gesture usually is depends on them.
     every = windows_for(dataset, bundle.arch, whole_gestures(bundle.windowing), bundle.gestures)

@@ -231,11 +231,16 @@ def outside_streams(windows: WindowSet, dataset: Dataset, people: Collection[str
 
 
 WHOLE_PEOPLE = "validation-subjects"
+_FEWEST_APART = 3  # people; with fewer, recordings are held out for validation
 
 
 @dataclass(frozen=True)
 class TrainValidationSplit:
-    """The train/validation split of a single training; ``train`` and ``watch`` are indices of the windows of each."""
+    """The train/validation split of a single training; ``train`` and ``watch`` are indices of the windows of each.
+
+    ``refit``: whether a second network, which is the one to keep, is trained on everybody in the same way after the
+    first was scored.
+    """
 
     split: Split
     kind: str
@@ -243,10 +248,21 @@ class TrainValidationSplit:
     fold: Fold
     train: NDArray[np.int64]
     watch: NDArray[np.int64]
+    refit: bool
+
+
+def refits(config: RunConfig, people: int) -> bool:
+    """Return whether `api.train` trains a second time, on everybody: where whole people are held out for nothing else.
+
+    With early stopping, the people who are held out determine when to stop.
+    """
+    return people >= _FEWEST_APART and config.training.patience is None and config.preset != "search"
 
 
 def divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = None) -> TrainValidationSplit:
     """Hold out people for validation; with fewer than three, recordings; with the preset ``search``, windows.
+
+    Where the validation windows do not determine when to stop, ``refit`` asks for a second training on everybody.
 
     ``watch`` and the fold's ``test`` are indices into ``scored``, windows of the same recordings that may be cut with
     other settings (default: ``windows``). Except with ``search``, no scored recording is trained on.
@@ -258,11 +274,13 @@ def divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = Non
         split = parse_split("windows:holdout")
         fold = fold_windows(windows, scored, split, seed)[0]
         description = "15 % of the windows, drawn at random: leaky, windows of one recording are on both sides"
-        return TrainValidationSplit(split, split.text, description, fold, fold.train, fold.validation)
+        return TrainValidationSplit(split, split.text, description, fold, fold.train, fold.validation, False)
     people = set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}
-    if len(people) >= 3:
+    if len(people) >= _FEWEST_APART:
         split = parse_split(f"by-subject:{min(len(people), round(1 / VALIDATION_SHARE))}")
         kind, description = WHOLE_PEOPLE, f"people who were not trained on{stops}: "
+        if refits(config, len(people)):
+            description = "people who were held back from the first of two trainings: "
     else:
         recordings = len(np.unique(windows.recording))
         split = parse_split(f"by-recording:{max(2, min(recordings // 2, round(1 / VALIDATION_SHARE)))}")
@@ -272,4 +290,4 @@ def divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = Non
     if split.apart:
         description += ", ".join(fold.subjects)
     rest = np.sort(np.concatenate([fold.train, fold.validation]))
-    return TrainValidationSplit(split, kind, description, fold, rest, fold.test)
+    return TrainValidationSplit(split, kind, description, fold, rest, fold.test, refits(config, len(people)))

@@ -161,8 +161,9 @@ def _people_not_met(windows: WindowSet, bundle: Bundle, dataset: Dataset, warn: 
     if not known_people(bundle.provenance):
         warn("the bundle does not say on whom it was trained: perhaps on these people")
     met = trained_people(bundle, dataset)
-    validation = bundle.provenance.get("validation_subjects")
-    held_out = {str(code) for code in validation} if isinstance(validation, list) else set()
+    # Of a network that was trained again on everybody, the validation people are training people, too.
+    held_out = set(known_people(bundle.provenance, ["validation_subjects"]))
+    held_out -= set(known_people(bundle.provenance, ["subjects"]))
     for known in (met, met - held_out):
         theirs = np.isin(windows.subject, sorted(known))
         people = sorted(set(windows.subject[~theirs].tolist()) - {NOBODY})

@@ -197,7 +197,7 @@ export default {
       this.xs = [];
       this.ys = this.channels.map(() => []);
       this.range = this.channels.map(() => null);
-      this.spans = new Map();
+      this.spans = this.stats.spans = new Map();
       this.did = [];
       this.t = 0;
       this.chances = null;

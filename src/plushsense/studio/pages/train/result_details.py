@@ -116,8 +116,9 @@ class ResultDetailsView:
     def _training(self, d: ResultDetails) -> None:
         w, facts = self._words, d.facts
         checked = sorted(set(facts.get("validation_subjects", [])) - {NOBODY, UNKNOWN_SUBJECT})
+        held_back = "train.facts_refit" if facts.get("refit") else "train.facts_training"
         text = w(
-            "train.facts_training" if d.row.spread == HELD_BACK else "train.facts_same",
+            held_back if d.row.spread == HELD_BACK else "train.facts_same",
             trained=counted(w, "with_people", len(set(facts.get("subjects", [])) - {NOBODY, UNKNOWN_SUBJECT})),
             checked=counted(w, "with_people", len(checked)),
             names=", ".join(checked) or "–",
