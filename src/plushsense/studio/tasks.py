@@ -42,10 +42,12 @@ from plushsense.jobs.progress import JobProgress
 from plushsense.studio.app.jobs import UNFINISHED
 from plushsense.studio.pages.export.exports import folder_digest
 from plushsense.windows.cut import ANYWHERE
-from plushsense.workflow.api import simulate
+from plushsense.workflow.api import simulate, train, unfinished
 from plushsense.workflow.config import from_settings
 from plushsense.workflow.datasets import check_dataset, publish_dataset
 from plushsense.workflow.export import export
+from plushsense.workflow.networks import FIRST_NETWORK, REFIT
+from plushsense.workflow.preparation import refits
 from plushsense.workflow.reporting import check_folder
 
 
@@ -323,11 +325,6 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     out = Path(spec["out"])
     check_folder(out.parent, "A bundle")
     reporter.progress(stage="reading", share=0.0)
-
-    from plushsense.workflow.api import train, unfinished
-    from plushsense.workflow.networks import FIRST_NETWORK, REFIT
-    from plushsense.workflow.preparation import refits
-
     clock, tuning, epochs = Clock(), int(spec.get("quantize_aware", 0)), config.training.epochs
     first = epochs if config.windows.context == ANYWHERE and config.anywhere.hard_share > 0 else 0
     each, again = first + epochs + tuning, refits(config, len(open_dataset(spec["dataset"]).subjects))
@@ -370,7 +367,6 @@ def run_make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     reporter.progress(stage="reading", share=0.0)
 
     from plushsense.trials.budget import BudgetProgress, make_network
-    from plushsense.workflow.networks import FIRST_NETWORK, REFIT
     from plushsense.workflow.reporting import load_evaluation
 
     clock = Clock()
