@@ -15,12 +15,12 @@ BIN := $(VENV)/Scripts
 else
 BIN := $(VENV)/bin
 endif
-PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(PIP_FLAGS) -c constraints.txt
 
 # Tests start hundreds of processes, each of which would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-quick fuzz check docs dist setup clean
+.PHONY: demo test test-quick fuzz check docs dist setup collect clean
 
 $(VENV)/.python:
 	@$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'PlushSense needs Python 3.11 or newer, this is ' + sys.version.split()[0] + ': run  make PYTHON=/path/to/python3.11 ...')"
@@ -50,6 +50,11 @@ test: $(VENV)/.dev
 
 test-quick: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" $(PYTEST_FLAGS)
+
+# Several workers of pytest that begin together would each compile all the tests: 13 s of processor time each.
+collect: $(VENV)/.dev
+	@mkdir -p build
+	$(BIN)/python -m pytest --collect-only -q > build/collected.txt || { cat build/collected.txt; false; }
 
 FUZZ ?= 1000
 fuzz: $(VENV)/.dev

@@ -47,14 +47,28 @@ SLOW_FILES = {
     "tuning/test_gate.py",
     "tuning/test_rule_baseline.py",
 }
-LONGEST = {"test_train.py", "test_live_long.py", "test_paper_page.py"}
+# Files that take longest, the longest first. The workers begin with them: one of them begun late would end alone.
+LONGEST = (
+    "deploy/proof/test_verify.py",
+    "studio/test_train.py",
+    "cli/test_paper_page.py",
+    "studio/test_therapist.py",
+    "studio/test_live_long.py",
+    "workflow/test_demo.py",
+    "studio/test_export_page.py",
+    "studio/test_review.py",
+    "studio/test_live_page.py",
+    "studio/test_record.py",
+    "studio/test_record_whole.py",
+    "studio/test_pictures_of_pages.py",
+)
 SLOW_FIXTURES = {"real_data", "c_compiler", "target_here", "two_nodes", "lsl_possible", "publish_tools", "pty_possible"}
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Run three tests on two processors, as the tests of the studio wait a third of their time."""
-    return max(2, 3 * (os.cpu_count() or 1) // 2)
+    """Run five tests on two processors: those of the studio, of processes and of devices wait half of their time."""
+    return max(2, 5 * (os.cpu_count() or 1) // 2)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -68,12 +82,79 @@ def _in_slow_place(path: Path) -> bool:
     return place.split("/")[0] in SLOW_FOLDERS or place in SLOW_FILES
 
 
+def _place(item: pytest.Item) -> str:
+    """Return the path of a test's file within this folder."""
+    return item.path.relative_to(REPO / "tests").as_posix() if item.path.is_relative_to(REPO / "tests") else ""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that `make test-quick` leaves out; begin with the longest and with others that wait a lot."""
-    items.sort(key=lambda item: (item.path.parent.name != "studio", item.path.name not in LONGEST))
+    """Mark the tests that `make test-quick` leaves out, and put the longest first."""
     for item in items:
         if _in_slow_place(item.path) or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
+    items[:] = _dealt(items, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
+
+
+def _dealt(items: list[pytest.Item], workers: int) -> list[pytest.Item]:
+    """Deal the files to the workers, in turn the longest, then those of the studio, which wait, then the others.
+
+    `--dist worksteal` cuts the list into one part for each worker; all parts are equally long in tests.
+    """
+    files: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(_place(item), []).append(item)
+    longest = [name for name in LONGEST if name in files]
+    waiting = [name for name in files if name.startswith("studio/") and name not in LONGEST]
+    parts: list[list[pytest.Item]] = [[] for _ in range(workers)]
+    for at, name in enumerate([*longest, *waiting]):
+        parts[at % workers] += files.pop(name)
+    rest = [item for tests in files.values() for item in tests]
+    for at, part in enumerate(parts):
+        size = (len(items) - sum(map(len, parts[:at]))) // (workers - at)
+        room = max(0, size - len(part))
+        part += rest[:room]
+        del rest[:room]
+    return [item for part in parts for item in part] + rest
+
+
+# The largest memory of the process of each worker, in MB.
+PEAKS = pytest.StashKey[dict[str, float]]()
+
+
+def _peak_mb() -> float:
+    """Return the largest resident memory of this process so far, in MB; 0 where the system does not say it."""
+    with contextlib.suppress(OSError, IndexError):
+        return int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 1000
+    return 0.0
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Have all threads share two arenas of memory: each arena keeps what was freed in it."""
+    config.stash[PEAKS] = {}
+    # M_ARENA_MAX of glibc.
+    with contextlib.suppress(OSError, TypeError, AttributeError):
+        ctypes.CDLL(None).mallopt(-8, 2)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Hand the largest memory of this worker to the process that writes the summary."""
+    output = getattr(session.config, "workeroutput", None)
+    if output is not None:
+        output["peak_mb"] = _peak_mb()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Keep what a worker said of its memory."""
+    node.config.stash[PEAKS][node.gateway.id] = getattr(node, "workeroutput", {}).get("peak_mb", 0.0)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Print the largest memory of each process that ran tests; the aim is less than 600 MB."""
+    peaks = config.stash[PEAKS] or {"pytest": _peak_mb()}
+    if any(peaks.values()):
+        text = ", ".join(f"{name} {mb:.0f} MB" for name, mb in sorted(peaks.items()))
+        terminalreporter.write_line(f"largest memory of the test processes: {text}")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -22,7 +22,6 @@ from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.image import memory_bytes
 from plushsense.windows.cut import whole_gestures
-from plushsense.workflow.estimator import labels_from
 from plushsense.workflow.reporting import card
 from support.bundles import contents, mutated, mutated_weights, signed
 from support.exports import bundle_of
@@ -94,6 +93,9 @@ def changed(content: dict[str, Any], weights: dict[str, Any], rng: random.Random
 
 def use(data: bytes, frames: np.ndarray[Any, Any], golden: bool) -> None:
     """All that is done with a bundle: read, described, run for a second in floats and in 8 bits, written as C."""
+    # It loads scikit-learn, which no other worker needs for this.
+    from plushsense.workflow.estimator import labels_from
+
     bundle = Bundle.from_bytes(data)
     layout = bundle.layout
     labels = list(bundle.gestures.labels)

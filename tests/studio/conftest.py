@@ -19,6 +19,7 @@ import pytest
 from support.browsing import CHROMIUM, DESK, Look, Studio, find_chromium, is_own
 from support.requirements import missing
 from support.sharing import built_once
+from support.trainings import train_apart
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, BrowserContext, Page
@@ -155,7 +156,6 @@ def shots() -> Callable[[Page, str], None]:
 @pytest.fixture(scope="session")
 def furniture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A studio's folder with a data set of six virtual people and a small trained bundle; read only: take a `copy`."""
-    import plushsense as ps
     from plushsense.workflow.api import simulate
 
     def build(home: Path) -> None:
@@ -163,7 +163,8 @@ def furniture(tmp_path_factory: pytest.TempPathFactory) -> Path:
         simulate(home / "made", people=6, repetitions=1, dataset=dataset)
         shutil.rmtree(home / "made")
         (home / "bundles").mkdir()
-        ps.train(dataset, preset="loso", epochs=12, context="anywhere").save(home / "bundles" / "little.plush")
+        options = ("--preset", "loso", "--epochs", "12", "--context", "anywhere")
+        train_apart(dataset, home / "bundles" / "little.plush", *options)
 
     return built_once(tmp_path_factory, "furniture", build)
 

@@ -1,8 +1,8 @@
-"""Ten minutes of a virtual toy at twenty times the speed: every gesture is seen with its affect, and nothing grows.
+"""Minutes of a virtual toy at twenty times the speed: every gesture is seen with its affect, and nothing grows.
 
 What is asked of the bundle is honest only for the virtual toy: it was trained on ten of its people and reads one
 whom it never met. Where this was written it found all 69 gestures of the ten minutes; one in fifty may be missed, since
-another machine rounds otherwise. A desk runs two minutes of them, CI all ten.
+another machine rounds otherwise. CI runs four of the minutes, a desk two, and with PLUSHSENSE_SOAK it is all ten.
 """
 
 from __future__ import annotations
@@ -23,10 +23,12 @@ from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.live.loop import run_live
 from plushsense.models.bundle import Bundle
 from support.browsing import marked
+from support.requirements import LONG
+from support.trainings import train_apart
 
 Fixture = Callable[..., Any]
 SPEED = 20.0
-TOY_S = 600.0 if os.environ.get("PLUSHSENSE_REQUIRE") else 120.0
+TOY_S = 600.0 if LONG else 240.0 if os.environ.get("PLUSHSENSE_REQUIRE") else 120.0
 TOY = "virtual://?person=31&seed=1"
 # An event may be told so long after the hand has gone.
 LATE_S = 1.5
@@ -39,13 +41,14 @@ _ROWS = (
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bundle trained on ten virtual people, as the train page does it."""
-    import plushsense as ps
     from plushsense.workflow.api import simulate
 
     folder = tmp_path_factory.mktemp("reader")
     simulate(folder / "made", people=10, repetitions=1, dataset=folder / "set")
-    trained = ps.train(folder / "set", preset="people", epochs=30, context="anywhere")
-    return trained.save(folder / "reader.plush")
+    train_apart(
+        folder / "set", folder / "reader.plush", "--preset", "people", "--epochs", "30", "--context", "anywhere"
+    )
+    return folder / "reader.plush"
 
 
 def played(bundle: Bundle) -> tuple[list[tuple[str, float, float]], list[tuple[float, str, str | None]]]:
@@ -110,13 +113,12 @@ def test_every_gesture_is_seen_with_its_affect_and_nothing_grows(
     total = sum(1 for label, _, end in done if label in made and end <= TOY_S - LATE_S - 2.5)
     assert len(missed) <= total // 50, missed
     assert total >= TOY_S / 12.0
-    if TOY_S >= 600.0:
-        assert len(made) >= 16, "in ten minutes nearly every gesture of the set is made"
+    assert len(made) >= min(16, TOY_S / 24.0), "in ten minutes nearly every gesture of the set is made"
 
     # All samples came, in messages that were no more than needed.
     assert told[1] >= 0.98 * 100 * TOY_S
     # Nothing grows with what was seen: three quarters of a minute's raw rows would be more than this.
-    if len(memory) > 9 and TOY_S >= 600.0:
+    if len(memory) > 9 and TOY_S >= 240.0:
         server_mb = bench.growth(memory[2:]) if linux else {"first_mb": 0.0, "last_mb": 0.0}
         page_mb = bench.growth(heap[2:])
         assert server_mb["last_mb"] - server_mb["first_mb"] < 12.0, server_mb

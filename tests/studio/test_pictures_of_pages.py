@@ -174,7 +174,7 @@ def furnished(furniture: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
         record(Workspace(home), "S01")
         data = home / "datasets" / "virtual"
         out = data / "evaluations" / "by-subject-3"
-        ps.evaluate(data, split="by-subject:3", preset="loso", epochs=8, workers=1, out=out)
+        ps.evaluate(data, split="by-subject:3", preset="loso", epochs=8 if KEPT else 1, workers=1, out=out)
 
     home = built_once(tmp_path_factory, "pictures", build) / "home"
     one = Studio(Path(shutil.copytree(home, tmp_path_factory.mktemp("pictures") / "home")), ("--speed", "4")).start()

@@ -1,5 +1,6 @@
-"""The paper's session, 51 recordings with the space bar of a real browser, over a pseudo terminal: reloaded on the way,
-and the server killed on the way."""
+"""The paper's gestures with the space bar of a real browser, over a pseudo terminal: reloaded and the server killed on
+the way. Each once; with PLUSHSENSE_SOAK it is the paper's session, 51 recordings, which the command makes in CI, too
+(`tests/recording/test_whole_session.py`)."""
 
 from __future__ import annotations
 
@@ -15,13 +16,16 @@ from plushsense.devices.virtual.session import GESTURES
 from plushsense.recording.session_files import SESSION_LOG, SessionHead, read_events
 from support.browsing import connected, marked
 from support.pty_toys import check_whole, pty_toy, recordings
-from support.recording_pages import showing, start_recording
+from support.recording_pages import choose, showing, start_recording
+from support.requirements import LONG
 from support.waiting import until
 
 Fixture = Callable[..., Any]
 pytestmark = pytest.mark.usefixtures("pty_possible")
 SPEED = 20.0
-RELOADED, KILLED = 17, 34
+REPETITIONS = 3 if LONG else 1
+TOTAL = REPETITIONS * len(GESTURES)
+RELOADED, KILLED = TOTAL // 3, 2 * TOTAL // 3
 
 
 def logged(folder: Path) -> list[str]:
@@ -29,20 +33,24 @@ def logged(folder: Path) -> list[str]:
     return [e.kind for e in read_events(folder)]
 
 
-def test_51_recordings_by_the_space_bar(studio: Fixture, look: Fixture, shots: Fixture, tmp_path: Path) -> None:
+def test_a_whole_session_by_the_space_bar(studio: Fixture, look: Fixture, tmp_path: Path) -> None:
     folder = tmp_path / "home" / "recordings" / "S01" / "1"
+    own = tmp_path / "home" / "protocols" / "whole.toml"
+    own.parent.mkdir(parents=True)
+    own.write_text(f'name = "whole"\ngesture_set = "plush-18"\nrepetitions = {REPETITIONS}\n', encoding="utf-8")
     with pty_toy(folder / SESSION_LOG, SPEED) as toy:
         server = studio("--device", toy.url, "--speed", f"{SPEED:g}")
         browser = look()
         page = browser.open(server.url + "/record")
         marked(page, "code").fill("S01")
+        choose(page, "protocol", "whole")
         page.get_by_text("More settings").click()
         page.get_by_text("This is a virtual toy").click()
         marked(page, "begin").click()
         page.wait_for_url("**/record?session=S01/1")
         connected(page)
         killed = False
-        for number in range(51):
+        for number in range(TOTAL):
             runs = start_recording(page, number)
             if number == RELOADED:
                 page.reload()
@@ -68,16 +76,16 @@ def test_51_recordings_by_the_space_bar(studio: Fixture, look: Fixture, shots: F
             if runs:
                 page.keyboard.press("Space")
             showing(page, f"idle.{number + 1}.", "finished.")
-        showing(page, "finished.50.51.0.0")
-        assert marked(page, "progress").inner_text() == "51 of 51 recorded"
+        showing(page, f"finished.{TOTAL - 1}.{TOTAL}.0.0")
+        assert marked(page, "progress").inner_text() == f"{TOTAL} of {TOTAL} recorded"
         marked(page, "main").click()
         page.wait_for_url("**/record?ended=S01/1")
-        assert "S01/1 is finished: 51 of 51" in marked(page, "message").inner_text()
-    assert check_whole(folder, toy) == 51
+        assert f"S01/1 is finished: {TOTAL} of {TOTAL}" in marked(page, "message").inner_text()
+    assert check_whole(folder, toy) == TOTAL
     made = Counter(n.label for p in recordings(folder) if (n := parse_name(p.name)) is not None)
-    assert made == dict.fromkeys(GESTURES, 3)
+    assert made == dict.fromkeys(GESTURES, REPETITIONS)
     events = Counter(e.kind for e in read_events(folder))
-    assert (events["take"], events["redo"], events["unfinished"], events["finished"]) == (51, 0, 1, 1)
+    assert (events["take"], events["redo"], events["unfinished"], events["finished"]) == (TOTAL, 0, 1, 1)
     head = SessionHead.read(folder)
     assert head is not None and head.simulated
     # The connection broke once; nothing else was wrong.

@@ -1,4 +1,4 @@
-"""Skip a test for what this machine lacks, or fail where it must be here."""
+"""Skip a test for what this machine lacks, or fail where it must be here; and whether tests take their long form."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import os
 import pytest
 
 REQUIRED = {word.strip() for word in os.environ.get("PLUSHSENSE_REQUIRE", "").split(",") if word.strip()}
+LONG = bool(os.environ.get("PLUSHSENSE_SOAK"))
+"""Whether tests that have a long form take it, as `make soak` asks them to."""
 
 
 def missing(what: str, reason: str) -> None:

@@ -23,7 +23,6 @@ from plushsense.evaluation.crossval import fold_windows
 from plushsense.models.reference import softmax
 from plushsense.scoring.splits import Splitter, parse_split
 from plushsense.windows.cut import WindowSpec
-from plushsense.workflow.estimator import balanced_by_class, labels_from
 
 pytestmark = pytest.mark.usefixtures("scikit_learn")
 SRC = Path(__file__).resolve().parents[2] / "src"
@@ -163,6 +162,8 @@ def test_weights_count_windows_and_their_order_does_not_matter() -> None:
 
 
 def test_balanced_classes_count_alike() -> None:
+    from plushsense.workflow.estimator import balanced_by_class
+
     y, weights = np.array(["a", "a", "a", "b"]), np.array([1.0, 1.0, 2.0, 1.0])
     assert balanced_by_class(weights, y, "balanced").tolist() == [0.625, 0.625, 1.25, 2.5]
     assert balanced_by_class(weights, y, {"b": 3.0}).tolist() == [1.0, 1.0, 2.0, 3.0]
@@ -404,6 +405,8 @@ def test_forget_finds_a_classifier_that_was_told_whose_windows_they_are(dataset:
 
 @pytest.mark.parametrize("dtype", [65536, "V99999999", "x", None, "<U999999"])
 def test_class_labels_that_do_not_fit_are_refused(dtype: object) -> None:
+    from plushsense.workflow.estimator import labels_from
+
     gestures = GestureSet("two", (Gesture("a"), Gesture("b")))
     provenance = {"estimator": {"labels": ["a", "b"], "dtype": dtype}}
     with pytest.raises(BundleError):
