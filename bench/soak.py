@@ -5,13 +5,13 @@
 A virtual toy (100 Hz, no lost lines) is played as fast as it is read. Each part is a process of its own:
 
 - ``frames`` writes the toy's frames to a file, which the other parts are compared with.
-- ``record`` records them as one session with automatic recordings of five seconds, and reads the session's stream again:
-  every frame must be in it, once and in order, and every recording must be a part of it.
+- ``record`` records them as one session with automatic recordings of five seconds, and reads the session's stream
+  again: every frame must be in it, once and in order, and every recording must be a part of it.
 - ``live`` classifies them with the float network. Its decisions of the whole last hour, and one of every minute before,
   are compared with the network's answers to whole windows of the resampled stream.
-- ``chip`` computes the deployed model twice: in Python (``runtime``), for the first `--python-hours`, and with the emitted
-  C, compiled by ``gcc`` for this machine, for all. All rows (answers, events, sensor health) must be equal. The clock
-  begins so that it passes 2^32 ms, as that of a toy that runs for 49.7 days, in the middle of what is compared.
+- ``chip`` computes the deployed model twice: in Python (``runtime``), for the first `--python-hours`, and with the
+  emitted C, compiled by ``gcc`` for this machine, for all. All rows (answers, events, sensor health) must be equal. The
+  clock begins so that it passes 2^32 ms, as that of a toy that runs for 49.7 days, in the middle of what is compared.
 
 The resident memory is sampled every ten minutes of toy time; its slope is that of a straight line from the second hour
 on (from the first third on, in shorter runs). Without `--model` a small network is trained on four virtual people. The

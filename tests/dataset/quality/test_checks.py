@@ -88,7 +88,8 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def copy(clean: Path, tmp_path: Path) -> Path:
-    shutil.copytree(clean, tmp_path / "DS")
+    """A copy without the stamp, which would refuse raw files that are changed after the import."""
+    shutil.copytree(clean, tmp_path / "DS", ignore=shutil.ignore_patterns("index.json"))
     return tmp_path / "DS"
 
 
