@@ -7,8 +7,8 @@ A virtual toy (100 Hz, no lost lines) is played as fast as it is read. Each part
 - ``frames`` writes the toy's frames to a file, which the other parts are compared with.
 - ``record`` records them as one session with automatic recordings of five seconds, and reads the session's stream
   again: every frame must be in it, once and in order, and every recording must be a part of it.
-- ``live`` classifies them with the float network. Its decisions of the whole last hour, and one of every minute before,
-  are compared with the network's answers to whole windows of the resampled stream.
+- ``live`` classifies them with the float network. Its decisions of the last quarter of an hour, and one of every minute
+  before, are compared with the network's answers to whole windows of the resampled stream.
 - ``chip`` computes the deployed model twice: in Python (``runtime``), for the first `--python-hours`, and with the
   emitted C, compiled by ``gcc`` for this machine, for all. All rows (answers, events, sensor health) must be equal. The
   clock begins so that it passes 2^32 ms, as that of a toy that runs for 49.7 days, in the middle of what is compared.
@@ -62,6 +62,7 @@ EVERY_S = 600.0
 BLOCK = 6000
 WRAP = 1 << 32
 SHORTEST_H = 0.02
+AT_END_US = 900_000_000
 LONG_H, MOST_KB = 8.0, 1000.0
 
 
@@ -193,7 +194,7 @@ def live(work: Path, hours: float, model: Path) -> dict[str, Any]:
 
 
 def compare_with_batch(work: Path, hours: float, model: Path) -> dict[str, Any]:
-    """Compare the decisions of `live` with the network's answers to whole windows: the last hour, and each minute."""
+    """Compare the decisions of `live` with the network's answers to whole windows: the end, and each minute."""
     bundle, table = Bundle.load(model), read_frames(work)
     arch, network, layout = bundle.arch, bundle.network(), bundle.layout
     found = np.memmap(work / "decisions.bin", dtype="<i4", mode="r").reshape(-1, 1 + arch.classes)
@@ -203,8 +204,8 @@ def compare_with_batch(work: Path, hours: float, model: Path) -> dict[str, Any]:
         inputs = network_inputs(segment.data, layout)
         n = np.arange(arch.span, len(inputs) + 1, arch.step)
         at_us = segment.start_us + (n - 1) * segment.period_us
-        last_hour = at_us > int(times[-1]) * 1000 - 3_600_000_000
-        chosen = n[last_hour | (np.arange(len(n)) % (60 * RATE_HZ // arch.step) == 0)]
+        at_end = at_us > int(times[-1]) * 1000 - AT_END_US
+        chosen = n[at_end | (np.arange(len(n)) % (60 * RATE_HZ // arch.step) == 0)]
         rows = np.searchsorted(found[:, 0], (segment.start_us + (chosen - 1) * segment.period_us) // 1000 - times[0])
         for at in range(0, len(chosen), 256):
             ends = chosen[at : at + 256]

@@ -19,7 +19,7 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any, Literal
@@ -84,10 +84,12 @@ def _run(words: list[str], place: Path, said: Path, fault: Fault, at: int) -> No
     (place / "tmp").mkdir(exist_ok=True)
     tempfile.tempdir = str(place / "tmp")
     os.environ["TMPDIR"] = str(place / "tmp")
-    count, below = 0, os.fspath(place)
+    over, count, below = False, 0, os.fspath(place) + os.sep
 
     def operation(kind: str) -> None:
         nonlocal count
+        if over:
+            return
         count += 1
         if fault == "kill" and count == at:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -111,7 +113,7 @@ def _run(words: list[str], place: Path, said: Path, fault: Fault, at: int) -> No
     os.fsync = flush
     sys.addaudithook(hook)
     status = importlib.import_module("plushsense.cli.main").main(words)
-    at = -1
+    over = True
     sys.stdout.flush()
     (said / "operations").write_text(str(count))
     os._exit(status)
@@ -121,15 +123,17 @@ def _run(words: list[str], place: Path, said: Path, fault: Fault, at: int) -> No
 class Drill:
     """A command to drill.
 
-    ``words`` are its arguments for files below a folder; ``outcome`` returns what must be the same after any fault as
-    in an undisturbed run, from the folder and the last run. Files in ``raw`` must never change. ``fresh`` are folders
-    whose names differ in every run.
+    ``words`` are its arguments for files below a folder; ``outcome`` returns, from the folder and the last run, what
+    must be the same after any fault as after an undisturbed run. Files in the folders ``raw`` must never change. The
+    names of what ``names_differ`` begins with differ from run to run. With ``once``, the command refuses when it is
+    given again although it was done, and its outcome is that of the files alone.
     """
 
     words: Callable[[Path], list[str]]
     outcome: Callable[[Path, Ran], Any]
     raw: tuple[str, ...] = ("src", "DS/recordings", "DS/streams")
-    names_differ: tuple[str, ...] = field(default=())
+    names_differ: tuple[str, ...] = ()
+    once: bool = False
 
 
 def contents(folder: Path, *, without: tuple[str, ...] = ()) -> dict[str, str]:
