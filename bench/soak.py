@@ -1,6 +1,6 @@
 """Run a day of toy time through the recorder, the live classification and the emitted C, and watch their memory.
 
-    python bench/soak.py [--hours 24] [--parts record,live,chip] [--model BUNDLE] [--work DIR] [--json]
+    python bench/soak.py [--hours 24] [--parts record,live,chip,studio] [--model BUNDLE] [--work DIR] [--json]
 
 A virtual toy (100 Hz, no lost lines) is played as fast as it is read. Each part is a process of its own:
 
@@ -12,6 +12,7 @@ A virtual toy (100 Hz, no lost lines) is played as fast as it is read. Each part
 - ``chip`` computes the deployed model twice: in Python (``runtime``), for the first `--python-hours`, and with the
   emitted C, compiled by ``gcc`` for this machine, for all. All rows (answers, events, sensor health) must be equal. The
   clock begins so that it passes 2^32 ms, as that of a toy that runs for 49.7 days, in the middle of what is compared.
+- ``studio`` plays a toy to the page Live in real time for `--studio-hours`, see `studio.py`; Chromium is required.
 
 The resident memory is sampled every ten minutes of toy time; its slope is that of a straight line from the second hour
 on (from the first third on, in shorter runs). Without `--model` a small network is trained on four virtual people. The
@@ -53,7 +54,7 @@ from plushsense.windows.clock import resample
 from plushsense.windows.features import network_inputs
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from studio import resident_bytes
+from studio import measure, resident_bytes
 from support.c_toy import C_FOLDER, TOY_C, library_of, seat
 
 TOY = "virtual://?person=31&seed=1&speed=0&lost=0&garbled=0"
@@ -264,11 +265,17 @@ def chip(work: Path, hours: float, model: Path, python_hours: float = float("inf
     }
 
 
+def studio(work: Path, hours: float, model: Path) -> dict[str, Any]:
+    """Show a toy in the studio for so many hours of real time; measure the memory of server and page."""
+    return measure(model, 1.0, hours * 3600.0, "memory")
+
+
 PARTS: dict[str, Callable[..., dict[str, Any]]] = {
     "record": record,
     "live": live,
     "batch": compare_with_batch,
     "chip": chip,
+    "studio": studio,
     "frames": lambda work, hours, model: write_frames(work, hours),
 }
 
@@ -314,7 +321,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="A day of toy time through recorder, live classification and C.")
     parser.add_argument("--hours", type=float, default=24.0, help="toy time in hours (24)")
     parser.add_argument("--python-hours", type=float, default=24.0, help="of which Python computes the chip's (24)")
-    parser.add_argument("--parts", default="record,live,chip", help="what to run (record,live,chip)")
+    parser.add_argument("--studio-hours", type=float, default=1.0, help="real time of the studio in hours (1)")
+    parser.add_argument("--parts", default="record,live,chip,studio", help="what to run (record,live,chip,studio)")
     parser.add_argument("--model", type=Path, metavar="BUNDLE", help="bundle to run (default: a small one is trained)")
     parser.add_argument("--work", type=Path, metavar="DIR", help="folder for its files, about 1.7 GB for a day")
     parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
@@ -332,7 +340,8 @@ def main() -> int:
         found: dict[str, Any] = {"hours": args.hours, "cores": os.cpu_count()}
         for part in ("frames", *args.parts.split(",")):
             for name in ("live", "batch") if part == "live" else (part,):
-                found[name] = run_part(name, work, args.hours, model, args.python_hours)
+                hours = args.studio_hours if name == "studio" else args.hours
+                found[name] = run_part(name, work, hours, model, args.python_hours)
                 if not args.json:
                     print(f"{name}: {json.dumps(found[name])}", flush=True)
     finally:

@@ -22,7 +22,7 @@ import pytest
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name, read_stream
 from plushsense.recording.session_files import read_events
-from support.drills import REPETITIONS, Drill, Fault, Ran, contents, names, run
+from support.drills import REPETITIONS, Drill, Fault, Ran, appending, contents, names, run, server, start
 
 pytestmark = [
     pytest.mark.skipif(sys.platform == "win32", reason="a process cannot be forked there"),
@@ -199,3 +199,31 @@ def test_given_again_it_does_what_it_does_undisturbed(
     assert ran.status == 0 or (drill.once and "already" in ran.sentence), (points, ran)
     assert drill.outcome(place, ran) == expected, points
     assert names(place, drill.names_differ) == names(reference, drill.names_differ), points
+
+
+@pytest.mark.parametrize("name", DRILLS if REPETITIONS > 1 else ("record", "import", "check", "evaluate"))
+def test_two_at_once_leave_what_one_leaves(
+    name: str, base: Path, undisturbed: Callable[[str], Any], tmp_path: Path
+) -> None:
+    """Two programs do the same at the same time: each does it, or says in one sentence that another one does."""
+    drill, (reference, _, expected) = DRILLS[name], undisturbed(name)
+    place = Path(shutil.copytree(base, tmp_path / name))
+    both = [start(drill.words(place), place) for _ in range(2)]
+    ran = [end() for end in both]
+    assert all(r.status == 0 or r.sentence for r in ran), ran
+    done = [r for r in ran if r.status == 0]
+    assert done, ran
+    assert all(drill.outcome(place, r) == expected for r in done)
+    assert names(place, drill.names_differ) == names(reference, drill.names_differ)
+
+
+def test_marks_of_several_programs_are_all_kept(tmp_path: Path) -> None:
+    count = 40 * REPETITIONS
+    programs = [server().Process(target=appending, args=(tmp_path, who, count)) for who in "abc"]
+    for program in programs:
+        program.start()
+    for program in programs:
+        program.join()
+    marks = [json.loads(line) for line in (tmp_path / "marks.jsonl").read_text().splitlines()]
+    for who in "abc":
+        assert [m["start"] for m in marks if m["who"] == who] == list(range(count))

@@ -24,6 +24,8 @@ from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any, Literal
 
+from plushsense.dataset.marks import Mark, append_marks
+
 REPETITIONS = int(os.environ.get("PLUSHSENSE_DRILLS", "1"))
 """Drills of each command; ``make soak`` sets more."""
 
@@ -64,16 +66,23 @@ def server() -> ForkServerContext:
 
 def run(words: list[str], place: Path, fault: Fault = "", at: int = 0) -> Ran:
     """Run a command whose files are all below ``place``, with a fault at its operation number ``at``."""
-    said = place.parent / f"{place.name}.said"
-    said.mkdir(exist_ok=True)
+    return start(words, place, fault, at)()
+
+
+def start(words: list[str], place: Path, fault: Fault = "", at: int = 0) -> Callable[[], Ran]:
+    """Start a command as `run` does; the returned function waits for its end."""
+    said = Path(tempfile.mkdtemp(dir=place.parent))
     child = server().Process(target=_run, args=(words, place, said, fault, at))
     child.start()
-    child.join()
-    texts = {name: (said / name).read_text() if (said / name).exists() else "" for name in ("out", "err", "operations")}
-    shutil.rmtree(said)
-    status = child.exitcode
-    assert status is not None
-    return Ran(status, texts["out"], texts["err"], int(texts["operations"] or 0))
+
+    def end() -> Ran:
+        child.join()
+        texts = {path.name: path.read_text() for path in said.iterdir()}
+        shutil.rmtree(said)
+        assert child.exitcode is not None
+        return Ran(child.exitcode, texts["out"], texts["err"], int(texts.get("operations", 0)))
+
+    return end
 
 
 def _run(words: list[str], place: Path, said: Path, fault: Fault, at: int) -> None:
@@ -134,6 +143,12 @@ class Drill:
     raw: tuple[str, ...] = ("src", "DS/recordings", "DS/streams")
     names_differ: tuple[str, ...] = ()
     once: bool = False
+
+
+def appending(folder: Path, who: str, count: int) -> None:
+    """Append marks of ``who`` one by one, as a program of its own does."""
+    for number in range(count):
+        append_marks(folder, [Mark("P1/Slow_1", "trim", who, start=number, stop=500 + number)])
 
 
 def contents(folder: Path, *, without: tuple[str, ...] = ()) -> dict[str, str]:
