@@ -24,12 +24,9 @@ from plushsense.core.recorder_csv import STREAM_NAME, parse_name, read_stream
 from plushsense.recording.session_files import read_events
 from support.drills import REPETITIONS, Drill, Fault, Ran, appending, contents, names, run, server, start
 
-pytestmark = [
-    pytest.mark.skipif(sys.platform == "win32", reason="a process cannot be forked there"),
-    pytest.mark.usefixtures("publish_tools"),
-]
-SHORT = 'name = "short"\ngesture_set = "plush-18"\ngestures = ["Tail tap 1", "Hold strong"]\nrepetitions = 2\n'
-TRAINED = ["--epochs", "1", "--workers", "1", "--context", "loop", "--json"]
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a process cannot be forked there")
+PROTOCOL = 'name = "short"\ngesture_set = "plush-18"\ngestures = ["Tail tap 1", "Hold strong"]\nrepetitions = 2\n'
+SHORT = "--epochs 1 --workers 1 --context loop --json"
 
 
 def recorded(place: Path, ran: Ran) -> Any:
@@ -74,75 +71,34 @@ def data_set(name: str) -> Callable[[Path, Ran], Any]:
 
 DRILLS = {
     "record": Drill(
-        lambda p: [
-            *("record", str(p / "out"), "--device", "virtual://?person=3&speed=0&lost=0&garbled=0", "--subject", "S01"),
-            *("--protocol", str(p / "short.toml"), "--auto", "0.5", "--speed", "0", "--json"),
-        ],
+        "record DIR/out --device 'virtual://?person=3&speed=0&lost=0&garbled=0' --speed 0 --auto 0.5 --subject S01 "
+        "--protocol DIR/short.toml --json",
         recorded,
         names_differ=("out/S01/1/",),
     ),
-    "import": Drill(
-        lambda p: ["import", str(p / "src"), str(p / "new"), "--layout", "accel-3"], data_set("new"), once=True
-    ),
-    "check": Drill(
-        lambda p: ["check", str(p / "DS"), "--json"],
-        lambda place, ran: (ran.json["findings"], data_set("DS")(place, ran)),
-    ),
-    "evaluate": Drill(
-        lambda p: ["evaluate", str(p / "DS"), "--filters", "2,3,3", "--split", "by-subject:2", *TRAINED], evaluated
-    ),
+    "import": Drill("import DIR/src DIR/new --layout accel-3", data_set("new"), once=True),
+    "check": Drill("check DIR/DS --json", lambda place, ran: (ran.json["findings"], data_set("DS")(place, ran))),
+    "evaluate": Drill(f"evaluate DIR/DS --filters 2,3,3 --split by-subject:2 {SHORT}", evaluated),
     "sweep": Drill(
-        lambda p: [
-            *(
-                "sweep",
-                str(p / "DS"),
-                "--architectures",
-                "126d2,83d1_84d2",
-                "--filters",
-                "4,6,8,8",
-                "--batches",
-                "full",
-            ),
-            *("--split", "by-subject:2", "--seeds", "1", *TRAINED[:4], "--json"),
-        ],
+        f"sweep DIR/DS --architectures 126d2,83d1_84d2 --filters 4,6,8,8 --batches full --split by-subject:2 {SHORT}",
         swept,
     ),
     "publish": Drill(
-        lambda p: [
-            *(
-                "publish",
-                str(p / "DS"),
-                str(p / "package"),
-                "--licence",
-                "CC-BY-4.0",
-                "--contact",
-                "Ada <a@example.org>",
-            ),
-            *("--consent", "all agreed", "--key", str(p / "key"), "--no-reidentification", "--json"),
-        ],
+        "publish DIR/DS DIR/package --licence CC-BY-4.0 --contact 'Ada <a@example.org>' --consent 'all agreed' "
+        "--key DIR/key --no-reidentification",
         lambda place, ran: contents(place / "package" / "data", without=("index.json",)),
         once=True,
     ),
-    "export": Drill(
-        lambda p: ["export", str(p / "model.plush"), str(p / "C"), "--json"],
-        lambda place, ran: contents(place / "C"),
-        once=True,
-    ),
+    "export": Drill("export DIR/model.plush DIR/C", lambda place, ran: contents(place / "C"), once=True),
     "adapt": Drill(
-        lambda p: ["adapt", str(p / "model.plush"), str(p / "S99"), "--out", str(p / "me.plush")],
+        "adapt DIR/model.plush DIR/S99 --out DIR/me.plush",
         lambda place, ran: contents(place, without=("src", "DS", "tmp", "S99")),
         once=True,
     ),
     "forget": Drill(
-        lambda p: ["forget", str(p / "DS"), "P2", "--yes", "--json"],
-        data_set("DS"),
-        raw=("src", "DS/recordings/P1", "DS/streams/P1", "DS/recordings/P3"),
+        "forget DIR/DS P2 --yes", data_set("DS"), raw=("src", "DS/recordings/P1", "DS/streams/P1", "DS/recordings/P3")
     ),
-    "backup": Drill(
-        lambda p: ["backup", str(p / "DS"), str(p / "copy.zip"), "--json"],
-        packed,
-        once=True,
-    ),
+    "backup": Drill("backup DIR/DS DIR/copy.zip", packed, once=True),
 }
 
 
@@ -158,20 +114,22 @@ def base(recordings: Path, imported: Path, bundle: Path, tmp_path_factory: pytes
     (folder / "S99").mkdir()
     for path in [*folder.glob("src/P[1-3]/Rest_*.csv"), *folder.glob("src/P[1-3]/Slow_*.csv")]:
         shutil.copy(path, folder / "S99" / path.name.replace("Slow", "Fast"))
-    (folder / "short.toml").write_text(SHORT)
+    (folder / "short.toml").write_text(PROTOCOL)
     (folder / "tmp").mkdir()
     return folder
 
 
 @pytest.fixture(scope="module")
-def undisturbed(base: Path) -> Callable[[str], tuple[Path, Ran, Any]]:
+def undisturbed(base: Path, request: pytest.FixtureRequest) -> Callable[[str], tuple[Path, Ran, Any]]:
     """The folder after an undisturbed run of a command, the run, and its outcome."""
     done: dict[str, tuple[Path, Ran, Any]] = {}
 
     def found(name: str) -> tuple[Path, Ran, Any]:
         if name not in done:
+            if name == "publish":
+                request.getfixturevalue("publish_tools")
             place = Path(shutil.copytree(base, base.parent / name))
-            ran = run(DRILLS[name].words(place), place)
+            ran = run(DRILLS[name].command(place), place)
             assert ran.status == 0, ran.err
             done[name] = place, ran, DRILLS[name].outcome(place, ran)
         return done[name]
@@ -191,7 +149,7 @@ def test_given_again_it_does_what_it_does_undisturbed(
     raw = {folder: contents(place / folder) for folder in drill.raw}
     points = sorted(drawn.sample(range(1, whole.operations + 1), min(2, whole.operations)))
     for at in [*points, 0]:
-        ran = run(drill.words(place), place, fault if at else "", at)
+        ran = run(drill.command(place), place, fault if at else "", at)
         assert ran.status == (0 if ran.operations else -signal.SIGKILL) or ran.sentence, (points, at, ran)
         assert {folder: contents(place / folder) for folder in drill.raw} == raw, at
         if ran.status == 0:
@@ -208,7 +166,7 @@ def test_two_at_once_leave_what_one_leaves(
     """Two programs do the same at the same time: each does it, or says in one sentence that another one does."""
     drill, (reference, _, expected) = DRILLS[name], undisturbed(name)
     place = Path(shutil.copytree(base, tmp_path / name))
-    both = [start(drill.words(place), place) for _ in range(2)]
+    both = [start(drill.command(place), place) for _ in range(2)]
     ran = [end() for end in both]
     assert all(r.status == 0 or r.sentence for r in ran), ran
     done = [r for r in ran if r.status == 0]

@@ -14,6 +14,7 @@ import importlib
 import json
 import multiprocessing
 import os
+import shlex
 import shutil
 import signal
 import sys
@@ -132,17 +133,20 @@ def _run(words: list[str], place: Path, said: Path, fault: Fault, at: int) -> No
 class Drill:
     """A command to drill.
 
-    ``words`` are its arguments for files below a folder; ``outcome`` returns, from the folder and the last run, what
-    must be the same after any fault as after an undisturbed run. Files in the folders ``raw`` must never change. The
-    names of what ``names_differ`` begins with differ from run to run. With ``once``, the command refuses when it is
-    given again although it was done, and its outcome is that of the files alone.
+    ``words`` are its arguments, with DIR for the folder of its files; ``outcome`` returns, from the folder and the last
+    run, what must be the same after any fault as after an undisturbed run. Files in the folders ``raw`` must never
+    change. The names of what ``names_differ`` begins with differ from run to run. With ``once``, the command refuses
+    when it is given again although it was done, and its outcome is that of the files alone.
     """
 
-    words: Callable[[Path], list[str]]
+    words: str
     outcome: Callable[[Path, Ran], Any]
     raw: tuple[str, ...] = ("src", "DS/recordings", "DS/streams")
     names_differ: tuple[str, ...] = ()
     once: bool = False
+
+    def command(self, place: Path) -> list[str]:
+        return [word.replace("DIR", str(place)) for word in shlex.split(self.words)]
 
 
 def appending(folder: Path, who: str, count: int) -> None:
