@@ -45,7 +45,6 @@ def recorded(place: Path, ran: Ran) -> Any:
         assert name is not None and name.rows == beside["rows"] == len(rows)
         assert rows == stream[beside["stream_row"] : beside["stream_row"] + len(rows)]
         labels.append(name.label)
-    assert ran.json["finished"]
     return Counter(labels)
 
 
@@ -75,6 +74,7 @@ DRILLS = {
         "--protocol DIR/short.toml --json",
         recorded,
         names_differ=("out/S01/1/",),
+        once=True,
     ),
     "import": Drill("import DIR/src DIR/new --layout accel-3", data_set("new"), once=True),
     "check": Drill("check DIR/DS --json", lambda place, ran: (ran.json["findings"], data_set("DS")(place, ran))),
@@ -152,7 +152,7 @@ def test_given_again_it_does_what_it_does_undisturbed(
         ran = run(drill.command(place), place, fault if at else "", at)
         assert ran.status == (0 if ran.operations else -signal.SIGKILL) or ran.sentence, (points, at, ran)
         assert {folder: contents(place / folder) for folder in drill.raw} == raw, at
-        if ran.status == 0:
+        if drill.once and ran.status == 0:
             break
     assert ran.status == 0 or (drill.once and "already" in ran.sentence), (points, ran)
     assert drill.outcome(place, ran) == expected, points

@@ -31,7 +31,7 @@ REPETITIONS = int(os.environ.get("PLUSHSENSE_DRILLS", "1"))
 """Drills of each command; ``make soak`` sets more."""
 
 Fault = Literal["", "kill", "full"]
-_PRELOADED = ("plushsense.cli.main", "plushsense.workflow.api", "plushsense.experiments.sweep.run", "polars", "torch")
+_PRELOADED = ("plushsense.cli.main", "plushsense.workflow.api", "plushsense.experiments.sweep.run", "polars", "torch", "pytest")
 _NEEDS_ROOM = ("open", "os.mkdir", "fsync")
 _OTHER = ("os.rename", "os.remove", "os.rmdir", "os.truncate")
 _WRITING = os.O_WRONLY | os.O_RDWR
@@ -135,8 +135,8 @@ class Drill:
 
     ``words`` are its arguments, with DIR for the folder of its files; ``outcome`` returns, from the folder and the last
     run, what must be the same after any fault as after an undisturbed run. Files in the folders ``raw`` must never
-    change. The names of what ``names_differ`` begins with differ from run to run. With ``once``, the command refuses
-    when it is given again although it was done, and its outcome is that of the files alone.
+    change. The names of what ``names_differ`` begins with differ from run to run. With ``once``, the command does
+    something else, or refuses, when it is given again although it was done; its outcome is that of the files alone.
     """
 
     words: str
