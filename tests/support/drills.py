@@ -31,7 +31,16 @@ REPETITIONS = int(os.environ.get("PLUSHSENSE_DRILLS", "1"))
 """Drills of each command; ``make soak`` sets more."""
 
 Fault = Literal["", "kill", "full"]
-_PRELOADED = ("plushsense.cli.main", "plushsense.workflow.api", "plushsense.experiments.sweep.run", "polars", "torch", "pytest")
+_PRELOADED = (
+    *(
+        "plushsense.cli.main",
+        "plushsense.workflow.api",
+        "plushsense.experiments.sweep.run",
+        "plushsense.deploy.package",
+    ),
+    *("plushsense.dataset.publishing.package", "pytest", "polars", "torch"),
+    *("mlcroissant", "frictionless", "rocrate.rocrate", "datacite"),
+)
 _NEEDS_ROOM = ("open", "os.mkdir", "fsync")
 _OTHER = ("os.rename", "os.remove", "os.rmdir", "os.truncate")
 _WRITING = os.O_WRONLY | os.O_RDWR
