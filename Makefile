@@ -3,6 +3,7 @@
 #   make test    install, then all tests
 #   make test-quick   install, then the tests that need no browser, compiler, emulator or cluster
 #   make fuzz    hostile bundles, layouts, lines and models for the C, for some hours (FUZZ=10: some minutes)
+#   make soak    24 hours of toy time through recorder, live and C; an hour of the studio; long fault drills (about a day)
 #   make check   formatting, lint, types, layers, rules of the code base
 #   make docs    write docs/reference anew from the code, and build the documentation as a site, in build/site
 #   make dist    wheel, source archive and list of components (SBOM), in dist; the wheel is tried in an empty environment
@@ -20,7 +21,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(PIP_FL
 # Tests start hundreds of processes, each of which would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-quick fuzz check docs dist setup collect clean
+.PHONY: demo test test-quick fuzz check docs dist setup collect soak clean
 
 $(VENV)/.python:
 	@$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'PlushSense needs Python 3.11 or newer, this is ' + sys.version.split()[0] + ': run  make PYTHON=/path/to/python3.11 ...')"
@@ -61,6 +62,15 @@ fuzz: $(VENV)/.dev
 	PLUSHSENSE_FUZZ=$(FUZZ) $(BIN)/python -m pytest -n auto --dist worksteal tests/deploy/test_fuzz.py \
 	  tests/deploy/test_bundle_fuzz.py tests/core/test_toml.py tests/deploy/test_c_image.py::test_a_drill_of_bad_updates \
 	  tests/deploy/test_firmware.py::test_computer_and_toy_read_one_grammar
+
+# Hours of toy time, hours of the studio in real time, drills of each command with each fault.
+SOAK_HOURS ?= 24
+STUDIO_HOURS ?= 1
+DRILLS ?= 30
+soak: $(VENV)/.dev
+	PLUSHSENSE_SOAK=1 PLUSHSENSE_DRILLS=$(DRILLS) $(BIN)/python -m pytest tests/faults tests/studio/test_live_long.py \
+	  tests/studio/test_record_whole.py tests/recording/test_whole_session.py
+	$(BIN)/python bench/soak.py --hours $(SOAK_HOURS) --studio-hours $(STUDIO_HOURS)
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .

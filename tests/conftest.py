@@ -33,7 +33,7 @@ settings.load_profile("ci" if os.environ.get("PLUSHSENSE_REQUIRE") else "desk")
 
 
 # Folders, files and fixtures of tests that take seconds; `make test-quick` leaves them out.
-SLOW_FOLDERS = {"bench", "cli", "deploy", "experiments", "studio", "workflow"}
+SLOW_FOLDERS = {"bench", "cli", "deploy", "experiments", "faults", "studio", "workflow"}
 SLOW_FILES = {
     "dataset/importing/test_importers_fuzz.py",
     "devices/test_wire_fuzz.py",

@@ -36,6 +36,7 @@ def folder(sound: Path, tmp_path: Path) -> Path:
         frames = read_recording(path, ACCEL).frames
         frames.device_ms[80:] -= 900
         path.write_text(format_header(ACCEL) + format_rows(frames, ACCEL), newline="\n")
+    (tmp_path / "DS" / "index.json").unlink()
     return tmp_path / "DS"
 
 

@@ -60,6 +60,19 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path, fai
     assert (path.read_text(), names(tmp_path)) == ("old", ["a.txt"])
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="part files are not locked there")
+def test_the_next_writer_deletes_what_a_killed_one_left_and_nothing_of_a_live_one(tmp_path: Path) -> None:
+    path = tmp_path / "a[1].txt"
+    for left in (".a[1].txt.0123abcd.part", ".b.txt.0123abcd.part"):
+        (tmp_path / left).write_text("of a killed program")
+    with replacing_file(path) as mine:
+        mine.write_text("mine")
+        write_file(path, "another's")
+        assert names(tmp_path) == sorted([mine.name, ".b.txt.0123abcd.part", path.name])
+    assert path.read_text() == "mine"
+    assert names(tmp_path) == [".b.txt.0123abcd.part", path.name]
+
+
 @pytest.mark.skipif(os.name != "posix", reason="modes are POSIX")
 def test_modes_follow_the_umask_and_private_files_are_the_owners(tmp_path: Path) -> None:
     (tmp_path / "plain").write_text("")

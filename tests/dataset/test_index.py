@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plushsense.core.errors import DatasetError
+from plushsense.core.errors import DatasetError, FileFormatError
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import CsvFormat, load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
@@ -53,6 +53,10 @@ def test_a_new_a_changed_and_a_removed_raw_file_are_noticed(folder: Path) -> Non
     assert len(open_dataset(folder).recordings) == 3
     path = folder / "recordings" / "ana" / "Wave_3_60.csv"
     path.write_text(path.read_text() + "1, 2, 3, 4, 5\n")
+    for _ in range(2):
+        with pytest.raises(DatasetError, match=r"1 raw file in '.*' changed since.*Wave_3_60.csv.*restore.*index.json"):
+            open_dataset(folder)
+    (folder / "index.json").unlink()
     assert next(r for r in open_dataset(folder).recordings if r.gesture == "Wave").rows == 61
     path.unlink()
     with pytest.raises(DatasetError, match=r"lacks 1 raw file that it had \('recordings/ana/Wave_3_60.csv'\)"):
@@ -99,7 +103,32 @@ def test_a_mark_reads_no_raw_file_again_and_comes_to_the_same(folder: Path, monk
     with monkeypatch.context() as patched:
         patched.setattr(index, "build_index", refuse)
         (folder / "marks.jsonl").unlink()
-        assert open_dataset(folder).recordings == whole.recordings, "without the marks, as it was"
+        with pytest.raises(DatasetError, match=r"Marks that .* missing or changed.*delete index.json"):
+            open_dataset(folder)
+    (folder / "index.json").unlink()
+    assert open_dataset(folder).recordings == whole.recordings, "without the marks, as it was"
+
+
+def test_a_flipped_bit_of_a_raw_file_or_of_the_marks_is_never_read(folder: Path) -> None:
+    """Also one that leaves the size, the time and the syntax as they were, as a failing disk does."""
+    path, marks = folder / "recordings" / "ana" / "Shake_1_60.csv", folder / "marks.jsonl"
+    append_marks(folder, [Mark("ana/Shake_1_60", "trim", "x", start=5, stop=50)])
+    dataset = open_dataset(folder)
+    before, rows = path.stat(), path.read_bytes()
+    at = rows.rindex(b"1")
+    path.write_bytes(rows[:at] + b"3" + rows[at + 1 :])
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    with pytest.raises(FileFormatError, match=r"Shake_1_60.csv' is not the file that was imported.*restore"):
+        dataset.read(dataset.recordings[0])
+    assert len(dataset.read(dataset.recordings[1])) == 60
+    path.write_bytes(rows)
+    line = marks.read_bytes()
+    marks.write_bytes(line.replace(b'"stop": 50', b'"stop": 10'))
+    with pytest.raises(DatasetError, match="missing or changed"):
+        open_dataset(folder)
+    marks.write_bytes(line)
+    append_marks(folder, [Mark("ana/Shake_2_60", "exclude", "x")])
+    assert [(r.start, r.stop, r.excluded) for r in open_dataset(folder).recordings] == [(5, 50, False), (0, 60, True)]
 
 
 def test_a_raw_file_that_became_unreadable_is_named(folder: Path) -> None:

@@ -36,6 +36,7 @@ def test_garbage_is_a_hole_and_squeezes_nothing(tmp_path: Path) -> None:
     lines = path.read_text().splitlines()
     cells = lines[20].split("; ")
     path.write_text("\n".join([*lines[:20], "; ".join(["-30000", *cells[1:]]), *lines[21:], ""]))
+    (dataset.path / "index.json").unlink()
     dataset = open_dataset(dataset.path)
     axes = trim_page(dataset, suggest_trims(dataset)[:1]).axes[0]
     drawn = np.asarray(axes.lines[0].get_ydata())

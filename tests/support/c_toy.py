@@ -90,7 +90,12 @@ def compiled(cc: str, factory: pytest.TempPathFactory, *flags: str) -> Any:
         words = [cc, "-std=c99", "-O2", "-shared", "-fPIC", *flags, f"-I{C_FOLDER}", str(TOY_C)]
         subprocess.run([*words, "-o", str(draft / "toy.so")], check=True)
 
-    library = ctypes.CDLL(str(built_once(factory, f"toy{''.join(flags)}", compile_into) / "toy.so"))
+    return library_of(built_once(factory, f"toy{''.join(flags)}", compile_into) / "toy.so")
+
+
+def library_of(path: Path) -> Any:
+    """The compiled library at ``path``, with the types of its functions."""
+    library = ctypes.CDLL(str(path))
     library.seat_new.restype = ctypes.c_void_p
     for name in ("seat_name", "seat_title"):
         getattr(library, name).restype = ctypes.c_char_p

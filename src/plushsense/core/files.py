@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import glob
 import os
 import secrets
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
@@ -121,7 +123,8 @@ def replacing_file(
     """Yield a path beside ``path`` to write to; it replaces ``path`` when the block ends without an exception.
 
     Readers see either the old file or the new one, even after a power failure or with several writers at once. After
-    an exception ``path`` is unchanged and nothing is left beside it.
+    an exception ``path`` is unchanged and nothing is left beside it; what a killed program left is deleted by the next
+    one that writes ``path`` (not on Windows, nor on a disk without locks).
 
     Args:
         private: make the file readable by its owner only (mode 600, where the system has file modes).
@@ -132,10 +135,12 @@ def replacing_file(
     Raises:
         OSError: when the file cannot be written; on Windows also while another program has ``path`` open.
     """
-    part = (within or path.parent) / f".{path.name}.{secrets.token_hex(4)}{PART}"
+    place = within or path.parent
+    _delete_abandoned_parts(place, path.name)
+    part = place / f".{path.name}.{secrets.token_hex(4)}{PART}"
+    owned = None
     try:
-        if private:
-            os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
+        owned = _create_part(part, 0o600 if private else 0o666)
         yield part
         with part.open("rb+") as file:
             os.fsync(file.fileno())
@@ -145,6 +150,41 @@ def replacing_file(
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
+        if owned is not None:
+            os.close(owned)
+
+
+def _create_part(part: Path, mode: int) -> int | None:
+    """Create a part file, locked until the returned descriptor is closed; on Windows nothing is locked."""
+    while True:
+        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        if sys.platform == "win32":
+            os.close(descriptor)
+            return None
+        import fcntl
+
+        with contextlib.suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        if os.fstat(descriptor).st_nlink:
+            return descriptor
+        # Another program took it for an abandoned one before it was locked.
+        os.close(descriptor)
+
+
+def _delete_abandoned_parts(place: Path, name: str) -> None:
+    """Delete the part files of ``name`` that no process locks any more, as a killed program leaves them."""
+    if sys.platform == "win32":
+        return
+    import fcntl
+
+    for part in place.glob(f".{glob.escape(name)}.*{PART}"):
+        with contextlib.suppress(OSError):
+            descriptor = os.open(part, os.O_RDONLY)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                part.unlink()
+            finally:
+                os.close(descriptor)
 
 
 @contextlib.contextmanager

@@ -17,7 +17,7 @@ from plushsense.dataset.store import HEAD, PEOPLE, RECORDINGS, STREAMS
 RECORDINGS_INDEX = "recordings.csv"
 STREAMS_INDEX = "streams.csv"
 STAMP = "index.json"
-STAMP_VERSION = 3
+STAMP_VERSION = 4
 
 
 def raw_files(folder: Path) -> list[tuple[str, Path]]:
@@ -49,9 +49,20 @@ def current_stamp(folder: Path) -> dict[str, Any]:
     return {
         "format": STAMP_VERSION,
         "files": [[name, now.st_size, now.st_mtime_ns] for name, now in files],
-        "marks": sha256_of(folder / MARKS),
+        "marks": _marks_stamp(_marks(folder)),
         "head": sha256_of(folder / HEAD),
     }
+
+
+def _marks(folder: Path) -> bytes:
+    try:
+        return (folder / MARKS).read_bytes()
+    except FileNotFoundError:
+        return b""
+
+
+def _marks_stamp(marks: bytes) -> list[Any]:
+    return [len(marks), hashlib.sha256(marks).hexdigest()]
 
 
 def _index_hashes(folder: Path) -> dict[str, str]:
@@ -93,6 +104,29 @@ def missing_files(folder: Path) -> list[str]:
         return [str(entry[0]) for entry in _read_stamp(folder)["files"] if not (folder / str(entry[0])).is_file()]
     except (KeyError, TypeError, IndexError):
         return []
+
+
+def rewritten_marks(folder: Path) -> bool:
+    """Return whether marks are missing or differ that were there when the stamp was written: marks are only appended.
+
+    False if there is no stamp, or it is damaged or of an earlier version.
+    """
+    stamp = _read_stamp(folder)
+    before = stamp.get("marks")
+    if stamp.get("format") != STAMP_VERSION or not isinstance(before, list) or not isinstance(before[0], int):
+        return False
+    return _marks_stamp(_marks(folder)[: before[0]]) != before
+
+
+def accept_marks(folder: Path) -> None:
+    """Let the stamp on disk, if there is one, have the present marks, after marks were removed on purpose."""
+    if stamp := _read_stamp(folder):
+        write_file(folder / STAMP, json.dumps(stamp | {"marks": _marks_stamp(_marks(folder))}) + "\n")
+
+
+def is_index_intact(folder: Path) -> bool:
+    """Return whether the index files are those that were written with the stamp, even if raw files changed since."""
+    return _read_stamp(folder).get("index") == _index_hashes(folder)
 
 
 CACHE = "cache"

@@ -27,12 +27,14 @@ from plushsense.dataset.files import (
     current_stamp,
     indexed_files,
     is_index_fresh,
+    is_index_intact,
     is_same_raw_data,
     missing_files,
     raw_files,
+    rewritten_marks,
     write_stamp,
 )
-from plushsense.dataset.marks import MarkState, read_marks
+from plushsense.dataset.marks import MARKS, MarkState, read_marks
 from plushsense.dataset.quality.checking import import_flags
 from plushsense.dataset.quality.findings import PARTLY_THERE
 from plushsense.dataset.quality.measurements import Examination, usual_rows
@@ -76,7 +78,8 @@ def open_dataset(path: str | Path) -> Dataset:
     On a read-only disk an outdated index is rebuilt in memory at every call.
 
     Raises:
-        DatasetError: if the folder is missing, empty or not a data set, or a raw file is missing or unreadable.
+        DatasetError: if the folder is missing, empty or not a data set, a raw file is missing, unreadable or not the
+            one that was indexed, or marks are missing.
     """
     folder = Path(path)
     head = DatasetHead.read(folder)
@@ -92,6 +95,13 @@ def open_dataset(path: str | Path) -> Dataset:
                 folder=folder.name,
                 n=len(missing),
                 file=missing[0],
+            )
+        if rewritten_marks(folder):
+            raise DatasetError(
+                f"Marks that '{folder / MARKS}' had are missing or changed, but marks are only appended: restore the "
+                f"file, or delete {STAMP} there to go on with the marks as they are now.",
+                reason="marks_changed",
+                folder=folder.name,
             )
         stamp = current_stamp(folder)
         # If only the marks changed, the raw files need not be read again.
@@ -116,6 +126,7 @@ def open_dataset(path: str | Path) -> Dataset:
             folder=folder.name,
             file=file,
         )
+    _refuse_changed(folder, built.dataset)
     try:
         with generation.writing():
             write_index_files(built.dataset, stamp)
@@ -127,6 +138,30 @@ def open_dataset(path: str | Path) -> Dataset:
         # The disk is read-only; the index only saves time.
         pass
     return built.dataset
+
+
+def _refuse_changed(folder: Path, now: Dataset) -> None:
+    """Raise DatasetError if a raw file is not the one that the index on disk describes."""
+    if not is_index_intact(folder):
+        return
+    try:
+        recordings = read_index(folder / RECORDINGS_INDEX, RecordingInfo)
+        streams = read_index(folder / STREAMS_INDEX, StreamInfo)
+    except DatasetError:
+        return
+    before = {info.file: info.sha256 for info in (*recordings, *streams)}
+    files = {info.file: info.sha256 for info in (*now.recordings, *now.streams)}
+    changed = sorted(file for file, sha256 in files.items() if before.get(file, sha256) != sha256)
+    if changed:
+        raise DatasetError(
+            f"{len(changed)} raw file{'s' if len(changed) > 1 else ''} in '{folder}' changed since the import "
+            f"('{changed[0]}'), but raw files are never rewritten: restore them, or delete {STAMP} there to go on with "
+            "what they hold now.",
+            reason="raw_files_changed",
+            folder=folder.name,
+            n=len(changed),
+            file=changed[0],
+        )
 
 
 def _indexed(folder: Path, head: DatasetHead, generation: Generation) -> Dataset | None:

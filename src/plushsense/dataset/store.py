@@ -32,7 +32,7 @@ from plushsense.core.errors import DatasetError, FileFormatError, ForgottenError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
-from plushsense.core.recorder_csv import Frames, ReadResult, read_recording, read_stream
+from plushsense.core.recorder_csv import Frames, ReadResult, read_bytes, read_recording, read_stream
 from plushsense.core.toml import load_table, read_toml
 from plushsense.dataset.about import About, HeadFile
 from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, append_marks, locked, read_marks
@@ -426,7 +426,7 @@ class Dataset:
             return self.read_stream(recording.stream).slice(
                 recording.first_row + recording.start, recording.first_row + recording.stop
             )
-        return self._frames(read_recording, recording.file).slice(recording.start, recording.stop)
+        return self._frames(read_recording, recording).slice(recording.start, recording.stop)
 
     def read_stream(self, stream: str) -> Frames:
         """Read the rows of one session stream; the last one is cached, as recordings are read stream by stream."""
@@ -434,7 +434,7 @@ class Dataset:
             info = next((s for s in self.streams if s.id == stream), None)
             if info is None:
                 raise DatasetError(f"Data set '{self.head.name}' has no stream '{stream}'.")
-            self._cached = (stream, self._frames(read_stream, info.file))
+            self._cached = (stream, self._frames(read_stream, info))
         return self._cached[1]
 
     def read_people(self, subjects: Iterable[str]) -> Iterator[Frames]:
@@ -446,9 +446,14 @@ class Dataset:
             else:
                 yield from (self.read(r) for r in self.used if r.subject == subject)
 
-    def _frames(self, read: Callable[[Path, Layout], ReadResult], file: str) -> Frames:
+    def _frames(self, read: Callable[..., ReadResult], info: RecordingInfo | StreamInfo) -> Frames:
+        path = self.path / info.file
         try:
-            return read(self.path / file, self.layout).frames
+            data = read_bytes(path)
+            if hashlib.sha256(data).hexdigest() != info.sha256:
+                message = f"'{path}' is not the file that was imported (its SHA-256 differs): restore it from a backup."
+                raise FileFormatError(message, reason="raw_file_changed", file=path.name)
+            return read(path, self.layout, data).frames
         except FileFormatError:
             # The file may have been deleted because its person was removed.
             self.generation.check()

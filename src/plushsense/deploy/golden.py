@@ -5,7 +5,7 @@ No recordings are used, because exports are given to others and must not contain
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -306,6 +306,16 @@ def answers_of(model: IntegerModel, frames: Ints, silences: Container[int] = ())
     table = _RowTable(toy, model)
     table.read(frames, silences)
     return table.array()
+
+
+def answers_by_block(model: IntegerModel, blocks: Iterable[Ints]) -> Iterator[NDArray[np.int32]]:
+    """Yield the rows of `answers_of` for each block of frames of one long stream; earlier ones are not kept."""
+    toy, frame = _toy(model), 0
+    for frames in blocks:
+        table = _RowTable(toy, model, frame)
+        table.read(frames)
+        frame = table.frame
+        yield table.array()
 
 
 def answers_over_swaps(parts: Sequence[tuple[IntegerModel, Ints]]) -> list[NDArray[np.int32]]:

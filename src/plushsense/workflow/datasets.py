@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plushsense.core.errors import BundleError, ConfigError, DatasetError
+from plushsense.core.files import write_file
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.index import as_dataset, change_head, open_dataset
 from plushsense.dataset.privacy.forget import RemovalPlan, find_mentions, plan_removal
@@ -233,8 +234,7 @@ def _read_key(path: Path, *beside: Path) -> bytes:
                 raise ValueError("too short")
             return key
         key = secrets.token_bytes(_KEY_BYTES)
-        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
-            file.write(key.hex() + "\n")
+        write_file(path, key.hex() + "\n", private=True)
         return key
     except ValueError:
         raise DatasetError(

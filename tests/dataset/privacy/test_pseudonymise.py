@@ -291,6 +291,7 @@ def test_malformed_lines_and_cut_streams_come_along(folder: Path, tmp_path: Path
     host = lines[9].split("; ")[13]
     lines[7] = "; ".join([*["0"] * 13, host[:8]])
     path.write_text("\n".join(lines) + "\n" + "; ".join([*["1"] * 13, host[:-4]]))
+    (folder / "index.json").unlink()
     done = made(folder, tmp_path)
     code = key_of(done.key)["P02"][0]
     new = (tmp_path / "OUT" / "streams" / code / "fulldatastream.csv").read_text()

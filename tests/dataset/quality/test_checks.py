@@ -119,12 +119,18 @@ def recording(folder: Path, number: int = 5, label: str = "Head stroke 1", perso
     return sorted((folder / "recordings" / person).glob(f"{label}_*.csv"))[number % TIMES]
 
 
+def rewrite(path: Path, text: str) -> None:
+    """Give a raw file another content, as if it had been imported so: without the stamp, which would refuse it."""
+    path.write_text(text, newline="\n")
+    (path.parents[2] / "index.json").unlink(missing_ok=True)
+
+
 def change(path: Path, how: Callable[[Frames], Frames]) -> str:
     """Rewrite a recording or stream with ``how`` applied: what finds it is the id."""
     kind = path.parents[1].name
     read = (read_stream if kind == "streams" else read_recording)(path, PLUSH).frames
     head = "" if kind == "streams" else format_header(PLUSH)
-    path.write_text(head + format_rows(how(read), PLUSH), newline="\n")
+    rewrite(path, head + format_rows(how(read), PLUSH))
     return path.relative_to(path.parents[1]).with_suffix("").as_posix()
 
 
@@ -230,7 +236,7 @@ def malformed(folder: Path) -> str:
     path = recording(folder)
     lines = path.read_text().splitlines(keepends=True)
     lines[30] = lines[30][:7] + "\n"
-    path.write_text("".join(lines), newline="\n")
+    rewrite(path, "".join(lines))
     return path.relative_to(folder / "recordings").with_suffix("").as_posix()
 
 
@@ -259,7 +265,7 @@ def overlapping(folder: Path) -> str:
 
 def missing(folder: Path) -> str:
     recording(folder).unlink()
-    (folder / "index.json").unlink()
+    (folder / "index.json").unlink(missing_ok=True)
     return "P2"
 
 
@@ -308,7 +314,7 @@ def other_rows(folder: Path) -> str:
 
 def cut(folder: Path) -> str:
     path = folder / "streams" / "P2" / "fulldatastream.csv"
-    path.write_text(path.read_text() + "100; 3", newline="\n")
+    rewrite(path, path.read_text() + "100; 3")
     return "P2/fulldatastream"
 
 
@@ -466,7 +472,7 @@ def test_balance_and_labels_are_counted_over_the_data_set(copy: Path) -> None:
         assert n < TIMES
     for path in [*(copy / "recordings").glob("P[12]/Hold*.csv")][:6]:
         path.unlink()
-    (copy / "index.json").unlink()
+    (copy / "index.json").unlink(missing_ok=True)
     said = {f.check: f for f in check(open_dataset(copy)).findings}
     assert "P4 2" in said["subject-balance"].message
     assert "Hold strong" in said["class-balance"].message
@@ -489,7 +495,7 @@ def test_what_asks_for_a_decision_is_an_error(copy: Path) -> None:
 
 def test_a_trimmed_recording_is_judged_by_what_remains(copy: Path) -> None:
     about = never_stopped(copy)
-    (copy / "index.json").unlink()
+    (copy / "index.json").unlink(missing_ok=True)
     append_marks(copy, [Mark(about, "trim", "x", start=0, stop=300)])
     result = check(open_dataset(copy))
     assert result.findings_of("never-stopped", "rows", "several-gestures") == []
@@ -498,7 +504,7 @@ def test_a_trimmed_recording_is_judged_by_what_remains(copy: Path) -> None:
 def test_the_mean_is_over_recordings_that_were_stopped(copy: Path) -> None:
     """One of 10 times the length would pull a plain mean until half of the others lie outside ±40 %."""
     never_stopped(copy)
-    (copy / "index.json").unlink()
+    (copy / "index.json").unlink(missing_ok=True)
     assert check(open_dataset(copy)).findings_of("duration") == []
 
 
@@ -529,7 +535,7 @@ def test_a_gesture_of_free_choice_is_compared_within_a_person(copy: Path) -> Non
     for path in (copy / "recordings" / "P1").glob("Hold*.csv"):
         change(path, lambda f: join(f, f, f))
         renamed(path, len(read_recording(path, PLUSH).frames))
-    (copy / "index.json").unlink()
+    (copy / "index.json").unlink(missing_ok=True)
     assert check(open_dataset(copy)).findings_of("duration", "missing") == []
 
 

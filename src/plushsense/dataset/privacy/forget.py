@@ -39,6 +39,7 @@ from plushsense.dataset.files import (
     EVALUATIONS,
     INDEX,
     DatasetFile,
+    accept_marks,
     list_files,
     match_code,
     missing_files,
@@ -356,6 +357,7 @@ def _rewrite_marks(folder: Path, subject: str) -> None:
     others = [line for line in lines if not _is_about(line, subject)]
     if len(others) < len(lines):
         write_file(folder / MARKS, b"".join(others))
+        accept_marks(folder)
 
 
 def _leftovers(folder: Path, files: Iterable[DatasetFile]) -> tuple[tuple[str, ...], tuple[str, ...]]:
