@@ -3,6 +3,8 @@
 #   make test    install, then all tests
 #   make test-quick   install, then the tests that need no browser, compiler, emulator or cluster
 #   make fuzz    hostile bundles, layouts, lines and models for the C, for some hours (FUZZ=10: some minutes)
+#   make coverage   branch coverage of the base packages (tests of them, of deploy and of the command line; half an hour)
+#   make mutants    one change at each of MUTANTS=200 random lines: which does no test find? (uses the data of the former)
 #   make check   formatting, lint, types, layers, rules of the code base
 #   make docs    write docs/reference anew from the code, and build the documentation as a site, in build/site
 #   make dist    wheel, source archive and list of components (SBOM), in dist; the wheel is tried in an empty environment
@@ -20,7 +22,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c const
 # Tests start hundreds of processes, each of which would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-quick fuzz check docs dist setup clean
+.PHONY: demo test test-quick fuzz coverage mutants check docs dist setup clean
 
 $(VENV)/.python:
 	@$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'PlushSense needs Python 3.11 or newer, this is ' + sys.version.split()[0] + ': run  make PYTHON=/path/to/python3.11 ...')"
@@ -56,6 +58,26 @@ fuzz: $(VENV)/.dev
 	PLUSHSENSE_FUZZ=$(FUZZ) $(BIN)/python -m pytest -n auto --dist worksteal tests/deploy/test_fuzz.py \
 	  tests/deploy/test_bundle_fuzz.py tests/core/test_toml.py tests/deploy/test_c_image.py::test_a_drill_of_bad_updates \
 	  tests/deploy/test_firmware.py::test_computer_and_toy_read_one_grammar
+
+BASE := core devices recording dataset windows models runtime live tuning scoring
+COVERED := $(addprefix tests/,$(BASE) deploy cli)
+SECONDS := build/coverage/seconds.json
+# Without xdist, so that each line is counted for the test that ran it.
+$(SECONDS): $(VENV)/.dev
+	rm -rf build/coverage
+	mkdir -p build/coverage
+	TEST_SECONDS=$@ $(BIN)/python -m coverage run -m pytest -p no:xdist -p support.contexts $(COVERED)
+	$(BIN)/python -m coverage combine -q
+
+coverage:
+	rm -f $(SECONDS)
+	$(MAKE) $(SECONDS)
+	$(BIN)/python -m coverage report
+
+MUTANTS ?= 200
+SEED ?= 1
+mutants: $(SECONDS)
+	$(BIN)/python .ci/mutation.py --mutants $(MUTANTS) --seed $(SEED)
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .
