@@ -130,12 +130,14 @@ def more_options(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
 def changes(node: ast.AST, statement: int = 0, inside: bool = False) -> Iterator[Change]:
     """Yield all changes below a node: (node, kind, its replacement, line of its statement, whether in a function).
 
-    Annotations, decorators, docstrings and the texts of errors stay as they are.
+    Annotations, decorators, docstrings, the texts of errors and ``strict`` of zip, an assertion, stay as they are.
     """
     statement = node.lineno if isinstance(node, ast.stmt) else statement
     for kind, new in (*options(node), *more_options(node)):
         yield node, kind, new, statement, inside
     if isinstance(node, ast.Raise) or (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)):
+        return
+    if isinstance(node, ast.keyword) and node.arg == "strict":
         return
     for field, value in ast.iter_fields(node):
         if field in ("annotation", "returns", "decorator_list", "format_spec"):

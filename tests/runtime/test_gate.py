@@ -9,7 +9,19 @@ import pytest
 
 from plushsense.core.errors import BundleError, ConfigError
 from plushsense.runtime.decisions import DecideSpec
-from plushsense.runtime.gate import HELD, JERK, LEVEL, Gate, GateSettings, Rule, Signal, Term, firings
+from plushsense.runtime.gate import (
+    HELD,
+    JERK,
+    LEVEL,
+    Gate,
+    GateSettings,
+    Rule,
+    Signal,
+    Term,
+    firings,
+    follow,
+    raw_signals,
+)
 from plushsense.tuning.gate import signal_sizes
 
 BLOW = Rule((Term(0, 32, times=2),), affect=3, gesture=255, within=3, deaf=5)
@@ -160,3 +172,27 @@ def test_plain_values_and_back() -> None:
     assert DecideSpec.from_dict({"gate": {}}).gate == GateSettings()
     with pytest.raises(ConfigError, match=r"gate\.signals\[0\]\.inputs is missing"):
         DecideSpec.from_dict({"gate": {"signals": [{"kind": 0}]}})
+
+
+def test_no_sample_is_suspect_unless_named_and_stretches_together_fire_as_alone() -> None:
+    x = np.array(tremble([100] * 20 + [121] * 3))
+    assert firings(LEVELS, [x]) == firings(LEVELS, [x], [np.zeros(23, dtype=np.bool_)]) == [[(21, 0)]]
+    assert firings(LEVELS, [x, x, x[:3]]) == [[(21, 0)], [(21, 0)], []]
+    assert firings(LEVELS, []) == [] and firings(LEVELS, [x[:0]]) == [[]]
+    assert firings(GateSettings(), [x, x]) == [[], []]
+
+
+def test_raw_signals_are_computed_once_for_signals_that_differ_only_later() -> None:
+    x = np.array([[0, 5], [-8, 1], [-40, 1], [2**30, -3]])
+    signals = (
+        Signal(LEVEL, (0,), floor=10), Signal(LEVEL, (0,), floor=99), Signal(LEVEL, (0,), shift=3),
+        Signal(JERK, (0, 1), lag=2), Signal(JERK, (1,)),
+    )  # fmt: skip
+    assert raw_signals(x, signals).T.tolist() == [
+        [0, -8, -40, HELD], [0, -8, -40, HELD], [0, -1, -5, HELD], [0, 0, 44, HELD], [0, 4, 0, 4]
+    ]  # fmt: skip
+    block = raw_signals(x[:2], signals).astype(np.int32)[:, None]
+    assert follow(block[:0].copy(), signals).shape == (0, 1, 5)
+    # The baseline begins with the first sample, and the size is in sixteenths of the floor.
+    assert follow(block.copy(), signals, deviations=True)[:, 0].tolist() == [[0] * 5, [-8, -8, -1, 0, 4]]
+    assert follow(block[..., :2].copy(), signals[:2])[1, 0].tolist() == [-(8 * 16 // 10), -(8 * 16 // 99)]

@@ -243,3 +243,22 @@ def test_bad_settings_are_refused(settings: dict[str, float], said: str) -> None
 def test_cut_windows_says_who_cuts_these(dataset: Dataset) -> None:
     with pytest.raises(ConfigError, match="cut_anywhere"):
         cut_windows(dataset, SPEC)
+
+
+def test_settings_at_the_ends_of_their_range() -> None:
+    ends = {"every_s": (0.01, 60.0), "onset_s": (0.0, 60.0), "after_s": (0.0, 1.0), "settle_s": (0.2, 60.0)}
+    shares = {"idle_share": (0.0, 0.99), "busy_share": (0.0, 1.0), "hard_share": (0.0, 1.0)}
+    for name, (low, high) in (ends | shares).items():
+        for value in (low, high):
+            assert getattr(AnywhereSpec(**{name: value}), name) == value
+        wrong = (-0.01, 1.01 if name.endswith("_share") else 60.01)
+        for value in wrong:
+            with pytest.raises(ConfigError, match=f"{name} is .*accepted is 0 to (1|60)[.]"):
+                AnywhereSpec(**{name: value})
+    with pytest.raises(ConfigError, match="every_s is 0"):
+        AnywhereSpec(every_s=0.0)
+    with pytest.raises(ConfigError, match="idle_share is 1: accepted is 0 up to, not including, 1"):
+        AnywhereSpec(idle_share=1.0)
+    assert AnywhereSpec(after_s=0.5, settle_s=0.5).settle_s == 0.5
+    with pytest.raises(ConfigError, match="settle_s must not be below after_s"):
+        AnywhereSpec(after_s=0.5, settle_s=0.4)
