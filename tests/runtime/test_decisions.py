@@ -7,7 +7,7 @@ import math
 import pytest
 
 from plushsense.core.errors import ConfigError
-from plushsense.runtime.decisions import DecideSpec
+from plushsense.runtime.decisions import DecideSpec, argmax_spec
 from plushsense.runtime.events import MOST_STEPS
 from plushsense.runtime.fixed import LOGIT_LIMIT
 
@@ -49,3 +49,11 @@ def test_settings_become_integers_and_numbers_of_steps():
     assert (events.wait, events.known) == (1200, 384)
     assert DecideSpec(wait_s=60.0).rules(1e-6).events.wait == MOST_STEPS
     assert DecideSpec().rules(0.05).events.known == -LOGIT_LIMIT
+
+
+def test_settings_that_report_the_best_class_of_every_step():
+    spec = argmax_spec()
+    events = spec.rules(0.05).events
+    assert (spec.smoothing_s, argmax_spec(0.3).smoothing_s) == (0.0, 0.3)
+    assert (events.enter, events.leave, events.sure, events.enter_affect) == (0, 0, 1 << 14, (1 << 15) + 1)
+    assert (events.least, events.switch, events.end, events.hold, events.rest, events.wait) == (1, 1, 1, 0, 0, 0)
