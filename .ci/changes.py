@@ -105,8 +105,9 @@ class Swap(ast.NodeTransformer):
         return self.new if node is self.old else self.generic_visit(node)
 
 
-def changed_source(source: str, number: int) -> str:
-    """Return the source with one of its `changes`, by its place among them; without comments."""
+def changed_tree(source: str, number: int) -> ast.Module:
+    """Return the tree of the source with one of its `changes`, by its place among them."""
     tree = ast.parse(source)
     old, _, new, *_ = list(changes(tree))[number]
-    return ast.unparse(ast.fix_missing_locations(Swap(old, new).visit(tree)))
+    Swap(old, ast.copy_location(new, old)).visit(tree)
+    return ast.fix_missing_locations(tree)

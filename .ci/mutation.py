@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import ast
 import contextlib
+import gc
 import importlib
 import json
 import math
@@ -27,19 +28,24 @@ import tempfile
 import time
 import tomllib
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
+from types import CodeType, FunctionType
+from typing import Any
 
 import pytest
-from changes import changed_source, changes
+from changes import changed_tree, changes
 from coverage import CoverageData
 
 ROOT = Path(__file__).resolve().parents[1]
 SRC = ROOT / "src" / "plushsense"
 STATE = ROOT / "build" / "coverage"
 PACKAGES = ("runtime", "windows", "scoring", "deploy")
-ROUNDS_S = (10.0, 120.0)  # of the tests of the first round, and of the second, for what survives the first
+MOST_S = 120.0  # of all tests of a mutant
+# For constants, which no line of a test reads: the reference pins defaults, the formats answers of a network.
+ALWAYS = ("tests/test_reference.py", "tests/test_formats.py")
 MEMORY_BYTES = 6 << 30
 LOST = ("survived", "not run")
 
@@ -59,6 +65,10 @@ class Mutant:
         return f"{self.module}:{self.line} {self.kind}: {self.before}  ->  {self.after}"
 
 
+Task = tuple[Mutant, list[str], float]
+"""A mutant, its tests, and the seconds that they take."""
+
+
 def sample_of(n: int, seed: int) -> list[Mutant]:
     """Draw lines of the packages, and a mutant of each."""
     places: dict[tuple[str, int], list[Mutant]] = defaultdict(list)
@@ -72,8 +82,8 @@ def sample_of(n: int, seed: int) -> list[Mutant]:
     return [draw.choice(places[place]) for place in draw.sample(sorted(places), n)]
 
 
-def rounds_of(sample: list[Mutant]) -> Iterator[list[tuple[list[str], float]]]:
-    """Yield the tests of each mutant, quickest first, in rounds with their seconds."""
+def tests_of(sample: list[Mutant]) -> Iterator[tuple[list[str], float]]:
+    """Yield the tests of each mutant, quickest first, and the seconds that they take."""
     seconds: dict[str, float] = json.loads((STATE / "seconds.json").read_text("utf-8"))
     data = CoverageData(str(STATE / "data"))
     data.read()
@@ -81,75 +91,107 @@ def rounds_of(sample: list[Mutant]) -> Iterator[list[tuple[list[str], float]]]:
     for mutant in sample:
         by_line = data.contexts_by_lineno(files.get(mutant.module, ""))
         lines = {mutant.line, mutant.statement} if mutant.in_function else set(by_line)
-        found = {test for line in lines for test in by_line.get(line, []) if test in seconds}
-        tests = sorted(found, key=lambda test: (seconds[test], test))
-        rounds = []
-        for limit in ROUNDS_S:
-            spent, mine = 0.0, list[str]()
-            while tests and (spent + seconds[tests[0]] <= limit or not mine):
-                spent += seconds[tests[0]]
-                mine.append(tests.pop(0))
-            rounds += [(mine, spent)] if mine else []
-        yield rounds
+        tests = {test for line in lines for test in by_line.get(line, []) if test in seconds}
+        if not mutant.in_function:
+            tests |= {test for test in seconds if test.startswith(ALWAYS)}
+        spent, chosen = 0.0, list[str]()
+        for test in sorted(tests, key=lambda test: (seconds[test], test)):
+            spent += seconds[test]
+            if spent <= MOST_S or not chosen:
+                chosen.append(test)
+        yield chosen, min(spent, MOST_S)
 
 
-class Chosen:
-    """A plugin that runs only the chosen tests, file by file, in their order."""
+class Forks:
+    """A plugin that runs tests file by file, the quickest first; of mutants, each in a fork with its tests."""
 
-    def __init__(self, tests: list[str]) -> None:
-        self.place = {test: i for i, test in enumerate(tests)}
-        self.file = {test.split("::")[0]: i for i, test in reversed(list(enumerate(tests)))}
+    def __init__(self, tests: list[str], tasks: list[Task] | None = None, results: Any = None) -> None:
+        self.tests, self.tasks, self.results = tests, tasks, results
+
+    def chosen(self, items: list[pytest.Item], tests: list[str]) -> list[pytest.Item]:
+        place = {test: i for i, test in enumerate(tests)}
+        file = {test.split("::")[0]: i for test, i in reversed(place.items())}
+        mine = [item for item in items if item.nodeid in place]
+        return sorted(mine, key=lambda item: (file[item.nodeid.split("::")[0]], place[item.nodeid]))
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        items[:] = [item for item in items if item.nodeid in self.place]
-        items.sort(key=lambda item: (self.file[item.nodeid.split("::")[0]], self.place[item.nodeid]))
+        items[:] = self.chosen(items, self.tests)
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtestloop(self, session: pytest.Session) -> bool | None:
+        for mutant, tests, seconds in self.tasks or ():
+            with changed_module(mutant) as code:
+                self.results.put((mutant, forked(partial(self.run, session, mutant, tests, code), seconds)))
+        return None if self.tasks is None else True
+
+    def run(self, session: pytest.Session, mutant: Mutant, tests: list[str], code: CodeType) -> int:
+        """Run tests with the new code in the functions of the module, wherever they are used, if it is loaded."""
+        name = "plushsense." + mutant.module.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+        functions, parts = {}, [code]
+        for part in parts:
+            parts += [constant for constant in part.co_consts if isinstance(constant, CodeType)]
+            functions[part.co_qualname, part.co_firstlineno] = part
+        for known in gc.get_objects():
+            if isinstance(known, FunctionType) and known.__module__ == name:
+                old = known.__code__
+                known.__code__ = functions.get((old.co_qualname, old.co_firstlineno), old)
+        factory = session.config._tmp_path_factory  # type: ignore[attr-defined]
+        factory._given_basetemp, factory._basetemp = Path("tmp").resolve(), None
+        session.items = self.chosen(session.items, tests)
+        for i, item in enumerate(session.items):
+            after = session.items[i + 1] if i + 1 < len(session.items) else None
+            item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
+            if session.testsfailed:
+                return pytest.ExitCode.TESTS_FAILED
+        return pytest.ExitCode.OK if session.items else pytest.ExitCode.NO_TESTS_COLLECTED
 
 
-def run_tests(tree: Path, tests: list[str], seconds: float) -> str:
-    """Run tests in a copy of the repository, in a forked process; return killed, survived or timed out."""
+def run_pytest(plugin: Forks) -> int:
+    sys.path.insert(0, str(Path("src").resolve()))
+    files = sorted({test.split("::")[0] for test in plugin.tests})
+    words = ["-x", "-p", "no:cacheprovider", "-p", "no:xdist", f"--basetemp={Path('tmp').resolve()}"]
+    return pytest.main([*words, *files], plugins=[plugin])
+
+
+def forked(run: Callable[[], int], seconds: float) -> str:
+    """Run tests of some seconds in a fork of this process; return killed, survived or timed out."""
     child = os.fork()
     if child == 0:
         os.setsid()
         limit = 30 + int(5 * seconds)  # of the process's own time, of which a busy machine uses no more
         resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 5))
         resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
-        output = os.open(tree / "output.txt", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        os.dup2(output, 1)
-        os.dup2(output, 2)
-        os.chdir(tree)
-        sys.path.insert(0, str(tree / "src"))
-        words = ["-x", "-p", "no:cacheprovider", "-p", "no:xdist", f"--basetemp={tree / 'tmp'}"]
-        code: int = pytest.ExitCode.INTERNAL_ERROR
+        code: int = pytest.ExitCode.TESTS_FAILED
         try:
-            code = pytest.main([*words, *sorted({test.split("::")[0] for test in tests})], plugins=[Chosen(tests)])
+            code = run()
         finally:
             os._exit(code)
     end = time.monotonic() + 600 + 20 * seconds
     while not (ended := os.waitpid(child, os.WNOHANG))[0]:
         if time.monotonic() > end:
             os.killpg(child, signal.SIGKILL)
-        time.sleep(0.02)
+        time.sleep(0.01)
     with contextlib.suppress(ProcessLookupError):
         os.killpg(child, signal.SIGKILL)  # what tests left
     code = os.waitstatus_to_exitcode(ended[1])
     if code == pytest.ExitCode.NO_TESTS_COLLECTED:
-        raise RuntimeError(f"The repository does not have these tests; remove {STATE}: {tests[:3]}")
+        raise RuntimeError("The repository does not have the tests of build/coverage: run  make coverage")
     return {0: "survived", -signal.SIGXCPU: "timed out", -signal.SIGKILL: "timed out"}.get(code, "killed")
 
 
-def judge(task: tuple[Mutant, list[tuple[list[str], float]]]) -> tuple[Mutant, str]:
-    """Run the rounds of tests of a mutant in this worker's copy of the repository until one fails."""
-    mutant, rounds = task
-    target, result = Path("src/plushsense", mutant.module).resolve(), "not run"
+@contextlib.contextmanager
+def changed_module(mutant: Mutant) -> Iterator[CodeType]:
+    """Write the change into this copy of the repository for a while; yield the code of the module."""
+    target = Path("src/plushsense", mutant.module).resolve()
     original = target.read_text("utf-8")
-    write(target, changed_source(original, mutant.number) if mutant.kind else original)
-    for tests, seconds in rounds:
-        result = run_tests(Path.cwd(), tests, seconds)
-        if result != "survived":
-            break
-    write(target, original)
-    return mutant, result
+    tree = changed_tree(original, mutant.number) if mutant.kind else ast.parse(original)
+    try:
+        write(target, ast.unparse(tree))
+        yield compile(tree, str(target), "exec", dont_inherit=True)
+    finally:
+        write(target, original)
+        shutil.rmtree("tmp", ignore_errors=True)
 
 
 def write(target: Path, text: str, stamps: Iterator[int] = iter(range(1_000_000_000, 2_000_000_000))) -> None:  # noqa: B008
@@ -170,6 +212,36 @@ def enter_copy(parent: str) -> None:
     os.environ.setdefault("PLUSHSENSE_DATA", str(ROOT.parent / "shared" / "data"))
     os.environ.setdefault("PLUSHSENSE_REQUIRE", "nothing")  # the same random examples each time
     os.environ["PYTHONPATH"] = str(tree / "src")
+    for descriptor in (1, 2):
+        os.dup2(os.open("output.txt", os.O_WRONLY | os.O_CREAT | os.O_APPEND), descriptor)
+
+
+def in_functions(tasks: list[Task], parent: str, results: Any) -> None:
+    """Run mutants in functions, whose code is exchanged after all tests are loaded: the tests then begin at once."""
+    enter_copy(parent)
+    run_pytest(Forks([test for _, tests, _ in tasks for test in tests], tasks, results))
+
+
+def from_the_start(tasks: list[Task], parent: str, results: Any) -> None:
+    """Run mutants in processes that have not loaded the package yet."""
+    enter_copy(parent)
+    for mutant, tests, seconds in tasks:
+        with changed_module(mutant):
+            results.put((mutant, forked(partial(run_pytest, Forks(tests)), seconds)))
+
+
+def judged(work: Callable[..., None], tasks: list[Task], jobs: int) -> Iterator[tuple[Mutant, str]]:
+    """Yield the results of a stage, by several processes."""
+    fork = multiprocessing.get_context("fork")
+    results = fork.SimpleQueue()
+    with tempfile.TemporaryDirectory() as parent:
+        workers = [fork.Process(target=work, args=(tasks[i::jobs], parent, results)) for i in range(jobs)]
+        for worker in workers:
+            worker.start()
+        for _ in tasks:
+            yield results.get()
+        for worker in workers:
+            worker.join()
 
 
 def interval(k: int, n: int) -> str:
@@ -210,17 +282,20 @@ def main() -> None:
         sample = [replace(mutant, kind="", before="", after="") for mutant in sample]
     for module in ("hypothesis", "numpy", "torch", "polars", "matplotlib", "cattrs", "jinja2", "safetensors.numpy"):
         importlib.import_module(module)
-    tasks = list(zip(sample, rounds_of(sample), strict=True))
-    results: list[tuple[Mutant, str]] = []
-    with (
-        tempfile.TemporaryDirectory() as parent,
-        multiprocessing.get_context("fork").Pool(args.jobs, enter_copy, (parent,)) as workers,
-    ):
-        for mutant, result in workers.imap_unordered(judge, tasks):
-            results.append((mutant, result))
-            print(f"{len(results)}/{len(tasks)} {result}: {mutant}", file=sys.stderr, flush=True)
-    lost.write_text(json.dumps([asdict(m) for m, result in results if result in LOST]))
-    report(results)
+    tasks = [(mutant, *found) for mutant, found in zip(sample, tests_of(sample), strict=True)]
+    results = dict.fromkeys(sample, "not run")
+
+    def take(found: Iterator[tuple[Mutant, str]]) -> None:
+        for mutant, result in found:
+            results[mutant] = result
+            print(f"{result}: {mutant}", file=sys.stderr, flush=True)
+
+    take(judged(in_functions, [task for task in tasks if task[0].in_function and task[1]], args.jobs))
+    # What a function returned when its module was loaded may have been kept: look again at what survived.
+    rest = [task for task in tasks if task[1] and results[task[0]] in LOST]
+    take(judged(from_the_start, rest, args.jobs))
+    lost.write_text(json.dumps([asdict(m) for m, result in results.items() if result in LOST]))
+    report(list(results.items()))
 
 
 if __name__ == "__main__":

@@ -208,3 +208,19 @@ def test_scales_that_the_toy_cannot_hold(changes: dict[str, Any], words: str) ->
     for kind in (Requantize, LogitScale):
         with pytest.raises(BundleError, match=words):
             kind(**{name: np.asarray(values) for name, values in table(**changes).items()})
+
+
+@pytest.mark.parametrize("kind", [InputScale, Requantize, LogitScale])
+def test_every_column_of_a_scale_at_the_ends_of_its_range(kind: type) -> None:
+    ends = {
+        "offset": (-(1 << 31), (1 << 31) - 1), "multiplier": (0, 32767), "bias": (-(1 << 30), (1 << 30) - 1),
+        "before": (0, 16 if kind is InputScale else 30), "after": (0, 30),
+    }  # fmt: skip
+    for name in kind.RANGES:
+        low, high = ends[name]
+        columns = {other: np.array([0, 0]) for other in kind.RANGES}
+        scale = kind(**columns | {name: np.array([low, high])})
+        assert len(scale) == 2 and getattr(scale, name).tolist() == [low, high]
+        for wrong in (low - 1, high + 1):
+            with pytest.raises(BundleError, match=f"has {name} .0, {wrong}.; accepted are whole numbers from {low}"):
+                kind(**columns | {name: np.array([0, wrong])})

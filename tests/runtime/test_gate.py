@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -196,3 +196,39 @@ def test_raw_signals_are_computed_once_for_signals_that_differ_only_later() -> N
     # The baseline begins with the first sample, and the size is in sixteenths of the floor.
     assert follow(block.copy(), signals, deviations=True)[:, 0].tolist() == [[0] * 5, [-8, -8, -1, 0, 4]]
     assert follow(block[..., :2].copy(), signals[:2])[1, 0].tolist() == [-(8 * 16 // 10), -(8 * 16 // 99)]
+
+
+RANGES = [
+    (Signal, "kind", 0, 1), (Signal, "lag", 1, 16), (Signal, "shift", 0, 24), (Signal, "baseline", 1, 15),
+    (Signal, "noise", 1, 15), (Signal, "floor", 1, 1 << 20), (Rule, "affect", 0, 3), (Rule, "gesture", 0, 255),
+    (Rule, "within", 0, 255), (Rule, "deaf", 0, 65535), (Term, "signal", 0, 0), (Term, "threshold", 1, 1 << 25),
+    (Term, "sign", -1, 1), (Term, "times", 1, 255),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("part", "name", "low", "high"), RANGES)
+def test_every_setting_at_the_ends_of_its_range(part: type, name: str, low: int, high: int) -> None:
+    def made(value: object) -> GateSettings:
+        change = {name: value}
+        signal = replace(LEVELS.signals[0], **change) if part is Signal else LEVELS.signals[0]
+        term = replace(BLOW.terms[0], **change) if part is Term else BLOW.terms[0]
+        rule = replace(BLOW, **change) if part is Rule else BLOW
+        return GateSettings((signal,), (replace(rule, terms=(term,)),))
+
+    assert made(low) and made(high)
+    for wrong in (low - 1, high + 1, True, float(high)):
+        with pytest.raises(BundleError, match=f"accepted are {low} to {high}"):
+            made(wrong)
+
+
+def test_how_many_signals_rules_terms_and_inputs_there_may_be() -> None:
+    signal, term = LEVELS.signals[0], BLOW.terms[0]
+    jerk = Signal(JERK, (254,) * 255, floor=10)
+    assert GateSettings((signal,) * 31 + (jerk,), (replace(BLOW, terms=(term,) * 8),) * 16)
+    for settings in (
+        ((signal,) * 33, ()), ((signal,), (BLOW,) * 17), ((signal,), (replace(BLOW, terms=(term,) * 9),)),
+        ((signal,), (replace(BLOW, terms=()),)), ((replace(jerk, inputs=(0,) * 256),), ()),
+        ((replace(signal, inputs=()),), ()), ((replace(signal, inputs=(-1,)),), ()),
+    ):  # fmt: skip
+        with pytest.raises(BundleError, match="The gate's settings have .*accepted are"):
+            GateSettings(*settings)
