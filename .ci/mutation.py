@@ -120,22 +120,23 @@ class Forks:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session: pytest.Session) -> bool | None:
+        known = [value for value in gc.get_objects() if type(value) is FunctionType]
         for mutant, tests, seconds in self.tasks or ():
+            name = "plushsense." + mutant.module.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+            mine = [function for function in known if function.__module__ == name]
             with changed_module(mutant) as code:
-                self.results.put((mutant, forked(partial(self.run, session, mutant, tests, code), seconds)))
+                self.results.put((mutant, forked(partial(self.run, session, tests, mine, code), seconds)))
         return None if self.tasks is None else True
 
-    def run(self, session: pytest.Session, mutant: Mutant, tests: list[str], code: CodeType) -> int:
-        """Run tests with the new code in the functions of the module, wherever they are used, if it is loaded."""
-        name = "plushsense." + mutant.module.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-        functions, parts = {}, [code]
+    def run(self, session: pytest.Session, tests: list[str], known: list[FunctionType], code: CodeType) -> int:
+        """Run tests with the code of a changed module in its functions, wherever they are used, if it is loaded."""
+        parts, new = [code], {}
         for part in parts:
             parts += [constant for constant in part.co_consts if isinstance(constant, CodeType)]
-            functions[part.co_qualname, part.co_firstlineno] = part
-        for known in gc.get_objects():
-            if isinstance(known, FunctionType) and known.__module__ == name:
-                old = known.__code__
-                known.__code__ = functions.get((old.co_qualname, old.co_firstlineno), old)
+            new[part.co_qualname, part.co_firstlineno] = part
+        for function in known:
+            old = function.__code__
+            function.__code__ = new.get((old.co_qualname, old.co_firstlineno), old)
         factory = session.config._tmp_path_factory  # type: ignore[attr-defined]
         factory._given_basetemp, factory._basetemp = Path("tmp").resolve(), None
         session.items = self.chosen(session.items, tests)
