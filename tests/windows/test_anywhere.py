@@ -190,7 +190,8 @@ def test_a_class_for_idleness_is_added_where_there_is_none(tmp_path: Path) -> No
     w = cut_anywhere(plain, SPEC, add_idle_gesture(plain.gestures, plain), EVERY)
     assert len(newest(w, "Idle")) > 500
     assert set(w.subject) == {"ana"}
-    assert "ana/fulldatastream (unmarked)" in w.recording_ids
+    unmarked = w.recording == w.recording_ids.index("ana/fulldatastream (unmarked)")
+    assert unmarked.sum() > 500 and np.all(w.recording_rows[unmarked] == 0), "no rows, so that it overlaps no other"
     assert set(cut_anywhere(plain, SPEC, plain.gestures, EVERY).y) == {0, 1}, "no class, no idleness"
 
 
@@ -262,3 +263,26 @@ def test_settings_at_the_ends_of_their_range() -> None:
     assert AnywhereSpec(after_s=0.5, settle_s=0.5).settle_s == 0.5
     with pytest.raises(ConfigError, match="settle_s must not be below after_s"):
         AnywhereSpec(after_s=0.5, settle_s=0.4)
+
+
+def test_what_gives_no_window_is_named_and_streams_are_counted(tmp_path: Path) -> None:
+    person(tmp_path / "src" / "ana", {(500, 200): "Wave"})
+    ben = tmp_path / "src" / "ben"
+    ben.mkdir()
+    bad = ramp(0, 80)
+    write_recording(ben / "Shake_5_80.csv", replace(bad, values=bad.values + 40_000), ACCEL)
+    data = made(tmp_path)
+    seen: list[tuple[int, int]] = []
+    w = cut_anywhere(data, SPEC, data.gestures, EVERY, lambda *done: seen.append(done))
+    assert seen == [(1, 1)] and w.left_out == ("ben/Shake_5_80: no valid sample",)
+    with pytest.raises(DatasetError, match="gives no window: 1 recordings of 1 gestures"):
+        cut_anywhere(data, SPEC, data.gestures.subset(["Shake"]), EVERY)
+    alone = made_alone(tmp_path / "alone")
+    assert add_idle_gesture(alone.gestures, alone) == alone.gestures, "without a stream nothing is known to be idle"
+
+
+def made_alone(folder: Path) -> Dataset:
+    """One recording, and no stream."""
+    (folder / "src" / "ben").mkdir(parents=True)
+    write_recording(folder / "src" / "ben" / "Wave_5_80.csv", ramp(0, 80), ACCEL)
+    return made(folder, Gesture("Wave"))
