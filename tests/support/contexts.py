@@ -16,11 +16,12 @@ _failed: set[str] = set()
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Count what runs from here on for this test; processes that it starts read `COVERAGE_TEST` (pyproject.toml)."""
+    """Count what runs from here on for this test, also in processes that it starts."""
     current = coverage.Coverage.current()
-    os.environ["COVERAGE_TEST"] = item.nodeid
     if current is not None:
         current.switch_context(item.nodeid)
+        current.config.context = item.nodeid
+        os.environ["COVERAGE_PROCESS_CONFIG"] = current.config.serialize()
     begin = sum(os.times()[:4])
     try:
         return (yield)
