@@ -43,7 +43,6 @@ ROOT = Path(__file__).resolve().parents[1]
 SRC = ROOT / "src" / "plushsense"
 STATE = ROOT / "build" / "coverage"
 PACKAGES = ("runtime", "windows", "scoring", "deploy")
-MOST_S = 120.0  # of all tests of a mutant
 # For constants, which no line of a test reads: the reference pins defaults, the formats answers of a network.
 ALWAYS = ("tests/test_reference.py", "tests/test_formats.py")
 MEMORY_BYTES = 6 << 30
@@ -54,12 +53,19 @@ LOST = ("survived", "not run")
 class Mutant:
     module: str  # below src/plushsense
     line: int
+    column: int
     statement: int  # its first line
     in_function: bool
     number: int  # of the change in its module
     kind: str
     before: str
     after: str
+
+    @property
+    def change(self) -> tuple[str, str, str]:
+        """The text of the line with a mark where the change is, before and after."""
+        line = (SRC / self.module).read_text("utf-8").splitlines()[self.line - 1]
+        return f"{line[: self.column]}@{line[self.column :]}".strip(), self.before, self.after
 
     def __str__(self) -> str:
         return f"{self.module}:{self.line} {self.kind}: {self.before}  ->  {self.after}"
@@ -76,14 +82,14 @@ def sample_of(n: int, seed: int) -> list[Mutant]:
         name = path.relative_to(SRC).as_posix()
         for i, (old, kind, new, statement, inside) in enumerate(changes(ast.parse(path.read_text("utf-8")))):
             before, after = (ast.unparse(node).split("\n")[0][:110] for node in (old, new))
-            line: int = old.lineno  # type: ignore[attr-defined]
-            places[name, line].append(Mutant(name, line, statement, inside, i, kind, before, after))
+            place: tuple[int, int] = old.lineno, old.col_offset  # type: ignore[attr-defined]
+            places[name, place[0]].append(Mutant(name, *place, statement, inside, i, kind, before, after))
     draw = random.Random(seed)
     return [draw.choice(places[place]) for place in draw.sample(sorted(places), n)]
 
 
-def tests_of(sample: list[Mutant]) -> Iterator[tuple[list[str], float]]:
-    """Yield the tests of each mutant, quickest first, and the seconds that they take."""
+def tests_of(sample: list[Mutant], most: float) -> Iterator[tuple[list[str], float]]:
+    """Yield the tests of each mutant, quickest first, and their seconds, ``most`` in all."""
     seconds: dict[str, float] = json.loads((STATE / "seconds.json").read_text("utf-8"))
     data = CoverageData(str(STATE / "data"))
     data.read()
@@ -97,9 +103,9 @@ def tests_of(sample: list[Mutant]) -> Iterator[tuple[list[str], float]]:
         spent, chosen = 0.0, list[str]()
         for test in sorted(tests, key=lambda test: (seconds[test], test)):
             spent += seconds[test]
-            if spent <= MOST_S or not chosen:
+            if spent <= most or not chosen:
                 chosen.append(test)
-        yield chosen, min(spent, MOST_S)
+        yield chosen, min(spent, most)
 
 
 class Forks:
@@ -256,8 +262,8 @@ def interval(k: int, n: int) -> str:
 def report(results: list[tuple[Mutant, str]]) -> None:
     """Print the survivors, and killed, timed out and survived by package."""
     rows = tomllib.loads((ROOT / ".ci" / "equivalent.toml").read_text("utf-8")).get("mutants", [])
-    reasons = {(row["module"], row["before"], row["after"]): row["reason"] for row in rows}
-    lost = [(m, result, reasons.get((m.module, m.before, m.after))) for m, result in results if result in LOST]
+    reasons = {(row["module"], row["line"], row["before"], row["after"]): row["reason"] for row in rows}
+    lost = [(m, result, reasons.get((m.module, *m.change))) for m, result in results if result in LOST]
     for m, result, reason in sorted(lost, key=lambda row: (row[2] is not None, str(row[0]))):
         print(f"equivalent: {m} ({reason})" if reason else f"{result}: {m}")
     for package in (*PACKAGES, ""):
@@ -274,6 +280,7 @@ def main() -> None:
     parser.add_argument("--mutants", type=int, default=200, help="number of lines to sample")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--seconds", type=float, default=30.0, help="of the tests for a mutant, the quickest first")
     parser.add_argument("--control", action="store_true", help="change nothing: all must survive")
     parser.add_argument("--again", action="store_true", help="run what survived the last time, not a new sample")
     args = parser.parse_args()
@@ -283,7 +290,7 @@ def main() -> None:
         sample = [replace(mutant, kind="", before="", after="") for mutant in sample]
     for module in ("hypothesis", "numpy", "torch", "polars", "matplotlib", "cattrs", "jinja2", "safetensors.numpy"):
         importlib.import_module(module)
-    tasks = [(mutant, *found) for mutant, found in zip(sample, tests_of(sample), strict=True)]
+    tasks = [(mutant, *found) for mutant, found in zip(sample, tests_of(sample, args.seconds), strict=True)]
     results = dict.fromkeys(sample, "not run")
 
     def take(found: Iterator[tuple[Mutant, str]]) -> None:
