@@ -127,6 +127,7 @@ class Forks:
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session: pytest.Session) -> bool | None:
         known = [value for value in gc.get_objects() if type(value) is FunctionType]
+        gc.freeze()  # so that a collection in a fork does not copy all pages
         for mutant, tests, seconds in self.tasks or ():
             name = "plushsense." + mutant.module.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
             mine = [function for function in known if function.__module__ == name]

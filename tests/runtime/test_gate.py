@@ -54,6 +54,11 @@ def test_it_fires_at_the_second_high_sample_and_is_then_deaf() -> None:
     assert fired(LEVELS, tremble([100] * 20 + [2000] * 9)) == [(21, 0), (27, 0)]  # deaf for five between
 
 
+def test_the_second_sample_may_be_a_blow() -> None:
+    at_once = GateSettings(LEVELS.signals, (Rule((Term(0, 32),), 3, 255), Rule((Term(0, 32, times=1),), 3, 255, 0, 2)))
+    assert fired(at_once, tremble([100] + [400] * 4)) == [(1, 1), (4, 0)]
+
+
 def test_a_slow_drift_of_any_size_is_followed() -> None:
     """Humidity: the baseline goes with it."""
     assert fired(LEVELS, tremble([100 + at // 12 for at in range(60_000)])) == []
