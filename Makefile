@@ -60,7 +60,7 @@ fuzz: $(VENV)/.dev
 	  tests/deploy/test_firmware.py::test_computer_and_toy_read_one_grammar
 
 BASE := core devices recording dataset windows models runtime live tuning scoring
-COVERED := $(addprefix tests/,$(BASE) deploy cli)
+COVERED := $(addprefix tests/,$(BASE) deploy cli test_formats.py test_reference.py)
 SECONDS := build/coverage/seconds.json
 # Without xdist, so that each line is counted for the test that ran it.
 $(SECONDS): $(VENV)/.dev
