@@ -286,3 +286,10 @@ def made_alone(folder: Path) -> Dataset:
     (folder / "src" / "ben").mkdir(parents=True)
     write_recording(folder / "src" / "ben" / "Wave_5_80.csv", ramp(0, 80), ACCEL)
     return made(folder, Gesture("Wave"))
+
+
+def test_a_stream_of_just_one_window_gives_it(tmp_path: Path) -> None:
+    person(tmp_path / "src" / "ana", {(20, 80): "Wave"}, rows=100)
+    data = made(tmp_path)
+    w = cut_anywhere(data, SPEC, data.gestures, EVERY)
+    assert w.context.tolist() == ["anywhere"] and w.x[0, 0].tolist() == [*range(100)]
