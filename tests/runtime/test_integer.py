@@ -15,6 +15,7 @@ from plushsense.core.errors import BadInput, BundleError
 from plushsense.models.arch import Arch, ConvLayer
 from plushsense.runtime.image import IntegerModel
 from plushsense.runtime.integer import IntegerLayer, IntegerNetwork, rounded_weights
+from plushsense.runtime.vectors import down_for
 from support.integers import INT32, any_network, models, plain_model, vector_model, window_model
 
 
@@ -247,3 +248,10 @@ def test_a_vector_layer_that_is_another_or_leaves_its_bits_is_refused() -> None:
     ):
         with pytest.raises(BundleError, match=words):
             dataclasses.replace(vectors, **changes)  # type: ignore[arg-type]
+
+
+def test_the_smallest_shift_of_a_kernel() -> None:
+    weights = np.zeros((1, 5, 3), dtype=np.int8)
+    weights[0, 1:] = [[0, 1, 0], [1, -1, 0], [-128, -128, -128], [1, 1, 1]]
+    # 32767 times the weights: 0, 15 bits, 16, 24 and 17, of which 14 may stay.
+    assert down_for(weights).tolist() == [[0, 1, 2, 10, 3]]
