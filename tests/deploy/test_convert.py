@@ -138,14 +138,31 @@ def test_onnx_says_what_it_is(tmp_path: Path, onnx_here: None) -> None:
     assert [d.dim_param or d.dim_value for d in shape] == ["N", 11, bundle.arch.span]
 
 
-def test_probabilities_are_the_softmax(onnx_here: None) -> None:
+def softmax(logits: Any) -> Any:
+    e = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return e / e.sum(axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("integers", [False, True])
+def test_probabilities_are_the_softmax(integers: bool, onnx_here: None, litert_here: None) -> None:
     import onnxruntime
+    from ai_edge_litert.interpreter import Interpreter
 
     bundle = made(NETS[1])
-    session = onnxruntime.InferenceSession(as_onnx.float_model(bundle), providers=["CPUExecutionProvider"])
-    raw = others(bundle)
-    found = session.run(["probabilities"], {"raw": raw.astype(np.float32)})[0]
-    np.testing.assert_allclose(found, bundle.network().probabilities(bundle.scaler.apply(raw)), atol=1e-5)
+    raw = others(bundle, 4)
+    parts = (bundle, integer_network(bundle)) if integers else (bundle,)
+    to_onnx, to_tflite = (
+        getattr(room, "integer_model" if integers else "float_model") for room in (as_onnx, as_tflite)
+    )
+    session = onnxruntime.InferenceSession(to_onnx(*parts), providers=["CPUExecutionProvider"])
+    logits, found = session.run(["logits", "probabilities"], {"raw": raw.astype(np.float32)})
+    np.testing.assert_allclose(found, softmax(logits), atol=1e-6)
+    if not integers:
+        np.testing.assert_allclose(found, bundle.network().probabilities(bundle.scaler.apply(raw)), atol=1e-5)
+    run = Interpreter(model_content=to_tflite(*parts), num_threads=1).get_signature_runner("serving_default")
+    answers = [run(raw=np.ascontiguousarray(row.T[None], dtype=np.float32)) for row in raw]
+    logits, found = (np.concatenate([answer[name] for answer in answers]) for name in ("logits", "probabilities"))
+    np.testing.assert_allclose(found, softmax(logits), atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["onnx", "tflite"])

@@ -170,22 +170,65 @@ def test_nothing_to_count_on(small: Path, monkeypatch: pytest.MonkeyPatch, tmp_p
         profile(small, ["cortex-m4"])
 
 
+CORE = replace(
+    next(c for c in cores() if c.name == "esp32"),
+    mhz=100,
+    cycles_low=1.0,
+    cycles_high=2.0,
+    flash_mb_s=None,
+    volts=2.0,
+    ma=(10.0, 30.0),
+)
+SECTIONS = {
+    "plushsense": {"text": 15_000, "others": 5_000, "rodata": 0, "data": 0, "bss": 0},
+    "plush_model": {"text": 0, "others": 0, "rodata": 10_000, "data": 0, "bss": 0},
+}
+
+
+def test_a_cost_adds_up_its_sections_and_names_what_it_should_not_need() -> None:
+    sections = {
+        "plushsense": {"text": 15_000, "others": 5_000, "rodata": 300, "data": 20, "bss": 7},
+        "plush_model": {"text": 1, "others": 0, "rodata": 10_000, "data": 40, "bss": 0},
+    }
+    counts = {"step": 10, "step_most": 11, "even": 12, "gap": 13, "call_most": 14, "call_bound": 15, "begin": 16}
+    needs = ("__addsf3", "__aeabi_i2d", "__divsi3", "_sbrk", "free", "memset")
+    cost = Cost(
+        "xtensa", **counts, stages={"clock": 3}, sections=sections, toy_bytes=500, memory_bytes=1000, stack_push=17,
+        stack_begin=18, stack_memory_bytes=19, stack_functions={"f": 20}, needs=needs, masking=("wfi",),
+    )  # fmt: skip
+    assert cost.flash_bytes == 15_000 + 300 + 20 + 1 + 10_000 + 40
+    assert cost.ram_bytes == 500 + 1000 + 20 + 7 + 40
+    assert cost.running_bytes() == 10_320 + 10_040 and cost.running_bytes(with_model=False) == 10_320
+    assert cost.to_dict() == {
+        "title": TARGETS["xtensa"].title,
+        "instructions_per_step": 10,
+        "instructions_per_step_most": 11,
+        "instructions_per_step_even": 12,
+        "instructions_longest_call": 13,
+        "instructions_call_most": 14,
+        "instructions_call_bound": 15,
+        "instructions_begin": 16,
+        "stages": {"clock": 3},
+        "sections": sections,
+        "flash_bytes": cost.flash_bytes,
+        "ram_bytes": cost.ram_bytes,
+        "toy_bytes": 500,
+        "memory_bytes": 1000,
+        "stack_push_bytes": 17,
+        "stack_begin_bytes": 18,
+        "stack_memory_bytes_call": 19,
+        "stack_functions": {"f": 20},
+        "needs": list(needs),
+        "interrupts_off": ["wfi"],
+        "heap": ["_sbrk", "free"],
+        "floating_point": ["__addsf3", "__aeabi_i2d"],
+    }
+
+
 def test_estimates_are_a_band_and_a_verdict() -> None:
-    core = replace(
-        next(c for c in cores() if c.name == "esp32"),
-        mhz=100,
-        cycles_low=1.0,
-        cycles_high=2.0,
-        flash_mb_s=None,
-        volts=2.0,
-        ma=(10.0, 30.0),
-    )
+    core, sections = CORE, SECTIONS
     stream = Arch.parse("9d1_5d2", "4,6", channels=3, classes=4)
     window = Arch.parse("9d1_5d2", "4,6", channels=3, classes=4, padding="mirror")
-    sections = {
-        "plushsense": {"text": 15_000, "others": 5_000, "rodata": 0, "data": 0, "bss": 0},
-        "plush_model": {"text": 0, "others": 0, "rodata": 10_000, "data": 0, "bss": 0},
-    }
 
     def of(instructions: int, core: Core = core, arch: Arch = stream) -> Estimate:
         counts = dict.fromkeys(("step_most", "even", "gap", "call_most", "begin", "stack_push", "stack_begin"), 1)
@@ -219,6 +262,14 @@ def test_estimates_are_a_band_and_a_verdict() -> None:
     # A window that the cache holds is fetched once, else for each of its samples.
     assert of(1_000_000, flash, window).flash_ms == 2.0
     assert of(1_000_000, replace(flash, cache_kb=16), window).flash_ms == 2.0 * window.span
+    assert found.to_dict() == {
+        "estimate": True, "chip": core.title, "mhz": 100, "counted_on": "xtensa", "instructions": 1_000_000,
+        "cycles_per_instruction": [1.0, 2.0], "flash_mb_s": None, "low": 10.0, "high": 20.0, "of_it_flash": 0.0,
+        "longest_call": 40.0, "energy_uj": [200.0, 1200.0], "volts": 2.0, "current_ma": [10.0, 30.0],
+        "current_source": core.power, "fits": "yes", "verdict": found.verdict, "why": core.why,
+    }  # fmt: skip
+    assert slow.to_dict()["of_it_flash"] == 10.0 and slow.to_dict()["longest_call"] == 42.0
+    assert found.largest_rate_hz == (50.0, 100.0) and of(2_500_000).fits == "yes" and of(5_000_000).fits == "unsure"
     assert of(4_000_000).verdict.startswith("fits 20 Hz: not sure, it would use about 80 to 160")
     assert of(6_000_000).verdict == "fits 20 Hz: no, it would use 120 % of the core or more"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import replace
 from typing import Any
@@ -513,3 +514,37 @@ def test_updates_as_events_with_labels_and_seconds() -> None:
 def test_a_setting_that_the_toy_could_not_hold_is_refused(name: str, value: Any) -> None:
     with pytest.raises(BundleError, match=name):
         EventSettings(**{name: value})
+
+
+@given(st.data())
+def test_many_steps_at_once_are_those_steps_one_by_one(data: st.DataObject) -> None:
+    """`skip` and `stay` leave the machine as `follow` does."""
+    machine = EventMachine(replace(SETTINGS, rest=3, wait=4, hold=2), UNSMOOTHED, SET)
+    candidates = st.sampled_from(
+        [(NO_GESTURE, 0), (STROKE, POSITIVE), (SCRATCH, POSITIVE), (NO_GESTURE, POSITIVE), (THING, 0)]
+    )
+    now = 0
+    for gesture, affect in data.draw(st.lists(candidates, max_size=14)):
+        if data.draw(st.sampled_from([False, False, True])):
+            machine.gate(POSITIVE, data.draw(st.sampled_from([NO_GESTURE, STROKE])), now)
+        machine.follow([ONE // 7] * 7, STROKE, gesture, affect, now)
+        now += 1
+    steps = data.draw(st.integers(1, 6))
+    one_by_one = copy.deepcopy(machine)
+    if not machine.open:
+        for at in range(steps):
+            assert one_by_one.follow([], STROKE, NO_GESTURE, 0, now + at) == []
+        machine.skip(steps, now)
+    elif machine.gesture != NO_GESTURE or machine.affect:
+        stays = [(NO_GESTURE, 0), (NO_GESTURE, machine.affect), (machine.gesture, machine.affect)]
+        gesture, affect = data.draw(st.sampled_from(stays))
+        for at in range(steps):
+            assert one_by_one.follow([ONE] * 7, STROKE, gesture, affect, now + at) == []
+        machine.stay(steps, gesture, affect, now)
+    else:
+        return
+    # The time of the first step away only counts while steps are away.
+    apart = {"_idle", "_away_since"}
+    assert {k: v for k, v in vars(machine).items() if k not in apart} == {
+        k: v for k, v in vars(one_by_one).items() if k not in apart
+    }

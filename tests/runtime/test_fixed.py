@@ -208,3 +208,29 @@ def test_scales_that_the_toy_cannot_hold(changes: dict[str, Any], words: str) ->
     for kind in (Requantize, LogitScale):
         with pytest.raises(BundleError, match=words):
             kind(**{name: np.asarray(values) for name, values in table(**changes).items()})
+
+
+@pytest.mark.parametrize("kind", [InputScale, Requantize, LogitScale])
+def test_every_column_of_a_scale_at_the_ends_of_its_range(kind: type) -> None:
+    ends = {
+        "offset": (-(1 << 31), (1 << 31) - 1), "multiplier": (0, 32767), "bias": (-(1 << 30), (1 << 30) - 1),
+        "before": (0, 16 if kind is InputScale else 30), "after": (0, 30),
+    }  # fmt: skip
+    for name in kind.RANGES:
+        low, high = ends[name]
+        columns = {other: np.array([0, 0]) for other in kind.RANGES}
+        scale = kind(**columns | {name: np.array([low, high])})
+        assert len(scale) == 2 and getattr(scale, name).tolist() == [low, high]
+        for wrong in (low - 1, high + 1):
+            with pytest.raises(BundleError, match=f"has {name} .0, {wrong}.; accepted are whole numbers from {low}"):
+                kind(**columns | {name: np.array([0, wrong])})
+
+
+def test_a_ratio_just_below_a_power_of_two_is_that_power() -> None:
+    for power in (-15, -1, 0, 1, 14):
+        before, multiplier, after = split_ratio(2.0**power * (1 - 1e-6), 1000.0)
+        assert (before, multiplier, after) == (0, 1 << 14, 14 - power)
+    assert split_ratio(1 - 1e-6, 1 << 20) == (6, 1 << 14, 8), "21 bits become 15"
+    assert split_ratio(1 - 1e-6, 1 << 20, most_before=3) == (3, 1 << 14, 11)
+    assert split_ratio(2.0**-14, 10.0, most_after=5) == (0, 0, 5) and split_ratio(2.0**-40, 10.0) == (0, 0, 30)
+    assert split_ratio(32767.6, 0.0) == split_ratio(32767.0, 0.0) == (0, 32767, 0)

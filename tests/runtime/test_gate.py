@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
 from plushsense.core.errors import BundleError, ConfigError
 from plushsense.runtime.decisions import DecideSpec
-from plushsense.runtime.gate import HELD, JERK, LEVEL, Gate, GateSettings, Rule, Signal, Term, firings
+from plushsense.runtime.gate import (
+    HELD,
+    JERK,
+    LEVEL,
+    Gate,
+    GateSettings,
+    Rule,
+    Signal,
+    Term,
+    firings,
+    follow,
+    raw_signals,
+)
 from plushsense.tuning.gate import signal_sizes
 
 BLOW = Rule((Term(0, 32, times=2),), affect=3, gesture=255, within=3, deaf=5)
@@ -40,6 +52,11 @@ def test_it_fires_at_the_second_high_sample_and_is_then_deaf() -> None:
     assert fired(LEVELS, tremble([100] * 20 + [121] * 3)) == [(21, 0)]
     assert fired(LEVELS, tremble([100] * 20 + [400] + [100] * 10)) == []  # one sample is no row
     assert fired(LEVELS, tremble([100] * 20 + [2000] * 9)) == [(21, 0), (27, 0)]  # deaf for five between
+
+
+def test_the_second_sample_may_be_a_blow() -> None:
+    at_once = GateSettings(LEVELS.signals, (Rule((Term(0, 32),), 3, 255), Rule((Term(0, 32, times=1),), 3, 255, 0, 2)))
+    assert fired(at_once, tremble([100] + [400] * 4)) == [(1, 1), (4, 0)]
 
 
 def test_a_slow_drift_of_any_size_is_followed() -> None:
@@ -160,3 +177,63 @@ def test_plain_values_and_back() -> None:
     assert DecideSpec.from_dict({"gate": {}}).gate == GateSettings()
     with pytest.raises(ConfigError, match=r"gate\.signals\[0\]\.inputs is missing"):
         DecideSpec.from_dict({"gate": {"signals": [{"kind": 0}]}})
+
+
+def test_no_sample_is_suspect_unless_named_and_stretches_together_fire_as_alone() -> None:
+    x = np.array(tremble([100] * 20 + [121] * 3))
+    assert firings(LEVELS, [x]) == firings(LEVELS, [x], [np.zeros(23, dtype=np.bool_)]) == [[(21, 0)]]
+    assert firings(LEVELS, [x, x, x[:3]]) == [[(21, 0)], [(21, 0)], []]
+    assert firings(LEVELS, []) == [] and firings(LEVELS, [x[:0]]) == [[]]
+    assert firings(GateSettings(), [x, x]) == [[], []]
+
+
+def test_raw_signals_are_computed_once_for_signals_that_differ_only_later() -> None:
+    x = np.array([[0, 5], [-8, 1], [-40, 1], [2**30, -3]])
+    signals = (
+        Signal(LEVEL, (0,), floor=10), Signal(LEVEL, (0,), floor=99), Signal(LEVEL, (0,), shift=3),
+        Signal(JERK, (0, 1), lag=2), Signal(JERK, (1,)),
+    )  # fmt: skip
+    assert raw_signals(x, signals).T.tolist() == [
+        [0, -8, -40, HELD], [0, -8, -40, HELD], [0, -1, -5, HELD], [0, 0, 44, HELD], [0, 4, 0, 4]
+    ]  # fmt: skip
+    block = raw_signals(x[:2], signals).astype(np.int32)[:, None]
+    assert follow(block[:0].copy(), signals).shape == (0, 1, 5)
+    # The baseline begins with the first sample, and the size is in sixteenths of the floor.
+    assert follow(block.copy(), signals, deviations=True)[:, 0].tolist() == [[0] * 5, [-8, -8, -1, 0, 4]]
+    assert follow(block[..., :2].copy(), signals[:2])[1, 0].tolist() == [-(8 * 16 // 10), -(8 * 16 // 99)]
+
+
+RANGES = [
+    (Signal, "kind", 0, 1), (Signal, "lag", 1, 16), (Signal, "shift", 0, 24), (Signal, "baseline", 1, 15),
+    (Signal, "noise", 1, 15), (Signal, "floor", 1, 1 << 20), (Rule, "affect", 0, 3), (Rule, "gesture", 0, 255),
+    (Rule, "within", 0, 255), (Rule, "deaf", 0, 65535), (Term, "signal", 0, 0), (Term, "threshold", 1, 1 << 25),
+    (Term, "sign", -1, 1), (Term, "times", 1, 255),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("part", "name", "low", "high"), RANGES)
+def test_every_setting_at_the_ends_of_its_range(part: type, name: str, low: int, high: int) -> None:
+    def made(value: object) -> GateSettings:
+        change = {name: value}
+        signal = replace(LEVELS.signals[0], **change) if part is Signal else LEVELS.signals[0]
+        term = replace(BLOW.terms[0], **change) if part is Term else BLOW.terms[0]
+        rule = replace(BLOW, **change) if part is Rule else BLOW
+        return GateSettings((signal,), (replace(rule, terms=(term,)),))
+
+    assert made(low) and made(high)
+    for wrong in (low - 1, high + 1, True, float(high)):
+        with pytest.raises(BundleError, match=f"accepted are {low} to {high}"):
+            made(wrong)
+
+
+def test_how_many_signals_rules_terms_and_inputs_there_may_be() -> None:
+    signal, term = LEVELS.signals[0], BLOW.terms[0]
+    jerk = Signal(JERK, (254,) * 255, floor=10)
+    assert GateSettings((signal,) * 31 + (jerk,), (replace(BLOW, terms=(term,) * 8),) * 16)
+    for settings in (
+        ((signal,) * 33, ()), ((signal,), (BLOW,) * 17), ((signal,), (replace(BLOW, terms=(term,) * 9),)),
+        ((signal,), (replace(BLOW, terms=()),)), ((replace(jerk, inputs=(0,) * 256),), ()),
+        ((replace(signal, inputs=()),), ()), ((replace(signal, inputs=(-1,)),), ()),
+    ):  # fmt: skip
+        with pytest.raises(BundleError, match="The gate's settings have .*accepted are"):
+            GateSettings(*settings)

@@ -15,7 +15,8 @@ from plushsense.core.errors import BadInput, BundleError
 from plushsense.models.arch import Arch, ConvLayer
 from plushsense.runtime.image import IntegerModel
 from plushsense.runtime.integer import IntegerLayer, IntegerNetwork, rounded_weights
-from support.integers import INT32, any_network, models, plain_model, window_model
+from plushsense.runtime.vectors import down_for
+from support.integers import INT32, any_network, models, plain_model, vector_model, window_model
 
 
 def samples_of(model: IntegerModel, n: int, seed: int) -> NDArray[np.int64]:
@@ -223,3 +224,34 @@ def test_parts_that_do_not_fit() -> None:
         any_network(long, model.layout, np.random.default_rng(1))
     fits = Arch((ConvLayer(1, 1, 1),), channels=2, classes=2, window=600, step=257, pool=257)
     any_network(fits, model.layout, np.random.default_rng(1))
+
+
+def test_a_vector_layer_that_is_another_or_leaves_its_bits_is_refused() -> None:
+    network = vector_model().network
+    vectors = network.vectors
+    assert vectors is not None and changed(network).vectors is vectors
+    with pytest.raises(BundleError, match="has another vector layer than"):
+        changed(network, vectors=None)
+    limit = np.array([16])
+    for shift, down in ((limit, vectors.down), (-limit, vectors.down), (vectors.shift, vectors.down * 0 + 30)):
+        assert dataclasses.replace(vectors, shift=shift, down=down)
+    for changes, words in (
+        ({"weights": vectors.weights[:, :1]}, r"has weights \(1, 1, 3\); the network needs \(1, 2, 3\)"),
+        ({"down": vectors.down[:, :1]}, "the network needs"),
+        ({"shift": np.array([0, 0])}, "the network needs"),
+        ({"weights": vectors.weights.astype(np.int16)}, "weights of int16: accepted is int8"),
+        ({"shift": limit + 1}, "accepted are ±16 and 0 to 30"),
+        ({"shift": -limit - 1}, "accepted are ±16 and 0 to 30"),
+        ({"down": vectors.down * 0 + 31}, "accepted are ±16 and 0 to 30"),
+        ({"down": vectors.down * 0 - 1}, "accepted are ±16 and 0 to 30"),
+        ({"down": vectors.down - 1}, "could leave its 15 bits"),
+    ):
+        with pytest.raises(BundleError, match=words):
+            dataclasses.replace(vectors, **changes)  # type: ignore[arg-type]
+
+
+def test_the_smallest_shift_of_a_kernel() -> None:
+    weights = np.zeros((1, 5, 3), dtype=np.int8)
+    weights[0, 1:] = [[0, 1, 0], [1, -1, 0], [-128, -128, -128], [1, 1, 1]]
+    # 32767 times the weights: 0, 15 bits, 16, 24 and 17, of which 14 may stay.
+    assert down_for(weights).tolist() == [[0, 1, 2, 10, 3]]

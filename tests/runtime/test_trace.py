@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +13,18 @@ from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.recorder_csv import Frames, read_stream
 from plushsense.deploy.quantize import integer_model
 from plushsense.runtime.decisions import DecideSpec, argmax_spec
+from plushsense.runtime.events import BEGUN, CNN, ENDED, GATE, NAMED, NO_GESTURE, Update
 from plushsense.runtime.fixed import integer_logits
 from plushsense.runtime.gate import JERK, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
-from plushsense.runtime.trace import replay, trace_of
+from plushsense.runtime.trace import ReportedEvent, TraceReplayer, replay, reported_events, trace_of
 from support.troubles import SPECS, STREAMS, TROUBLES, calibrate, events_of, lived, make_bundle, reader_of, same, stream
 
 ENGINES = ("float", "int8")
 BUNDLE = calibrate(make_bundle())
-GATE = GateSettings((Signal(JERK, (0, 1, 2), lag=2, floor=60),), (Rule((Term(0, 24),), 3, 255, deaf=12),))
+GATES = GateSettings((Signal(JERK, (0, 1, 2), lag=2, floor=60),), (Rule((Term(0, 24),), 3, 255, deaf=12),))
 SPEC = DecideSpec(
-    0.2, 0.4, 0.2, 0.5, 0.3, least_s=0.1, switch_s=0.1, end_s=0.1, hold_s=0.0, rest_s=0.1, wait_s=0.3, gate=GATE,
+    0.2, 0.4, 0.2, 0.5, 0.3, least_s=0.1, switch_s=0.1, end_s=0.1, hold_s=0.0, rest_s=0.1, wait_s=0.3, gate=GATES,
     health=HealthSettings((-1500,) * 3, (1500,) * 3, fault_ms=150, still_ms=300, recover_ms=100),
 )  # fmt: skip
 
@@ -124,3 +126,40 @@ def test_silence_in_the_middle_ends_the_event_and_the_stream_goes_on() -> None:
     after = lived(reader, frames.slice(500, 900))
     assert after[0].state == "tracking", "the gap was none on the toy's clock"
     assert next(e.number for d in after for e in d.events) == first[-1].events[0].number + 1
+
+
+def test_updates_become_whole_events() -> None:
+    updates = [
+        Update(BEGUN, 1, 3, NO_GESTURE, GATE, 900_000, 1_000_000),
+        Update(NAMED, 1, 3, 2, GATE, 900_000, 1_500_000),
+        Update(ENDED, 1, 3, 2, GATE, 1_700_000, 2_000_000),
+        Update(BEGUN, 2, 0, NO_GESTURE, CNN, 2_000_000, 3_000_000),
+        Update(NAMED, 2, 1, 0, CNN, 2_000_000, 3_250_000),
+        Update(BEGUN, 3, 2, 1, CNN, 4_000_000, 4_500_000),
+    ]
+    ended, named, last = reported_events(updates)
+    assert ended == ReportedEvent(1.0, 2.0, 2, 1.5, 3, GATE)
+    assert named == ReportedEvent(3.0, 4.5, 0, 3.25, 1, CNN), "it has not ended, and got its affect with its name"
+    assert last == ReportedEvent(4.5, 4.5, 1, 4.5, 2, CNN)
+    assert reported_events([]) == []
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_event_of_the_gate_without_affect_and_gesture(engine: str) -> None:
+    rule = Rule((Term(0, 24),), 0, NO_GESTURE, deaf=12)
+    spec = replace(SPEC, gate=replace(GATES, rules=(rule,)), enter=1.0, enter_affect=2.0, wait_s=0.5)
+    found = events_of(same(BUNDLE, spec, engine, stream(3, 900, [("blow", 0.3, 40), ("blow", 0.6, 3)])))
+    assert {(e[2], e[3]) for e in found} == {("none", None)} and len(found) >= 4
+
+
+def test_a_replayer_gives_the_events_of_settings_with_or_without_its_cache() -> None:
+    replayer = TraceReplayer(trace_of(stream(5, 900, []), BUNDLE))
+    spec = argmax_spec()
+    events = replayer.events(spec)
+    assert events and events == reported_events(replayer.replay(spec.rules(replayer.step_s), replayer.weight(0.0)))
+    assert replayer.weight(0.0) == 1 << 15 and 0 < replayer.weight(0.3) < 1 << 14
+    one = replayer.smoothed(9000)
+    assert np.array_equal(one[0].shares, replayer.smoothed(9000)[0].shares)
+    replayer.clear_cache()
+    assert replayer.events(spec) == events
+    assert np.array_equal(one[0].shares, replayer.smoothed(9000)[0].shares)

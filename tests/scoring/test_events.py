@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 
 import pytest
@@ -16,6 +17,7 @@ from plushsense.scoring.events import (
     at_recall,
     cost,
     front,
+    outside_insertions,
     overlaps,
     pooled,
     tally,
@@ -122,13 +124,64 @@ def test_saying_it_again_costs_a_little() -> None:
 def test_uncovered_time() -> None:
     assert uncovered_s([(0, 10), (20, 30)], [(2, 4), (3, 5), (8, 22)]) == pytest.approx(20 - 3 - 2 - 2)
     assert uncovered_s([(0, 10)], []) == 10
+    assert uncovered_s([(0, 10)], [(1, 6), (2, 3), (6, 7), (8, 9)]) == pytest.approx(3)
 
 
 def test_front_and_what_stands_at_a_recall() -> None:
     points = [(0.5, 10.0), (0.7, 30.0), (0.6, 40.0), (0.4, 10.0), (0.9, 100.0)]
     assert [points[i] for i in front(points)] == [(0.5, 10.0), (0.7, 30.0), (0.9, 100.0)]
     assert at_recall(points, 0.6) == pytest.approx(20.0)
+    assert at_recall(points, 0.5) == 10.0 and at_recall(points, 0.9) == 100.0
     assert at_recall(points, 0.45) is None and at_recall(points, 0.95) is None and at_recall([], 0.5) is None
+
+
+def test_scores_of_a_tally_by_hand() -> None:
+    t = Tally(truths=4, hits=3, fragmented=1, merged=1, fragmented_merged=2, events=7, matched=3, unnamed=1)
+    t.insertions, t.confused, t.latencies = 3, 1, [0.1, 0.2, 0.9]
+    assert (t.recall, t.precision, t.outside) == (0.75, 0.5, 2)
+    assert t.f1 == pytest.approx(0.6)
+    table = t.to_dict()
+    assert (table["fragmentations"], table["merges"], table["outside"], table["truths"]) == (3, 3, 2, 4)
+    assert (table["recall"], table["precision"], table["f1"]) == (t.recall, t.precision, t.f1)
+    assert table["latency_s"] == {"median": 0.2, "p90": pytest.approx(0.2 + 0.8 * 0.7)}
+    assert "latencies" not in table and json.dumps(table)
+    assert Tally(events=2, unnamed=2).precision is None and Tally(events=2, unnamed=2).f1 == 0.0
+
+
+def test_practice_is_matched_by_its_own_label_only() -> None:
+    practice = [at(0, 5)]
+    said = [at(1, 2), at(3, 4), at(2, 2.5, HIT), at(4, 4.5, UNNAMED), at(20, 21)]
+    found = tally([], said, 0.0, practice)
+    hug, hit, unnamed = found[HUG], found[HIT], found[UNNAMED]
+    assert (hug.events, hug.matched, hug.practised, hug.insertions, hug.confused) == (3, 2, 2, 1, 0)
+    assert (hug.truths, hug.hits, hug.deletions) == (0, 0, 0)
+    assert (hit.insertions, hit.confused, hit.practised) == (1, 1, 0)
+    assert (unnamed.events, unnamed.unnamed) == (1, 1)
+    affects = ["positive", "positive", "negative", "none", "positive"]
+    weights = ErrorCosts(confused=0.25, affect=0.5, outside=4.0, missed=100.0)
+    assert cost([], said, affects, FAMILIES, AFFECTS, weights, 0.0, practice) == 0.5 + 0.25 + 4.0
+    assert cost([at(1, 2)], said[:2], affects[:2], FAMILIES, AFFECTS, late_s=0.0, practice=practice) == 0.0
+
+
+def test_each_category_of_error_has_its_cost() -> None:
+    weights = ErrorCosts(again=1, family=2, confused=4, missed=8, outside=16, affect=32)
+
+    def charge(event: Interval, affect: str, affect_of: dict[str, str] = AFFECTS) -> float:
+        return cost([at(0, 2)], [event], [affect], FAMILIES, affect_of, weights, 0.0)
+
+    assert charge(at(0, 1, "stroke"), "none") == charge(at(0, 1, "hit"), "negative", AFFECTS | {"hug": "none"}) == 4
+    assert charge(at(0, 1, "stroke"), "positive") == 4 and charge(at(0, 1, "squeeze"), "positive") == 2
+    assert charge(at(0, 1, "hit"), "negative") == 32 and charge(at(0, 1, UNNAMED), "positive") == 2
+    # The lowest cost over the truths to whose time an event belongs; a truth is right once.
+    both = [at(0, 2), at(0, 2, HIT)]
+    assert cost(both, [at(0, 1, HIT), at(1, 2, HIT)], ["negative"] * 2, FAMILIES, AFFECTS, weights, 0.0) == 1
+
+
+def test_events_beside_all_truths_are_listed() -> None:
+    said = [at(0.5, 1), at(2.5, 3, HIT), at(20, 21)]
+    assert outside_insertions([at(0, 2)], said, late_s=1.0) == said[2:]
+    assert outside_insertions([at(0, 2)], said, late_s=0.0) == said[1:]
+    assert outside_insertions([], said) == said
 
 
 LABELS = st.sampled_from(["hug", "squeeze", "stroke", "hit"])

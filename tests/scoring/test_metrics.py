@@ -80,3 +80,47 @@ def test_summary_of_one_or_no_value_fits_json() -> None:
     assert metrics.summary([float("nan")]) == {"mean": None, "sd": None, "ci95": None}
     assert metrics.summary([0.5, float("nan")])["mean"] == 0.5
     json.dumps(metrics.summary([0.1, 0.2]), allow_nan=False)
+
+
+def test_accuracy_over_people_counts_each_person_alike_and_nobody_not() -> None:
+    truth, read = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 0, 1, 1, 0, 2])
+    subject = np.array(["P1", "P1", "P1", "P1", "P2", "none"])
+    assert metrics.accuracy_over_people(truth, read, subject) == pytest.approx((3 / 4 + 0) / 2)
+    assert metrics.accuracy_over_people(truth, read, np.full(6, "none")) is None
+
+
+def test_a_class_index_below_0_is_refused_and_the_highest_accepted() -> None:
+    top, low = np.array([2]), np.array([-1])
+    assert metrics.confusion(top, top, 3)[2, 2] == 1
+    assert metrics.confusion(top[:0], top[:0], 3).sum() == 0
+    with pytest.raises(BadInput, match="truth is out of range: accepted are 0 to 2"):
+        metrics.confusion(low, top, 3)
+    with pytest.raises(BadInput, match="truth is out of range"):
+        metrics.confusion(np.array([3]), top, 3)
+
+
+def test_rows_and_scores_by_key() -> None:
+    rows = metrics.class_rows(COUNTS, "abcd")
+    assert rows[1] == {"label": "b", "precision": 5 / 8, "recall": 5 / 7, "f1": pytest.approx(10 / 15), "support": 7}
+    assert [row["label"] for row in rows] == ["a", "b", "c", "d"]
+    assert json.loads(json.dumps(rows)) == rows
+    scores = metrics.scores_of(COUNTS)
+    assert scores == {key: metric.function(COUNTS) for key, metric in metrics.METRICS.items()}
+    assert scores["accuracy"] == metrics.accuracy(COUNTS)
+    assert metrics.macro_recall(COUNTS, all_classes=True) == pytest.approx((8 / 10 + 5 / 7) / 4)
+    assert np.isnan(metrics.macro_recall(COUNTS * 0, all_classes=True))
+    assert metrics.METRICS["macro_f1"].title == "Macro-F1"
+    assert list(metrics.column_metrics()) == ["accuracy", "macro_f1"]
+    assert [metric.percent for metric in metrics.METRICS.values()] == [True, False, False]
+
+
+def test_the_pareto_front_keeps_equal_rows_and_those_that_nothing_beats() -> None:
+    rows = [(0.9, 10.0, 5.0), (0.9, 10.0, 5.0), (0.8, 10.0, 5.0), (0.5, 9.0, 5.0), (0.9, 10.0, 6.0), (0.95, 20.0, 9.0)]
+    assert metrics.pareto_front(rows) == [True, True, False, True, False, True]
+
+
+def test_accuracy_by_the_logarithm_of_the_parameters() -> None:
+    assert metrics.accuracy_complexity_ratio(0.75, 10_000) == pytest.approx(0.1875)
+    assert metrics.accuracy_complexity_ratio(0.5, 2) == pytest.approx(0.5 / np.log10(2))
+    assert metrics.accuracy_complexity_ratio(0.5, 1) is None
+    assert metrics.accuracy_complexity_ratio(None, 100) is None

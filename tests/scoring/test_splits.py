@@ -215,3 +215,34 @@ def test_a_splitter_keeps_people_and_recordings_apart_and_says_what_it_lacks() -
     ):
         with pytest.raises((ArrayError, BadInput), match=match):
             list(splitter.split(x, y, groups))
+
+
+def test_a_split_knows_what_it_splits_and_what_it_needs() -> None:
+    assert [parse_split(text).unit for text in ("windows:5", "by-recording:5")] == ["window", "recording"]
+    assert [parse_split(text).apart for text in EXAMPLES] == [True, True, *[False] * 5]
+    assert parse_split("by-subject:2").k == 2 and parse_split("windows:1000").k == 1000
+    with pytest.raises(ConfigError, match="from 2 to 1000"):
+        parse_split("windows:1001")
+    subject, label = study(3, repetitions=1)
+    with pytest.raises(BadInput, match="got 12 people and 11 classes"):
+        make_folds(parse_split("by-recording:5"), subject, label[1:])
+    with pytest.raises(BadInput, match=r"by-subject:2 leaves one person to train and validate") as left:
+        make_folds(parse_split("by-subject:2"), subject, label)
+    assert left.value.reason == "one_person_left"
+    for text, units in (("by-recording:5", 4), ("windows:4", 3), ("windows:holdout", 2), ("recordings:holdout", 2)):
+        needed = int(text[-1]) if text[-1].isdigit() else 3
+        split = parse_split(text)
+        with pytest.raises(BadInput, match=f"{text} needs at least {needed} (windows|recordings); there are {units}"):
+            make_folds(split, subject[:units], label[:units])
+        assert make_folds(split, subject[:needed], label[:needed])
+    with pytest.raises(BadInput, match="needs at least 3 recordings"):
+        make_folds(parse_split("by-recording:2"), subject[:2], label[:2])
+
+
+def test_folds_have_names_and_their_people() -> None:
+    subject, label = study(4, repetitions=2)
+    pairs = make_folds(parse_split("by-subject:2"), subject, label)
+    assert [fold.name for fold in pairs] == ["fold 1", "fold 2"] and {len(fold.subjects) for fold in pairs} == {2}
+    by_recording = make_folds(parse_split("by-recording:2"), subject, label)
+    assert [(fold.name, len(fold.subjects)) for fold in by_recording] == [("fold 1", 4), ("fold 2", 4)]
+    assert [fold.name for fold in make_folds(parse_split("windows:holdout"), subject, label)] == ["holdout"]

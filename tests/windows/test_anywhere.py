@@ -190,7 +190,8 @@ def test_a_class_for_idleness_is_added_where_there_is_none(tmp_path: Path) -> No
     w = cut_anywhere(plain, SPEC, add_idle_gesture(plain.gestures, plain), EVERY)
     assert len(newest(w, "Idle")) > 500
     assert set(w.subject) == {"ana"}
-    assert "ana/fulldatastream (unmarked)" in w.recording_ids
+    unmarked = w.recording == w.recording_ids.index("ana/fulldatastream (unmarked)")
+    assert unmarked.sum() > 500 and np.all(w.recording_rows[unmarked] == 0), "no rows, so that it overlaps no other"
     assert set(cut_anywhere(plain, SPEC, plain.gestures, EVERY).y) == {0, 1}, "no class, no idleness"
 
 
@@ -243,3 +244,52 @@ def test_bad_settings_are_refused(settings: dict[str, float], said: str) -> None
 def test_cut_windows_says_who_cuts_these(dataset: Dataset) -> None:
     with pytest.raises(ConfigError, match="cut_anywhere"):
         cut_windows(dataset, SPEC)
+
+
+def test_settings_at_the_ends_of_their_range() -> None:
+    ends = {"every_s": (0.01, 60.0), "onset_s": (0.0, 60.0), "after_s": (0.0, 1.0), "settle_s": (0.2, 60.0)}
+    shares = {"idle_share": (0.0, 0.99), "busy_share": (0.0, 1.0), "hard_share": (0.0, 1.0)}
+    for name, (low, high) in (ends | shares).items():
+        for value in (low, high):
+            assert getattr(AnywhereSpec(**{name: value}), name) == value
+        wrong = (-0.01, 1.01 if name.endswith("_share") else 60.01)
+        for value in wrong:
+            with pytest.raises(ConfigError, match=f"{name} is .*accepted is 0 to (1|60)[.]"):
+                AnywhereSpec(**{name: value})
+    with pytest.raises(ConfigError, match="every_s is 0"):
+        AnywhereSpec(every_s=0.0)
+    with pytest.raises(ConfigError, match="idle_share is 1: accepted is 0 up to, not including, 1"):
+        AnywhereSpec(idle_share=1.0)
+    assert AnywhereSpec(after_s=0.5, settle_s=0.5).settle_s == 0.5
+    with pytest.raises(ConfigError, match="settle_s must not be below after_s"):
+        AnywhereSpec(after_s=0.5, settle_s=0.4)
+
+
+def test_what_gives_no_window_is_named_and_streams_are_counted(tmp_path: Path) -> None:
+    person(tmp_path / "src" / "ana", {(500, 200): "Wave"})
+    ben = tmp_path / "src" / "ben"
+    ben.mkdir()
+    bad = ramp(0, 80)
+    write_recording(ben / "Shake_5_80.csv", replace(bad, values=bad.values + 40_000), ACCEL)
+    data = made(tmp_path)
+    seen: list[tuple[int, int]] = []
+    w = cut_anywhere(data, SPEC, data.gestures, EVERY, lambda *done: seen.append(done))
+    assert seen == [(1, 1)] and w.left_out == ("ben/Shake_5_80: no valid sample",)
+    with pytest.raises(DatasetError, match="gives no window: 1 recordings of 1 gestures"):
+        cut_anywhere(data, SPEC, data.gestures.subset(["Shake"]), EVERY)
+    alone = made_alone(tmp_path / "alone")
+    assert add_idle_gesture(alone.gestures, alone) == alone.gestures, "without a stream nothing is known to be idle"
+
+
+def made_alone(folder: Path) -> Dataset:
+    """One recording, and no stream."""
+    (folder / "src" / "ben").mkdir(parents=True)
+    write_recording(folder / "src" / "ben" / "Wave_5_80.csv", ramp(0, 80), ACCEL)
+    return made(folder, Gesture("Wave"))
+
+
+def test_a_stream_of_just_one_window_gives_it(tmp_path: Path) -> None:
+    person(tmp_path / "src" / "ana", {(20, 80): "Wave"}, rows=100)
+    data = made(tmp_path)
+    w = cut_anywhere(data, SPEC, data.gestures, EVERY)
+    assert w.context.tolist() == ["anywhere"] and w.x[0, 0].tolist() == [*range(100)]

@@ -17,6 +17,7 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.machine import FrameReader, Sample
+from plushsense.windows import calibration
 from plushsense.windows.calibration import UNIT, SelfCalibration
 from plushsense.windows.clock import resample
 from plushsense.windows.cut import cut_windows
@@ -141,3 +142,23 @@ def test_a_layout_without_it_is_written_as_before() -> None:
     assert "self_calibration" not in PLAIN.to_dict()
     assert Layout.from_dict(PLAIN.to_dict()) == PLAIN
     assert Layout.from_dict(LAYOUT.to_dict()) == LAYOUT
+
+
+def test_a_long_stream_halves_its_sums_and_reads_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is asked for is a ratio of sums, so that halving all of them changes nothing while the readings repeat."""
+    x = np.tile(readings(1500, 3), (6, 1))
+    long = SelfCalibration(LAYOUT).apply(x)
+    monkeypatch.setattr(calibration, "MOST_WEIGHT", 1 << 16)
+    halving = SelfCalibration(LAYOUT)
+    out = halving.apply(x)
+    assert 1 << 14 < halving._fits[0]._weight <= 1 << 16
+    assert np.abs(out - long)[-1500:].mean() < 0.01 * UNIT and not np.array_equal(out, long)
+    one_by_one = SelfCalibration(LAYOUT)
+    assert [one_by_one.push(row) for row in x.tolist()] == out.tolist()
+
+
+def test_without_such_sensors_samples_stay_as_they_are() -> None:
+    x = readings(50, 1)
+    plain = SelfCalibration(PLAIN)
+    assert plain.apply(x).tolist() == x.tolist()
+    assert list(plain.push(x[0].tolist())) == x[0].tolist()

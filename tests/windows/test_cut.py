@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.store import Dataset
-from plushsense.windows.cut import WindowSpec, cut_windows, shared_gestures
+from plushsense.windows.cut import WindowSpec, cut_windows, recordings_in_time, shared_gestures, whole_gestures
 
 ACCEL = load_layout("accel-3")
 
@@ -105,10 +106,16 @@ def test_shared_gestures_and_why_not_the_others(dataset: Dataset) -> None:
         "Custom": "free choice: everybody did something else",
         "Shake": "made by 1 of 2 people",
     }
+    assert shared_gestures(dataset, share=0.5)[0].labels == ("Shake", "Wave")
     maker = next(r.subject for r in dataset.recordings if r.gesture == "Shake")
     others = [r.id for r in dataset.recordings if r.subject != maker]
     append_marks(dataset.path, [Mark(recording, "exclude", "test", "not of this study") for recording in others])
-    assert "Shake" in shared_gestures(open_dataset(dataset.path))[0].labels, "who is excluded does not count"
+    kept, left_out = shared_gestures(open_dataset(dataset.path))
+    assert kept.labels == ("Shake", "Wave"), "who is excluded does not count"
+    waves = [r.id for r in dataset.recordings if r.gesture == "Wave"]
+    append_marks(dataset.path, [Mark(recording, "exclude", "test", "not of this study") for recording in waves])
+    kept, left_out = shared_gestures(open_dataset(dataset.path))
+    assert kept.labels == ("Shake",) and left_out["Wave"] == "no recording"
 
 
 def test_bad_settings_are_refused(dataset: Dataset) -> None:
@@ -153,3 +160,55 @@ def test_a_recording_with_a_gap_keeps_the_full_windows_before_it(dataset: Datase
     mine = w.take(np.flatnonzero(w.recording == w.recording_ids.index("ana/Shake_77_650")))
     assert mine.x[:, 0, 0].tolist() == [1150, 1200, 1250, 1500, 1550]
     assert set(mine.context) == {"inside"}
+
+
+def test_settings_of_whole_recordings_come_from_a_bundle() -> None:
+    assert WindowSpec(longest_factor=1.0, window_s=60.0, step_s=60.0).longest_factor == 1.0
+    for wrong in ({"longest_factor": 0.5}, {"window_s": 60.1}, {"step_s": 0.0}, {"step_s": 61.0}):
+        with pytest.raises(ConfigError, match="accepted are 0|out of range"):
+            WindowSpec(**wrong)
+    bundled = {"window_s": 1.5, "step_s": 0.25, "context": "anywhere", "every_s": 0.1}
+    assert whole_gestures(bundled) == WindowSpec(1.5, 0.25, "stream")
+    assert whole_gestures({"context": "loop", "span_s": 3.0}) == WindowSpec(context="loop", span_s=3.0)
+
+
+def test_sets_of_windows_are_joined_and_cut_down_to_some_inputs(dataset: Dataset) -> None:
+    waves = cut_windows(dataset, WindowSpec(context="loop"), dataset.gestures.subset(["Wave", "Shake"]))
+    both = waves.joined(waves.take(np.arange(2)))
+    n = len(waves)
+    assert len(both) == n + 2 and both.recording_ids == waves.recording_ids * 2
+    assert both.recording.tolist() == [*waves.recording, *(waves.recording[:2] + len(waves.recording_ids))]
+    assert np.array_equal(both.x[n:], waves.x[:2]) and both.subject[n:].tolist() == waves.subject[:2].tolist()
+    turned = waves.only(["z", "x", "y"])
+    assert turned.inputs == ("z", "x", "y") and turned.vectors == ((1, 2, 0),)
+    assert np.array_equal(turned.x, waves.x[:, [2, 0, 1]])
+    assert waves.only(["y"]).vectors == () and waves.only(["y"]).x.shape == (n, 1, 250)
+    assert repr(waves) == (
+        f"WindowSet({n} windows of 3 channels × 250 samples at 100 Hz, 5 recordings, 2 classes; 4 inside, 4 loop)"
+    )
+    with pytest.raises(ConfigError, match="cut_anywhere"):
+        cut_windows(dataset, WindowSpec(context="anywhere"))
+
+
+def test_progress_counts_the_recordings_and_one_without_a_valid_sample_is_named(
+    dataset: Dataset, tmp_path: Path
+) -> None:
+    bad = ramp(0, 100)
+    write_recording(tmp_path / "src" / "ben" / "Wave_77_100.csv", replace(bad, values=bad.values + 40_000), ACCEL)
+    again = import_recordings(tmp_path / "src", tmp_path / "DS2", layout=ACCEL).dataset
+    seen: list[tuple[int, int]] = []
+    w = cut_windows(again, WindowSpec(), again.gestures.subset(["Wave"]), lambda *done: seen.append(done))
+    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert w.left_out == ("ben/Wave_77_100: no valid sample",)
+
+
+def test_how_long_a_recording_is_counts_after_trimming(dataset: Dataset, tmp_path: Path) -> None:
+    for n in range(3):
+        write_recording(tmp_path / "src" / "ben" / f"Wave_9{n}_110.csv", ramp(10 * n, 110), ACCEL)
+    write_recording(tmp_path / "src" / "ben" / "Wave_99_3000.csv", ramp(5000, 3000), ACCEL)
+    longer = import_recordings(tmp_path / "src", tmp_path / "DS2", layout=ACCEL).dataset
+    append_marks(longer.path, [Mark("ben/Wave_99_3000", "trim", "test", "late", 2800, 2910)])
+    longer = open_dataset(longer.path)
+    assert len(recordings_in_time(list(longer.used))) == len(longer.used)
+    w = cut_windows(longer, WindowSpec(context="loop"), longer.gestures.subset(["Wave"]))
+    assert w.left_out == () and 7800 in w.x[:, 0, 0]

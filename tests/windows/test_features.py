@@ -89,3 +89,12 @@ def test_inputs_are_distances_from_the_offset_of_a_channel() -> None:
     values = np.array([[330, 330, 430], [330, 430, 330]])
     assert network_inputs(values, layout)[:, :3].tolist() == [[0, 0, 100], [0, 100, 0]]
     assert network_inputs(values, layout)[0, 3:].tolist() == [0, 0, 1600]
+
+
+def test_no_scaling_changes_nothing_and_vectors_keep_their_zero() -> None:
+    x = np.array([[[3, 4, 5], [10, 10, 10], [0, 30, 0]]], dtype=np.int32)
+    assert np.array_equal(Scaler.none(3).apply(x), x)
+    scaler = Scaler.fit(x, [(1, 2)])
+    assert scaler.offset.tolist() == [4.0, 0.0, 0.0]
+    # Mean squares of the two axes: 100 and 300.
+    assert scaler.scale == pytest.approx([1 / np.sqrt(2 / 3), 1 / np.sqrt(200), 1 / np.sqrt(200)])

@@ -13,7 +13,7 @@ falls from 2.0–4.3 % of their spread (bias alone, no headroom of the ranges) t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -67,7 +67,7 @@ class Ranges:
     high: Floats
     tops: tuple[Floats, ...]
     means: tuple[Floats, ...]
-    axes: Floats = field(default_factory=lambda: np.empty(0))
+    axes: Floats
 
     def to_dict(self) -> dict[str, Any]:
         """Return the ranges as plain values for JSON."""

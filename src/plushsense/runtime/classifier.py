@@ -237,7 +237,6 @@ class IntegerClassifier(StreamReader):
 
     def __init__(self, model: IntegerModel) -> None:
         super().__init__(model.network.stepper(), model.layout, model.gestures, model.rules, model.smoothing)
-        self.model = model
 
 
 class BothEngines(IntegerClassifier):

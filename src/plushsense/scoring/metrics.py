@@ -124,7 +124,7 @@ def risk_coverage(confidence: ArrayLike, right: ArrayLike) -> RiskCoverage:
 
 def _wrong(sure: Floats, good: NDArray[np.bool_]) -> Floats:
     """Return the expected number of errors (n,) in the 1 to n most confident answers, over all orders of ties."""
-    order = np.argsort(-sure, kind="stable")
+    order = np.argsort(-sure)
     ranked, wrong = sure[order], (~good[order]).astype(np.float64)
     starts = np.flatnonzero(np.concatenate([[True], ranked[1:] != ranked[:-1]]))
     sizes = np.diff(np.append(starts, len(ranked)))

@@ -10,8 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plushsense.core.errors import BadInput, PlushSenseError
-from plushsense.deploy.proof.vectors import Export, compare
+from plushsense.core.errors import BadInput, ConfigError, PlushSenseError
+from plushsense.core.layouts import load_layout
+from plushsense.core.recorder_csv import Frames, write_recording
+from plushsense.dataset.importing.importers import import_recordings
+from plushsense.deploy.proof.vectors import Export, compare, recorded_frames
 from support.exports import bundle_of, exported
 
 
@@ -84,3 +87,29 @@ def test_golden_vectors_of_another_model_or_damaged(own: Path, tmp_path: Path) -
     for folder in (own, other):
         with pytest.raises(BadInput, match=r"they are damaged, or of another model \(row "):
             Export(folder)
+
+
+def test_recordings_give_as_many_rows_each_with_pauses_between_them(tmp_path: Path) -> None:
+    layout = load_layout("accel-3")
+    for n, (person, rows) in enumerate((("ana", 200), ("ben", 30), ("cleo", 100))):
+        (tmp_path / "src" / person).mkdir(parents=True)
+        row = np.arange(rows)
+        frames = Frames(np.stack([row, row * 0 + n, row * 0], axis=1), 7000 + row * 10, 1_000_000 + row * 10)
+        write_recording(tmp_path / "src" / person / f"Wave_{n}_{rows}.csv", frames, layout)
+    dataset = import_recordings(tmp_path / "src", tmp_path / "DS", layout=layout).dataset
+
+    def taken(rows: int, *people: str) -> tuple[list[int], np.ndarray]:
+        frames = recorded_frames(dataset, layout, subjects=people, rows=rows)
+        return [int((frames[:, 2] == n).sum()) for n in range(3)], frames
+
+    assert taken(90)[0] == [30, 30, 30] and taken(1000)[0] == [200, 30, 100]
+    assert taken(150)[0] == [60, 30, 60], "what one lacks, the others give"
+    assert sum(taken(2)[0]) == 2 and max(taken(2)[0]) == 1 and taken(0)[1].shape == (0, 4)
+    found, frames = taken(40, "ana", "cleo")
+    assert found == [20, 0, 20] and frames[:20, 1].tolist() == [*range(20)]
+    steps = np.diff(frames[:, 0])
+    assert frames[0, 0] == 1000 and steps[19] == layout.gap_ms + 1000 and set(np.delete(steps, 19)) == {10}
+    with pytest.raises(ConfigError, match="has nobody 'anna': accepted are ana, ben, cleo.*Did you mean 'ana'"):
+        taken(1, "anna")
+    with pytest.raises(ConfigError, match=r"holds layout 'accel-3' \(x, y, z\), but the model reads 'phone-6'"):
+        recorded_frames(dataset, load_layout("phone-6"), rows=1)
