@@ -5,7 +5,9 @@ What cannot be run here stands in `NOT_RUN`, with the reason and the test that r
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import importlib
 import io
 import re
 import runpy
@@ -21,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import plushsense as ps
 from plushsense.cli.main import main, parser_of
 from plushsense.cli.options import VERBS
 from plushsense.deploy.proof.verify import Setting
@@ -139,6 +142,18 @@ def test_every_option_in_the_text_is_one_of_its_verb() -> None:
                 assert not unknown, f"{page}: {verb} {unknown}"
             else:
                 assert verb.isupper() or verb.startswith("-"), f"{page}: plushsense {verb}"
+
+
+def test_programs_use_names_that_exist() -> None:
+    """Those of questions.md, python.md and streams.md are run by other tests, where the packages are that they need."""
+    for page, text in PAGES.items():
+        for program in re.findall(r"^```python\n(.*?)^```", text, re.S | re.M):
+            for node in ast.walk(ast.parse(program)):
+                if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("plushsense."):
+                    module = importlib.import_module(str(node.module))
+                    assert all(hasattr(module, name.name) for name in node.names), f"{page}: {ast.unparse(node)}"
+                elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "ps":
+                    assert node.attr in ps.__all__, f"{page}: ps.{node.attr}"
 
 
 def test_commands_stand_in_blocks_of_commands() -> None:

@@ -426,7 +426,8 @@ CLI_LEAD = """\
 All options of all commands. [Commands](../commands.md) says which command is for what, and has examples.
 
 Every command also takes `--help`, and `--json`: then it prints one JSON object on standard output and nothing else
-there. The exit status is 0 when done, 1 when a check said no, 2 for bad input. Names in capitals stand for what you give.
+there. The exit status is 0 when done, 1 when a check said no, 2 for bad input. Names in capitals stand for what you
+give.
 """
 
 
