@@ -47,7 +47,7 @@ SLOW_FILES = {
     "tuning/test_gate.py",
     "tuning/test_rule_baseline.py",
 }
-LONGEST = {"test_train.py", "test_live_long.py", "test_paper_page.py"}
+LONGEST = {"test_train.py", "test_live_long.py", "test_paper_page.py", "test_pages.py"}
 SLOW_FIXTURES = {"real_data", "c_compiler", "target_here", "two_nodes", "lsl_possible", "publish_tools", "pty_possible"}
 
 
