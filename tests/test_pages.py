@@ -72,13 +72,25 @@ NOT_RUN = {
         "the file of the authors",
         "tests/dataset/importing/test_saved_windows.py::test_the_recordings_come_back_and_give_the_same_windows",
     ),
-    "plushsense protocol --model model.plush --session": (
-        "sessions of the paper's protocol",
-        "tests/cli/test_protocol.py::test_recorded_sessions_give_the_same_table_under_their_own_heading",
+    "plushsense protocol ": (
+        "a network of all gestures of the paper",
+        "tests/cli/test_protocol.py::test_five_strangers_three_systems_one_page",
     ),
-    "plushsense protocol --model model.plush --dataset": (
-        "sessions of the paper's protocol",
-        "tests/cli/test_protocol.py::test_a_network_that_may_have_met_them_is_told",
+    "plushsense report DS/evaluations/sweep": (
+        "the folder of a sweep that trained",
+        "tests/cli/test_paper_page.py::test_every_command_runs",
+    ),
+    "plushsense feedback model.plush SESSION --wrong": (
+        "a network that reports events",
+        "tests/cli/test_adapt.py::test_events_marked_as_wrong_correct_the_bundle",
+    ),
+    "plushsense adapt model.plush --feedback": (
+        "corrections of events",
+        "tests/cli/test_adapt.py::test_events_marked_as_wrong_correct_the_bundle",
+    ),
+    "plushsense adapt model.plush RECORDINGS --feedback": (
+        "corrections of events",
+        "tests/cli/test_adapt.py::test_events_marked_as_wrong_correct_the_bundle",
     ),
     "plushsense publish ": (
         "the validators of a package take long",
@@ -193,11 +205,11 @@ SMALL = {
     "evaluate": {"--filters": "4,4,4"},
     "lens": {"--filters": "4,4,4"},
     "abstain": {"--filters": "4,4,4"},
-    "baselines": {"--models": "!forest", "--pca": "!no", "--split": "by-subject:2"},
+    "baselines": {"--models": "!tree", "--pca": "!no", "--split": "by-subject:2"},
     "trim --plot": {"--only": "P01/*"},
+    "stream-eval DS --model": {"--subjects": "P01"},
     "stream-eval --split": {"--systems": "hysteresis"},
     "adapt": {"--force": ""},
-    "protocol": {"--people": "!1", "--repetitions": "1", "--no-rules": ""},
     "verify": {"--target": "host"},
     "profile": {"--target": "host"},
     "search": {"--rungs": "1,2", "--share": "1", "--architectures": "14d1_39d2_41d4", "--filters": "4/6/8/8"},
@@ -220,23 +232,28 @@ NEW = {
 STAND_INS = {
     r"^(live .*)--device ['a-z]*(serial|ble|virtual):\S*": r"\1--device virtual://?speed=0&seconds=20",
     r"^(record .*)--device \S*": r"\1--device virtual://",
-    r"^(import (RECORDINGS|SRC) [A-Z]+)$": r"\1 --layout plush-15",
+    r"^(import (RECORDINGS|SRC) ([A-Z]+|--dry-run))$": r"\1 --layout plush-15",
+    r"^(adapt \S+) RECORDINGS": r"\1 SESSION",
+    r" m\.plush": " model.plush",
     r"by-subject:5": "by-subject:2",
     r"/(safe/place|somewhere/safe)/": "",
     r"Shake": "'Tail pull'",
     r"S07": "P03",
     r"P07": "P03",
     r"P22/Forehand\*_18907": "P03/Tail pull*",
-    r"gaps:P26": "duration:P02",
+    r"P26": "P02",
 }
-GESTURES = ("Back stroke 1", "Hold strong", "Tail pull", "Tail tap 1")
+GESTURES = ("Hold strong", "Tail pull", "Tail scratch 1", "Tail tap 1", "Tail tap 2")
 
 
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what the commands of the pages need: recordings, a data set, bundles, an export, small files."""
     folder = tmp_path_factory.mktemp("pages")
-    simulate(folder / "RECORDINGS", people=5, repetitions=2, gestures=GESTURES, at_rest=2)
+    simulate(folder / "RECORDINGS", people=4, repetitions=3, gestures=GESTURES, at_rest=2)
+    with_gap = next((folder / "RECORDINGS" / "P02").glob("Hold strong_*.csv"))
+    lines = with_gap.read_bytes().splitlines(keepends=True)
+    with_gap.write_bytes(b"".join(lines[:40] + lines[80:]))
     import_simulation(folder / "RECORDINGS", folder / "DS", lambda *_: None)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
