@@ -259,7 +259,7 @@ GESTURES = ("Hold strong", "Tail pull", "Tail scratch 1", "Tail tap 1", "Tail ta
 def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what the commands of the pages need: recordings, a data set, bundles, an export, small files."""
     folder = tmp_path_factory.mktemp("pages")
-    simulate(folder / "RECORDINGS", people=4, repetitions=3, gestures=GESTURES, at_rest=2)
+    simulate(folder / "RECORDINGS", people=5, repetitions=3, gestures=GESTURES, at_rest=2)
     with_gap = next((folder / "RECORDINGS" / "P02").glob("Hold strong_*.csv"))
     lines = with_gap.read_bytes().splitlines(keepends=True)
     with_gap.write_bytes(b"".join(lines[:40] + lines[80:]))
