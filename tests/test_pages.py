@@ -285,7 +285,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "MODELS").mkdir()
     mine.save(folder / "MODELS" / "mine.plush")
     shutil.copyfile(ROOT / "src/plushsense/core/data/layouts/plush-15.toml", folder / "my-sensor.toml")
-    shutil.copyfile(ROOT / "examples/files/reactions.toml", folder / "ours.toml")
+    shutil.copyfile(ROOT / "src/plushsense/core/data/reactions/gentle.toml", folder / "ours.toml")
     (folder / "names.txt").write_text("Anna\n")
     (folder / "predictions.csv").write_text("stream,t,stop,label,score\nP01/fulldatastream,2.5,4,Hold strong,0.8\n")
     return folder
