@@ -207,7 +207,7 @@ def test_what_is_not_run_has_a_reason_and_a_test() -> None:
 # Trainings have one epoch. "!" before a value: it also replaces that of the page.
 SMALL = {
     "devices": {"--scan-s": "!0.1"},
-    "record": {"--auto": "1", "--speed": "!200", "--protocol": "quick"},
+    "record": {"--auto": "!1", "--speed": "!200", "--protocol": "quick"},
     "simulate": {"--people": "!3", "--repetitions": "1"},
     "train": {"--filters": "4,4,4", "--force": ""},
     "evaluate": {"--filters": "4,4,4"},
@@ -235,6 +235,7 @@ NEW = {
     "pseudonymise": "out",
     "backup": "file",
     "restore": "dest",
+    "merge": "out",
 }
 # What stands on the pages for something that is not here, and what stands in for it.
 STAND_INS = {
@@ -246,6 +247,8 @@ STAND_INS = {
     r"by-subject:5": "by-subject:2",
     r"/(safe/place|somewhere/safe)/": "",
     r"--samples 100000": "--samples 500",
+    r"--merges 2": "--groups plush-13",
+    r"--recording ID": "--recording P01/x_1760000000000_1",
     r"Shake": "'Tail pull'",
     r"S07": "P03",
     r"P07": "P03",
