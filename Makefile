@@ -1,4 +1,5 @@
 # Everything from a bare checkout, with only Python 3.11+ and make.
+#   make install PlushSense and PyTorch into .venv, for the tutorial
 #   make demo    install, then the whole path on a virtual toy (a simulation)
 #   make test    install, then all tests
 #   make test-quick   install, then the tests that need no browser, compiler, emulator or cluster
@@ -23,7 +24,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(PIP_FL
 # Tests start hundreds of processes, each of which would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-quick fuzz check docs dist setup collect soak coverage mutants clean
+.PHONY: demo test test-quick fuzz check docs dist setup collect soak coverage mutants install clean
 
 $(VENV)/.python:
 	@$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'PlushSense needs Python 3.11 or newer, this is ' + sys.version.split()[0] + ': run  make PYTHON=/path/to/python3.11 ...')"
@@ -42,6 +43,8 @@ $(VENV)/.dev: $(VENV)/.train
 
 # The registry's plain `torch` brings gigabytes of CUDA; an exact version takes a CPU build where one is at hand.
 TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
+
+install: $(VENV)/.train
 
 setup: $(VENV)/.dev
 

@@ -1,12 +1,10 @@
-"""Settings of Sphinx: `make docs` builds build/site of these pages, the README, CONTRIBUTING and the CHANGELOG."""
+"""Settings of Sphinx: `make docs` builds build/site of these pages, CONTRIBUTING and the CHANGELOG."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-from pygments.lexers.special import TextLexer
 
 from plushsense import __version__
 
@@ -18,7 +16,10 @@ release = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_heading_anchors = 6  # pages link to headings of other pages
 autodoc_typehints = "description"
+smartquotes_action = "qe"  # no dashes: --option stays as it is
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
 html_title = f"PlushSense {release}"
 html_copy_source = False
 html_show_copyright = False
@@ -54,4 +55,3 @@ def setup(app: Sphinx) -> None:
         source[0] = _INCLUDE.sub(lambda m: as_in_site(ROOT, (ROOT / m.group(1)).read_text(encoding="utf-8")), text)
 
     app.connect("source-read", read)
-    app.add_lexer("mermaid", TextLexer)

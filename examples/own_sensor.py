@@ -1,4 +1,4 @@
-"""Write a folder of CSV files as a sensor of your own might leave them, for docs/tutorial.md.
+"""Write a folder of CSV files as a sensor of your own might leave them, for docs/own-sensor.md.
 
 Six made-up people each touch a cushion with two force sensors and an accelerometer, 50 times a second. Each file is a
 session, with an empty label between the gestures; in one gesture of the third person rows are missing. The readings are

@@ -51,6 +51,7 @@ SLOW_FILES = {
 LONGEST = (
     "deploy/proof/test_verify.py",
     "studio/test_train.py",
+    "test_pages.py",
     "cli/test_paper_page.py",
     "studio/test_therapist.py",
     "studio/test_live_long.py",

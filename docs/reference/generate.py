@@ -1,4 +1,6 @@
-"""Write the reference of all files that a user may write: ``python docs/reference/generate.py`` (``make docs``).
+"""Write the reference of all files that a user may write, and of all commands: ``python docs/reference/generate.py``.
+
+``make docs`` runs it. The commands are those of ``cli/verbs.toml``.
 
 Keys, types and defaults are those of the dataclasses that the files are read into; their meaning is in the section
 ``Attributes`` of the docstrings. An entry there may end in a group in brackets, whose parts are separated by ``;``:
@@ -12,6 +14,7 @@ A description that begins with "Not in a file" is of an attribute that the reade
 
 from __future__ import annotations
 
+import argparse
 import inspect
 import re
 import sys
@@ -20,6 +23,8 @@ from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+from plushsense.cli.main import parser_of
+from plushsense.cli.options import VERBS
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import Layout, load_layout
@@ -406,6 +411,7 @@ def _table(found: list[Key]) -> str:
 
 
 NOTE = "<!-- Written by docs/reference/generate.py (make docs) from the code: edit the docstrings there. -->\n"
+CLI_NOTE = "<!-- Written by docs/reference/generate.py (make docs): edit src/plushsense/cli/verbs.toml. -->\n"
 
 
 def page(name: str) -> str:
@@ -443,9 +449,47 @@ def index() -> str:
     )
 
 
+CLI_LEAD = """\
+All options of all commands. [Commands](../commands.md) says which command is for what, and has examples.
+
+Every command also takes `--help`, and `--json`: then it prints one JSON object on standard output and nothing else
+there. The exit status is 0 when done, 1 when a check said no, 2 for bad input. Names in capitals stand for what you
+give.
+"""
+
+
+def _argument(action: argparse.Action) -> str:
+    """Return an argument as it is written on the command line."""
+    value = action.metavar or "|".join(map(str, action.choices or ())) or action.dest.upper()
+    words = " ".join(value) if isinstance(value, tuple) else value
+    names = ", ".join(action.option_strings)
+    if not names:
+        return f"[{words}]" if action.nargs == "?" else f"{words} …" if action.nargs in ("*", "+") else words
+    optional = f"[{words}]" if action.nargs == "?" else words
+    return names if action.nargs == 0 else f"{names} {optional}"
+
+
+def cli_page() -> str:
+    """Return the page of all commands, with the texts of ``--help``."""
+    text = f"{CLI_NOTE}# Options of all commands\n\n{CLI_LEAD}"
+    for verb in VERBS:
+        parser = parser_of(verb)
+        about, _, more = (parser.description or "").partition("\n\n")
+        text += f"\n## {verb}\n\n{about}\n"
+        text += "".join(f"\n```text\n{part.strip(chr(10))}\n```\n" for part in (more, parser.epilog or "") if part)
+        text += f"\n{_row('argument', 'meaning')}{_row('---', '---')}"
+        for action in parser._actions:
+            if action.dest not in ("help", "json"):
+                meaning = re.sub(r"([*_<\[])", r"\\\1", (action.help or "").replace("%%", "%"))
+                needed = " (must be given)" if action.required and action.option_strings else ""
+                text += _row(f"`{_argument(action)}`", f"{meaning}{needed}")
+    return text
+
+
 def pages() -> dict[str, str]:
     """Return the text of each page by its file name."""
-    return {"README.md": index(), "tables.md": tables_page()} | {f"{name}.md": page(name) for name in FILES}
+    files = {f"{name}.md": page(name) for name in FILES}
+    return {"README.md": index(), "tables.md": tables_page(), "cli.md": cli_page()} | files
 
 
 if __name__ == "__main__":

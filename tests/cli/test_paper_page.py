@@ -23,7 +23,7 @@ from plushsense.studio.app import serve
 from support.archive import make_archive
 
 ROOT = Path(__file__).parents[2]
-PAGE, TUTORIAL = ROOT / "docs" / "paper.md", ROOT / "docs" / "tutorial.md"
+PAGE, TUTORIAL = ROOT / "docs" / "paper.md", ROOT / "docs" / "own-sensor.md"
 VERDICTS = ("better", "equal", "not possible here", "weaker")
 
 # What makes a command small: three people instead of 25, some of the gestures, one epoch, and no processes that would

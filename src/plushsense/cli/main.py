@@ -46,6 +46,18 @@ def load_verb(verb: str) -> Callable[[argparse.Namespace], int]:
     return run
 
 
+def parser_of(verb: str) -> Parser:
+    """Return the parser of a verb's options: those in ``verbs.toml``, and ``--json``."""
+    summary = VERBS[verb]["summary"]
+    parser = Parser(prog=f"plushsense {verb}", description=summary[0].upper() + summary[1:] + ".")
+    add_options(parser, verb)
+    json_help = "print one JSON object on standard output and nothing else there (default: text)"
+    if verb == "live":
+        json_help = "no effect: decisions are always JSON, one object a line"
+    parser.add_argument("--json", action="store_true", help=json_help)
+    return parser
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     utf8()
@@ -59,14 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     verb = words[0]
     try:
         run = load_verb(verb)
-        summary = VERBS[verb]["summary"]
-        parser = Parser(prog=f"plushsense {verb}", description=summary[0].upper() + summary[1:] + ".")
-        add_options(parser, verb)
-        json_help = "print one JSON object on standard output and nothing else there (default: text)"
-        if verb == "live":
-            json_help = "no effect: decisions are always JSON, one object a line"
-        parser.add_argument("--json", action="store_true", help=json_help)
-        return int(run(parser.parse_args(words[1:])))
+        return int(run(parser_of(verb).parse_args(words[1:])))
     except PlushSenseError as error:
         say("\n".join([f"plushsense: {error}", *getattr(error, "__notes__", ())]))
         return 2
