@@ -143,7 +143,7 @@ def test_clang_tidy(needs: Callable[..., None]) -> None:
         # That a window has two samples, and that the best class has a probability, is beyond the analyzer.
         "-clang-analyzer-core.DivideZero",
     ]
-    for define in ("-UPLUSH_PLAIN", "-DPLUSH_PLAIN", "-DPLUSH_WINDOW"):
+    for define in ("-UPLUSH_PLAIN", "-DPLUSH_PLAIN", "-DPLUSH_WINDOW", "-DPLUSH_CALIBRATE"):
         done = subprocess.run(
             [
                 "clang-tidy",

@@ -59,7 +59,7 @@ def test_gain_and_offset_change_nothing(gain: float, offset: tuple[int, int, int
     other = SelfCalibration(LAYOUT).apply(np.rint(x * gain + np.array(offset)).astype(np.int64))
     # While there are hardly any directions, a rounded reading weighs more.
     assert np.abs(other - plain)[1000:].max() <= 0.01 * UNIT
-    assert np.abs(other - plain).mean() < 1.0
+    assert np.abs(other - plain).mean() < 3.0
     still = plain[3000:].reshape(-1, 25, 3)[(np.arange(40) // 3) % 2 == 0]
     assert np.median(np.linalg.norm(still, axis=2)) == pytest.approx(UNIT, rel=0.02), "held still, it reads 1 g"
 

@@ -8,10 +8,14 @@ readings with another gain and offset give the same numbers but for rounding. Al
 1. Samples are taken in blocks of about 0.3 s. A block gives the mean m of the vector and its variance within the block.
 2. The weight of a block is ``(level / (variance + level))²``; the level follows the variance of the stillest blocks: it
    falls by 1/4 where a block is stiller, else rises by 1/32, so that a sixth of the blocks is.
-3. Weighted sums of m, of the products of its components, and of ``|m|² m`` are kept; all are halved when the sum of
-   weights exceeds `MOST_WEIGHT`. With d the distance of the centre from the weighted mean of m, least squares ask for
-   ``A d = b``: A is the covariance of m, b half the covariance of ``|m - mean|²`` and m. Each block makes two
-   Gauss-Seidel sweeps from the previous centre, so that a direction which nothing is known of keeps what it had.
+3. Weighted sums of m, of the products of its components, of ``q = |m|²``, ``q m`` and ``q²`` are kept; all are halved
+   when the sum of weights exceeds `MOST_WEIGHT`. With d the distance of the centre from the weighted mean of m, least
+   squares ask for ``A d = b``: A is the covariance of m, b half the covariance of ``|m - mean|²`` and m. While the
+   sensor has hardly been turned, noise makes such a sphere too small. So the variance of the distances from the sphere
+   is subtracted from the diagonal of A (total least squares, as in the fit of Taubin 1991, 10.1109/34.103273). It is
+   that of the previous centre, and at most the determinant of A divided by the sum of its principal minors of order
+   two, which is not above the smallest eigenvalue. Each block makes eight Gauss-Seidel sweeps from the previous centre,
+   so that a direction which nothing is known of keeps what it had.
 4. The square of the radius is the mean of ``|m - centre|²``, but at least `LEAST_RADIUS` times the level, so that a
    sensor that was not turned yet does not show its noise as movement.
 
@@ -35,12 +39,14 @@ MOST_OUTPUT = 32767
 MEAN_BITS = 12  # magnitude of the components of m: larger ones raise the exponent of all sums
 WEIGHT_BITS = 14
 MOST_WEIGHT = 1 << 22
+SQUARE_BITS = 6  # q is |m|² without these bits
 LEAST_RADIUS = 256
 FRACTION_BITS = 8  # of mean, covariance and centre
 OFFSET_BITS = 4  # fraction bits of the offset that is subtracted
 _MOST_VARIANCE = (1 << 47) - 1
 _VARIANCE_OF_STEPS = 256  # three times that of rounding to whole numbers, in the units of the variance
-_SWEEPS = 2
+_SWEEPS = 8
+_MINOR_BITS = 20  # magnitude of the covariance from which determinant and minors are computed
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 _PLACE = ((0, 3, 4), (3, 1, 5), (4, 5, 2))  # of the product of two components among the pairs
 
@@ -63,7 +69,8 @@ class SphereFit:
         self._level = 0
         self._exponent = 0
         self._weight = 0
-        self._first, self._second, self._third = [0] * 3, [0] * 6, [0] * 3
+        self._first, self._second = [0] * 3, [0] * 6
+        self._square, self._third, self._fourth = 0, [0] * 3, 0
         self._centre = [0, 0, 0]
         self.offset = [0, 0, 0]  # with `OFFSET_BITS`
         self.multiplier = 0  # 0 before the first block, else 16 bits
@@ -121,43 +128,64 @@ class SphereFit:
             self._exponent += 1
             self._first = [_quotient(v, 2) for v in self._first]
             self._second = [_quotient(v, 4) for v in self._second]
+            self._square = _quotient(self._square, 4)
             self._third = [_quotient(v, 8) for v in self._third]
+            self._fourth = _quotient(self._fourth, 16)
             self._centre = [_quotient(v, 2) for v in self._centre]
         m = [_quotient(v, 1 << self._exponent) for v in self._sum]
-        square = sum(v * v for v in m)
+        square = sum(v * v for v in m) >> SQUARE_BITS
         self._weight += w
         for i in range(3):
             self._first[i] += w * m[i]
             self._third[i] += w * m[i] * square
         for i, (one, other) in enumerate(_PAIRS):
             self._second[i] += w * m[one] * m[other]
+        self._square += w * square
+        self._fourth += w * square * square
         if self._weight > MOST_WEIGHT:
+            odd, n = self._weight & 1, self._weight
+
+            def halved(v: int) -> int:
+                return _quotient(v - odd * _quotient(v, n), 2)
+
             self._weight >>= 1
-            self._first = [_quotient(v, 2) for v in self._first]
-            self._second = [_quotient(v, 2) for v in self._second]
-            self._third = [_quotient(v, 2) for v in self._third]
+            self._first = [halved(v) for v in self._first]
+            self._second = [halved(v) for v in self._second]
+            self._square = halved(self._square)
+            self._third = [halved(v) for v in self._third]
+            self._fourth = halved(self._fourth)
 
     def _fit(self) -> None:
         """Move the centre toward the solution, and derive offset and scale."""
         one = 1 << FRACTION_BITS
         n = max(self._weight, 1)
-        mean = [_quotient(v * one, n) for v in self._first]
-        second = [_quotient(v * one, n) for v in self._second]
-        square = sum(second[:3])
-        a = [s - _quotient(mean[i] * mean[j], one) for s, (i, j) in zip(second, _PAIRS, strict=True)]
+        mean = [_quotient(v * one * one, n) for v in self._first]
+        whole = [_quotient(v, n) for v in self._first]
+        rest = [v - w * n for v, w in zip(self._first, whole, strict=True)]
+        a = [
+            _quotient((s - whole[i] * self._first[j] - _quotient(rest[i] * self._first[j], n)) * one, n)
+            for s, (i, j) in zip(self._second, _PAIRS, strict=True)
+        ]
+        square = self._square // n
+        over = self._square - square * n
+        # Covariance of q and m, half of that of |m - mean|² and m, and the centre from the mean.
+        k = [
+            _quotient((third - square * first - _quotient(over * first, n)) * one, n)
+            for third, first in zip(self._third, self._first, strict=True)
+        ]
         b = [
-            _quotient(self._third[i], n) * one * one
-            - square * mean[i]
-            - 2 * sum(a[_PLACE[i][j]] * mean[j] for j in range(3))
+            k[i] * (one << (SQUARE_BITS - 1)) - _quotient(sum(a[_PLACE[i][j]] * mean[j] for j in range(3)), one)
             for i in range(3)
         ]
+        mean = [_quotient(v, one) for v in mean]
         d = [c - m for c, m in zip(self._centre, mean, strict=True)]
+        noise = min(self._noise(a, b, k, d, square, over, n), _least_eigenvalue(a))
         most = 4 << (MEAN_BITS + FRACTION_BITS)
         for _ in range(_SWEEPS):
             for i in range(3):
-                j, k = (i + 1) % 3, (i + 2) % 3
-                rest = _quotient(b[i], 2) - a[_PLACE[i][j]] * d[j] - a[_PLACE[i][k]] * d[k]
-                d[i] = min(max(_quotient(rest, max(a[i], 0) + 1), -most), most)
+                j, other = (i + 1) % 3, (i + 2) % 3
+                left = b[i] - a[_PLACE[i][j]] * d[j] - a[_PLACE[i][other]] * d[other]
+                d[i] = min(max(_quotient(left, max(a[i] - noise, 0) + 1), -most), most)
         self._centre = [m + v for m, v in zip(mean, d, strict=True)]
         least = min(self._level >> (2 * self._exponent), 1 << 36) * LEAST_RADIUS * one * one
         radius = math.isqrt(max(sum(a[:3]) * one + sum(v * v for v in d), least, one * one))
@@ -170,6 +198,27 @@ class SphereFit:
             (x << OFFSET_BITS) + _quotient(c << self._exponent, 1 << to_raw)
             for x, c in zip(self._base, self._centre, strict=True)
         ]
+
+    def _noise(self, a: list[int], b: list[int], k: list[int], d: list[int], square: int, over: int, n: int) -> int:
+        """Return the variance of the distances from the sphere around the previous centre, with `FRACTION_BITS`."""
+        one = 1 << FRACTION_BITS
+        spread = _quotient(self._fourth - square * self._square - square * over, n)  # the variance of q
+        left = (spread << (2 * SQUARE_BITS - 5)) * one  # 1 / 32 of the variance of |m - centre|²
+        for i in range(3):
+            turned = sum(a[_PLACE[i][j]] * d[j] for j in range(3))
+            part = _quotient(k[i] * (one << (SQUARE_BITS - 1)) + b[i] - turned, one * one * 8)
+            left -= self._centre[i] * part
+        radius = (sum(a[:3]) * one + sum(v * v for v in d)) >> (2 * FRACTION_BITS)
+        return 8 * max(left, 0) // max(radius, 1)
+
+
+def _least_eigenvalue(a: list[int]) -> int:
+    """Return a third of the smallest eigenvalue of the covariance ``a`` or more, but not above it."""
+    down = max(max(a[:3]).bit_length() - _MINOR_BITS, 0)
+    xx, yy, zz, xy, xz, yz = (_quotient(v, 1 << down) for v in a)
+    minors = [yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy]
+    determinant = xx * minors[0] - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    return max(determinant, 0) // max(sum(minors), 1) << down
 
 
 class SelfCalibration:

@@ -71,6 +71,12 @@ def test_two_references_of_an_analogue_converter_are_named(tmp_path: Path, cli: 
     assert 'give a layout with self_calibration = ["x", "y", "z"]' in ran.err
     adopted = import_recordings(source, tmp_path / "DS2", layout="accel-3", adopt_proposals=True)
     assert [c.offset for c in adopted.dataset.layout.channels] == [0, 0, 0], "no zero fits both"
+    assert open_dataset(tmp_path / "DS2").layout.self_calibration == ("x", "y", "z")
+    assert adopted.proposals[0]["advice"] == 'adopted self_calibration = ["x", "y", "z"]'
+    wide = load_layout("accel-3")
+    wide = replace(wide, channels=tuple(replace(c, valid_max=1e6) for c in wide.channels))
+    kept = import_recordings(source, tmp_path / "WIDE", layout=wide, adopt_proposals=True)
+    assert kept.dataset.layout == wide and "give a layout" in kept.proposals[0]["advice"]
     (found,) = (p for p in adopted.to_dict()["proposals"] if p["key"] in ("offset", "self_calibration"))
     assert found["value"] == ["x", "y", "z"] and list(found["groups"]) == adopted.sensors
     for group, zero, one_g, people in zip(

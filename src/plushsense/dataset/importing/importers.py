@@ -376,9 +376,11 @@ def _propose(done: ImportSummary, adopting: bool = False, added: bool = False) -
     sensors = find_sensors(done.dataset)
     done.sensors = [sensor.to_dict() for sensor in sensors]
     found = [p for p in propose_settings(done.dataset, sensors) if not added or p.key == SELF_CALIBRATION]
-    done.proposals = [{**p.to_dict(), "advice": p.advice(adopted=adopting)} for p in found]
     head = done.dataset.head
     layout = adopt(head.layout, found) if adopting else head.layout
+    for p in found:
+        adopted = adopting and (p.key != SELF_CALIBRATION or set(p.value) <= set(layout.self_calibration))
+        done.proposals.append({**p.to_dict(), "advice": p.advice(adopted)})
     if layout != head.layout:
         head = replace(head, layout=layout)
         write_file(done.dataset.path / HEAD, head.to_toml())
@@ -470,8 +472,8 @@ def import_recordings(
         people: the path of a people's table, see `dataset.store.read_people`.
         columns: the column of a table by role (``{"label": "activity"}``), or the ``stream`` of an XDF file.
         limits: limits of unpacking a zip.
-        adopt_proposals: put the proposed rate, gap and offsets (see `propose_settings`) into the layout of the new
-            data set; otherwise they are only reported.
+        adopt_proposals: put the proposed rate, gap, offsets and self-calibration (see `propose_settings`) into the
+            layout of the new data set; otherwise they are only reported.
         person: the person of files that name none: those directly in ``source``, in folders of gestures, and XDF files
             and tables without a person. "" refuses them; None takes the name of the folder where there is one.
         guess_layout: if no layout is given or stated, take the most probable built-in one that can read the files.

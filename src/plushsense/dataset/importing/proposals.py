@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import FileFormatError
+from plushsense.core.errors import FileFormatError, LayoutError
 from plushsense.core.layouts import ACCELERATION, DEVICE_MS, Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import read_recording
 from plushsense.dataset.quality.measurements import zeroing_limit
@@ -72,11 +72,13 @@ class Proposal:
 
     def advice(self, adopted: bool) -> str:
         """Say what to do, or what was done if the layout ``adopted`` the proposal."""
-        if self.key == SELF_CALIBRATION:
-            # No zero fits all sessions, so that there is nothing to adopt.
-            return f"give a layout with {self.key} = {json.dumps(self.value, ensure_ascii=False)}"
         many = isinstance(self.value, dict)
-        value = ", ".join(f"{k} {v:g}" for k, v in self.value.items()) if many else format(self.value, "g")
+        if many:
+            value = ", ".join(f"{k} {v:g}" for k, v in self.value.items())
+        else:
+            value = (
+                format(self.value, "g") if self.key != SELF_CALIBRATION else json.dumps(self.value, ensure_ascii=False)
+            )
         if self.key == "window_s":
             return f"try  [windows] window_s = {value}  in a --config file"
         setting = f"{self.key}: {value}" if many else f"{self.key} = {value}"
@@ -228,12 +230,20 @@ def propose_settings(dataset: Dataset, sensors: Sequence[Sensor] | None = None) 
 
 
 def adopt(layout: Layout, proposals: Sequence[Proposal]) -> Layout:
-    """Return the layout with the proposed rate, gap and offsets."""
+    """Return the layout with the proposed rate, gap, offsets and self-calibration.
+
+    Axes whose valid range is too wide for a self-calibration stay without.
+    """
     values = {p.key: p.value for p in proposals}
     offsets: dict[str, float] = values.get("offset", {})
     channels = tuple(replace(c, offset=offsets.get(c.name, c.offset)) for c in layout.channels)
     same = {key: values[key] for key in ("rate_hz", "gap_ms") if key in values}
-    return replace(layout, channels=channels, **same)
+    calibrated = (*layout.self_calibration, *values.get(SELF_CALIBRATION, ()))
+    adopted = replace(layout, channels=channels, **same)
+    try:
+        return replace(adopted, self_calibration=calibrated)
+    except LayoutError:
+        return adopted
 
 
 def _rate_and_gap(dataset: Dataset) -> Iterator[Proposal]:

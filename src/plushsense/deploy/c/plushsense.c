@@ -2156,7 +2156,9 @@ static void read_inputs(plush_toy *toy)
 #define LEAST_RADIUS 256
 #define MOST_VARIANCE ((INT64_C(1) << 47) - 1)
 #define VARIANCE_OF_STEPS 256
-#define SWEEPS 2u
+#define SWEEPS 8u
+#define SQUARE_BITS 6u
+#define MINOR_BITS 20u
 #define MOST_OUTPUT 32767
 #define MOST_CENTRE (INT64_C(4) << 20)
 
@@ -2165,6 +2167,41 @@ PLUSH_SMALL static void divide(int64_t *sums, uint32_t n, int64_t by)
 {
     for (; n > 0; n--)
         *sums++ /= by;
+}
+
+/* Halves the sums for the weight n; if that is odd, their mean leaves once first. */
+PLUSH_SMALL static void halve(int64_t *sums, uint32_t count, int64_t n)
+{
+    for (; count > 0; count--, sums++)
+        *sums = (*sums - (n & 1) * (*sums / n)) / 2;
+}
+
+/* The product of a symmetric matrix and a vector. */
+PLUSH_SMALL static int64_t row_times(const int64_t *a, uint32_t row, const int64_t *v)
+{
+    static const uint8_t place[9] = {0, 3, 4, 3, 1, 5, 4, 5, 2};
+    int64_t sum = 0;
+    uint32_t j;
+
+    for (j = 0; j < 3; j++)
+        sum += a[place[3 * row + j]] * v[j];
+    return sum;
+}
+
+/* At most the smallest eigenvalue of a covariance, at least a third of it. */
+PLUSH_SMALL static int64_t least_eigenvalue(const int64_t *a)
+{
+    int64_t m[6], minors, first, second, most = a[0] > a[1] ? a[0] : a[1];
+    uint32_t down = 0, i;
+
+    for (most = most > a[2] ? most : a[2]; most >> MINOR_BITS != 0; most >>= 1)
+        down++;
+    for (i = 0; i < 6; i++)
+        m[i] = a[i] / (INT64_C(1) << down);
+    first = m[1] * m[2] - m[5] * m[5];
+    minors = first + m[0] * m[2] - m[4] * m[4] + m[0] * m[1] - m[3] * m[3];
+    second = m[0] * first - m[3] * (m[3] * m[2] - m[5] * m[4]) + m[4] * (m[3] * m[5] - m[1] * m[4]);
+    return second > 0 ? second / (minors > 1 ? minors : 1) * (INT64_C(1) << down) : 0;
 }
 
 /* The mean of a block, with its weight, into the sums. */
@@ -2178,7 +2215,9 @@ PLUSH_SMALL static void add_mean(plush_sensor *s, int64_t weight)
     for (; top >> (s->exponent + MEAN_SIZE_BITS) != 0; s->exponent++) {
         divide(s->first, 3, 2);
         divide(s->second, 6, 4);
+        divide(&s->square, 1, 4);
         divide(s->third, 3, 8);
+        divide(&s->fourth, 1, 16);
         for (i = 0; i < 3; i++)
             s->centre[i] /= 2;
     }
@@ -2186,7 +2225,10 @@ PLUSH_SMALL static void add_mean(plush_sensor *s, int64_t weight)
         m[i] = s->sum[i] / (INT32_C(1) << s->exponent);
         squared += m[i] * m[i];
     }
+    squared >>= SQUARE_BITS;
     s->weight += (uint32_t)weight;
+    s->square += weight * squared;
+    s->fourth += weight * squared * squared;
     for (i = 0; i < 3; i++) {
         s->first[i] += weight * m[i];
         s->third[i] += weight * m[i] * squared;
@@ -2196,45 +2238,50 @@ PLUSH_SMALL static void add_mean(plush_sensor *s, int64_t weight)
     s->second[n++] += weight * m[0] * m[2];
     s->second[n] += weight * m[1] * m[2];
     if (s->weight > MOST_WEIGHT) {
+        halve(s->first, 3, s->weight);
+        halve(s->second, 6, s->weight);
+        halve(&s->square, 1, s->weight);
+        halve(s->third, 3, s->weight);
+        halve(&s->fourth, 1, s->weight);
         s->weight >>= 1;
-        divide(s->first, 3, 2);
-        divide(s->second, 6, 2);
-        divide(s->third, 3, 2);
     }
 }
 
 /* The centre moves toward the solution of A d = b; offset and scale follow. All with 8 fraction bits, products with 16. */
 PLUSH_SMALL static void fit_sphere(plush_sensor *s, uint32_t shift)
 {
-    static const uint8_t place[9] = {0, 3, 4, 3, 1, 5, 4, 5, 2};
-    int64_t n = s->weight != 0 ? (int64_t)s->weight : 1, mean[3], a[6], b[3], d[3], squared = 0, least;
+    int64_t n = s->weight != 0 ? (int64_t)s->weight : 1, mean[3], a[6], b[3], d[3], k[3], whole = s->square / n;
+    int64_t over = s->square - whole * n, noise, most, squared = 0, least;
     uint64_t size = UINT64_C(1) << 16;
     uint32_t radius, bits = 0, i, j;
 
-    for (i = 0; i < 3; i++)
-        mean[i] = s->first[i] * 256 / n;
+    noise = (s->fourth - whole * s->square - whole * over) / n * (INT64_C(1) << (2 * SQUARE_BITS + 3));
     for (i = 0; i < 6; i++) {
-        a[i] = s->second[i] * 256 / n;
-        if (i < 3)
-            squared += a[i];
+        int64_t one = s->first[i < 3 ? i : i == 5 ? 1 : 0], other = s->first[i < 3 ? i : i == 3 ? 1 : 2];
+
+        a[i] = (s->second[i] - one / n * other - (one - one / n * n) * other / n) * 256 / n;
+    }
+    for (i = 0; i < 3; i++) {
+        mean[i] = s->first[i] * 65536 / n;
+        k[i] = (s->third[i] - whole * s->first[i] - over * s->first[i] / n) * 256 / n * (INT64_C(1) << (SQUARE_BITS + 7));
     }
     for (i = 0; i < 3; i++)
-        for (j = i; j < 3; j++)
-            a[place[3 * i + j]] -= mean[i] * mean[j] / 256;
+        b[i] = k[i] - row_times(a, i, mean) / 256;
     for (i = 0; i < 3; i++) {
-        b[i] = s->third[i] / n * 65536 - squared * mean[i];
-        for (j = 0; j < 3; j++)
-            b[i] -= 2 * (a[place[3 * i + j]] * mean[j]);
-        b[i] /= 2;
+        mean[i] /= 256;
         d[i] = s->centre[i] - mean[i];
+        squared += d[i] * d[i];
     }
+    for (i = 0; i < 3; i++)
+        noise -= s->centre[i] * ((k[i] + b[i] - row_times(a, i, d)) / (INT32_C(1) << 19));
+    squared = ((a[0] + a[1] + a[2]) * 256 + squared) >> 16;
+    noise = noise > 0 ? 8 * noise / (squared > 1 ? squared : 1) : 0;
+    most = least_eigenvalue(a);
+    noise = noise < most ? noise : most;
     for (j = 0; j < 3 * SWEEPS; j++) {
-        uint32_t one, other;
-
         i = j % 3;
-        one = (i + 1) % 3;
-        other = (i + 2) % 3;
-        d[i] = (b[i] - a[place[3 * i + one]] * d[one] - a[place[3 * i + other]] * d[other]) / ((a[i] > 0 ? a[i] : 0) + 1);
+        most = a[i] > noise ? a[i] - noise : 0;
+        d[i] = (b[i] - row_times(a, i, d) + a[i] * d[i]) / (most + 1);
         d[i] = d[i] < -MOST_CENTRE ? -MOST_CENTRE : d[i] > MOST_CENTRE ? MOST_CENTRE : d[i];
     }
     least = s->level >> (2 * s->exponent);

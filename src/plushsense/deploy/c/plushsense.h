@@ -158,7 +158,8 @@ typedef struct {
 #ifdef PLUSH_CALIBRATE
 /* What is known of an accelerometer: sums over the blocks so far, the block at hand, and what follows. */
 typedef struct {
-    int64_t first[3], second[6], third[3]; /* weighted sums of the means, of their products, and times their squares */
+    int64_t first[3], second[6];           /* weighted sums of the means, and of their products */
+    int64_t square, third[3], fourth;      /* of q, the square of the length, of q times the means, and of q times q */
     int64_t squares, level;                /* of the block at hand; the variance of still blocks */
     int32_t base[3], sum[3];               /* the first sample, from which all is measured; sums of the block at hand */
     int32_t centre[3], offset[3];          /* offset: with 4 fraction bits */
