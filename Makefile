@@ -3,6 +3,7 @@
 #   make demo    install, then the whole path on a virtual toy (a simulation)
 #   make test    install, then all tests
 #   make test-quick   install, then the tests that need no browser, compiler, emulator or cluster
+#   make bench   measure the headline figures again, into docs/numbers.md: hours (ROWS=import,live: some rows)
 #   make fuzz    hostile bundles, layouts, lines and models for the C, for some hours (FUZZ=10: some minutes)
 #   make soak    24 hours of toy time through recorder, live and C; an hour of the studio; long fault drills (about a day)
 #   make coverage   branch coverage of the base packages (tests of them, of deploy and of the command line; half an hour)
@@ -24,7 +25,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(PIP_FL
 # Tests start hundreds of processes, each of which would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-quick fuzz check docs dist setup collect soak coverage mutants install clean
+.PHONY: demo test test-quick fuzz check docs dist setup collect soak coverage mutants install bench clean
 
 $(VENV)/.python:
 	@$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'PlushSense needs Python 3.11 or newer, this is ' + sys.version.split()[0] + ': run  make PYTHON=/path/to/python3.11 ...')"
@@ -103,6 +104,10 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest -p no:xdist tests/test_architecture.py
+
+BENCH_OUT ?= build/numbers
+bench: $(VENV)/.dev
+	$(BIN)/python bench/measure.py --out $(BENCH_OUT) $(if $(ROWS),--rows $(ROWS)) $(if $(SEEDS),--seeds $(SEEDS)) $(BENCH_FLAGS)
 
 # A warning is an error: a link that leads nowhere, a page that no other page lists.
 docs: $(VENV)/.dev

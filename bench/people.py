@@ -44,7 +44,7 @@ from plushsense.models import net
 from plushsense.models.arch import NORM_EPSILON, Arch, VectorLayer
 from plushsense.models.reference import Network
 from plushsense.training.augment import Channels, augmentations
-from plushsense.training.engine import slices, torch_threads
+from plushsense.training.engine import Adam, slices, torch_threads
 from plushsense.training.fit import fit, predict
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
@@ -158,15 +158,14 @@ def distilled(task: FoldTask) -> Floats:
         torch.manual_seed(spec.seed)
         random = torch.Generator().manual_seed(spec.seed)
         student = net.Net(task.arch)
-        adam = torch.optim.Adam(student.parameters(), lr=spec.learning_rate)
+        adam = Adam(student.parameters())
         for epoch in range(1, spec.epochs + 1):
-            adam.param_groups[0]["lr"] = spec.learning_rate_at(epoch)
             # Whole batches only: the statistics of a few remaining windows would be noisy.
             for batch in torch.randperm(len(x), generator=random).unfold(0, spec.batch, spec.batch):
                 windows = x[batch] if augment is None else augment(x[batch], random)
                 adam.zero_grad()
                 torch.autograd.backward(F.cross_entropy(student(windows), soft[batch]))
-                adam.step()
+                adam.step(spec.learning_rate_at(epoch))
     return task.predict(student.export_weights())
 
 

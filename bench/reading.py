@@ -1,8 +1,8 @@
 """Measure the time of reading recordings, against `np.loadtxt` alone and within the whole import.
 
 1326 recordings of 700 rows × 15 columns, as many as in the paper, are written once. In every round each method reads
-all of them in turn. Ratios are taken within a round, so that slow changes of the machine's speed have little effect.
-The import (copying, checksums, checks, index) is timed in the same rounds.
+all of them in turn. Ratios are of processor time and taken within a round, so that other programs and slow changes of
+the machine's speed have little effect. The import (copying, checksums, checks, index) is timed in the same rounds.
 
     python bench/reading.py [--rounds 7] [--files 1326] [--folder RECORDINGS --layout NAME] [--json]
 
@@ -55,10 +55,16 @@ def loadtxt_all(files: list[Path]) -> None:
         np.loadtxt(path, delimiter=separator, skiprows=1)
 
 
-def timed(work: Callable[[], object]) -> float:
-    began = time.perf_counter()
+def timed(work: Callable[[], object]) -> tuple[float, float]:
+    """Return seconds on the wall clock, and of the processor."""
+    began, used = time.perf_counter(), time.process_time()
     work()
-    return time.perf_counter() - began
+    return time.perf_counter() - began, time.process_time() - used
+
+
+def spread(seconds: list[float]) -> list[float]:
+    """Return minimum, median and maximum."""
+    return [round(s, 3) for s in (min(seconds), statistics.median(seconds), max(seconds))]
 
 
 def main() -> None:
@@ -88,7 +94,7 @@ def main() -> None:
             "read_recording": lambda: [read_recording(path, layout) for path in files],
             "whole import": whole_import,
         }
-        times: dict[str, list[float]] = {name: [] for name in ways}
+        times: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
         for _ in range(args.rounds + 1):
             for name, work in ways.items():
                 times[name].append(timed(work))
@@ -101,18 +107,24 @@ def main() -> None:
             "way": name,
             "files": len(files),
             "rounds": args.rounds,
-            "seconds": [round(s, 3) for s in (min(mine[1:]), statistics.median(mine[1:]), max(mine[1:]))],
-            "speed_of_loadtxt": round(statistics.median(f / m for f, m in zip(floor, mine[1:], strict=True)), 2),
+            "seconds": spread([wall for wall, _ in mine[1:]]),
+            "processor_seconds": spread([used for _, used in mine[1:]]),
+            "speed_of_loadtxt": round(
+                statistics.median(f / m for (_, f), (_, m) in zip(floor, mine[1:], strict=True)), 2
+            ),
         }
         for name, mine in times.items()
     ]
     if args.json:
         print(json.dumps(rows))
         return
-    print(f"{len(files)} files, {args.rounds} rounds; seconds (minimum / median / maximum), speed against np.loadtxt")
+    print(
+        f"{len(files)} files, {args.rounds} rounds; seconds on the wall clock, and of the processor (minimum / median /"
+    )
+    print("maximum); speed against np.loadtxt")
     for row in rows:
-        least, median, most = row["seconds"]  # type: ignore[misc]
-        print(f"{row['way']:<18} {least:7.3f} {median:7.3f} {most:7.3f}   {row['speed_of_loadtxt']}")
+        numbers = [*row["seconds"], *row["processor_seconds"]]  # type: ignore[misc]
+        print(f"{row['way']:<18} {' '.join(f'{s:7.3f}' for s in numbers)}   {row['speed_of_loadtxt']}")
 
 
 if __name__ == "__main__":

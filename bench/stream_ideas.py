@@ -49,7 +49,7 @@ from plushsense.runtime.fixed import integer_logits, smoothing_weight
 from plushsense.runtime.trace import ReportedEvent, TraceReplayer
 from plushsense.scoring.events import at_recall, overlaps
 from plushsense.training.augment import Channels, augmentations
-from plushsense.training.engine import Engine, Fast, Windows, slices
+from plushsense.training.engine import Adam, Engine, Fast, Windows, slices
 from plushsense.training.fast.net import FastNet, Fill
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSet
@@ -265,15 +265,14 @@ def trained(
     if start:
         net.import_weights(bundle.weights)
     engine, order = make(net), torch.Generator().manual_seed(spec.seed)
-    adam = torch.optim.Adam(engine.parameters, lr=rates[0], fused=True)
+    adam = Adam(engine.parameters, fused=True)
     for rate in rates:
-        adam.param_groups[0]["lr"] = rate
         index = torch.arange(len(x)) if choose is None else choose(F.softmax(engine.logits(x), dim=1))
         index = index[torch.randperm(len(index), generator=order)]
         for at in slices(len(index), spec.batch):
             if len(index[at]) >= 8:
                 engine.step(x, index[at], y[index[at]], augment, order)
-                adam.step()
+                adam.step(rate)
     weights = engine.export_weights()
     engine.close()
     return replace(bundle, weights=weights)

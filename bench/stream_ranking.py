@@ -134,6 +134,7 @@ def fit_continual(train: WindowSet, watch: WindowSet, seed: int) -> Reader:
     from torch.nn import functional as F
 
     from plushsense.training.augment import Channels, augmentations
+    from plushsense.training.engine import Adam
 
     torch.manual_seed(seed)
     scaler, layers, macs, channels = Scaler.fit(train.x), [], 0, len(AXES)
@@ -144,15 +145,13 @@ def fit_continual(train: WindowSet, watch: WindowSet, seed: int) -> Reader:
     span = net.receptive_field
     x, y = torch.from_numpy(scaler.apply(train.x)[:, :, -span:]), torch.from_numpy(train.y)
     turn = augmentations(("random-rotation:45",), Channels(((0, 1, 2),), scaler, torch.device("cpu")))
-    adam, order = torch.optim.Adam(net.parameters(), lr=0.003), torch.Generator().manual_seed(seed)
-    schedule = torch.optim.lr_scheduler.StepLR(adam, 8, 0.5)
-    for _ in range(30):
+    adam, order = Adam(net.parameters()), torch.Generator().manual_seed(seed)
+    for epoch in range(30):
         for batch in torch.randperm(len(x), generator=order).split(64):
             if len(batch) > 1:
                 adam.zero_grad()
                 F.cross_entropy(net(turn(x[batch], order))[:, :, -1], y[batch]).backward()
-                adam.step()
-        schedule.step()
+                adam.step(0.003 * 0.5 ** (epoch // 8))
     net.eval()
 
     @torch.no_grad()

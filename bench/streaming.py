@@ -1,7 +1,8 @@
 """Measure the cost of a live decision: a network that keeps its state against one that recomputes its window.
 
-Both run in the NumPy reference, in turn, on the same samples. Ratios are taken within a round, so that slow changes of
-the machine's speed have little effect. The numbers of multiply-accumulates are printed beside the times.
+Both run in the NumPy reference on one thread, in turn, on the same samples. Times are of the processor, and ratios are
+taken within a round, so that other programs and slow changes of the machine's speed have little effect. The numbers of
+multiply-accumulates are printed beside the times.
 
     python bench/streaming.py [--rounds 15] [--json]
 """
@@ -10,8 +11,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import statistics
 import time
+
+# Before NumPy: threads of BLAS that wait for each other would take time, too.
+os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
 
@@ -40,10 +45,10 @@ def main() -> None:
         for name, stepper in steppers.items():
             stepper.reset()
             stepper.push(samples[:600])
-            began = time.perf_counter()
+            began = time.process_time()
             for at in range(600, len(samples), 5):
                 stepper.push(samples[at : at + 5])
-            times[name].append((time.perf_counter() - began) / DECISIONS)
+            times[name].append((time.process_time() - began) / DECISIONS)
     rows = []
     for name, arch in archs.items():
         mine, other = times[name][1:], times[AGAINST][1:]

@@ -17,6 +17,7 @@ gestures as the network did before the correction.
 from __future__ import annotations
 
 import argparse
+import json
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from statistics import fmean, stdev
@@ -71,17 +72,25 @@ def main() -> None:
     parser.add_argument("--rows", default=",".join([*ROWS, FEEDBACK]), help="rows to compute, joined by commas")
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument("--workers", type=int, default=0, help="folds in parallel (default: one per processor)")
+    parser.add_argument("--json", action="store_true", help="one JSON object: of each row the result of each seed")
     args = parser.parse_args()
     dataset = ps.open_dataset(args.dataset)
     seeds = [int(seed) for seed in args.seeds.split(",")]
     chosen = args.rows.split(",")
     if unknown := [name for name in chosen if name not in ROWS and name != FEEDBACK]:
         parser.error(f"there is no row {', '.join(unknown)}: accepted are {', '.join([*ROWS, FEEDBACK])}")
+    if args.json and FEEDBACK in chosen:
+        parser.error(f"the row {FEEDBACK} has no --json: leave it out of --rows")
+    table: dict[str, Any] = {}
     for name in chosen:
         if name != FEEDBACK:
             results = [benchmark(dataset, ROWS[name], seed, args.workers) for seed in seeds]
-            print(line(name, ROWS[name], results), flush=True)
-    if FEEDBACK in chosen:
+            table[name] = [figures(ROWS[name], result) for result in results]
+            if not args.json:
+                print(line(name, ROWS[name], results), flush=True)
+    if args.json:
+        print(json.dumps({"seeds": seeds, "rows": table}))
+    elif FEEDBACK in chosen:
         for how in ("balanced", "cheapest"):
             for line_of in feedback(dataset, seeds, how, args.workers):
                 print(line_of, flush=True)
@@ -98,6 +107,14 @@ def benchmark(dataset: Dataset, row: Row, seed: int, workers: int) -> dict[str, 
     # The reference is needed for the interpolation at equal recall.
     systems = list(dict.fromkeys(["smoothed", row.system]))
     return stream_benchmark(dataset, config, systems=systems, anywhere_pool_s=row.pool_s)
+
+
+def figures(row: Row, result: dict[str, Any]) -> dict[str, Any]:
+    """Return the figures of a row with one seed: false events per hour at each recall, and each choice of settings."""
+    at = {f"{r['recall']:g}": r["systems"][row.system]["false_events_per_hour"] for r in result["at_recall"]}
+    scores = result["systems"][row.system]
+    keys = ("recall", "f1", "false_events_per_hour", "latency_s", "fragmentations", "merges")
+    return {"at_recall": at, "choices": {how: {key: scores[how][key] for key in keys} for how in CHOICES}}
 
 
 def spread(values: list[float | None], digits: int) -> str:

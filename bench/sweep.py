@@ -1,24 +1,27 @@
 """Compare our training with a plain PyTorch loop: cost of the paper's grid, losses, and final accuracies.
 
-    python bench/sweep.py steps [--cores 1] [--filters 0,1,2,3] [--batches 64,256,3936] [--repeats 5]
+    python bench/sweep.py steps [--cores 1] [--filters 0,1,2,3] [--batches 64,256,3936] [--repeats 5] [--json]
     python bench/sweep.py losses DATASET        first 50 steps of all 52 networks, from the same weights and batches
     python bench/sweep.py trials DATASET        20 paired trainings: are the final accuracies different?
 
 The plain loop is a careful standard implementation: nn.Conv1d, nn.ReLU, nn.BatchNorm1d, F.pad with reflection, the data
 in memory as one tensor, fused Adam, no value read out within an epoch, one training at a time. Both are timed in turn,
-step by step, with the same batch and number of cores. On one core each uses one thread. On several cores, the plain
-loop runs one training with that many threads, and ours runs that many trainings side by side, as a sweep does. The
-fastest step of each is used, because other programs on the machine can only slow it down. The grid has 52 networks ×
+step by step, with the same batch and number of cores. On one core each uses one thread, and its processor time is
+taken. On several cores, the plain loop runs one training with that many threads, and ours runs that many trainings side
+by side, as a sweep does, and the wall clock is taken. The fastest step of each is used, because other programs on the
+machine can only slow it down. The grid has 52 networks ×
 batch 64, 256, full × 100, 250 and 1000 epochs; trained separately these are 1350 epochs, nested 1000.
 """
 
 import argparse
 import copy
+import json
 import math
 import multiprocessing
 import platform
 import sys
 import time
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -31,6 +34,7 @@ from torch.nn import functional as F
 import plushsense as ps
 from plushsense.models.arch import PAPER_ARCHITECTURES, PAPER_FILTERS, Arch
 from plushsense.models.net import Net
+from plushsense.training.engine import Adam
 from plushsense.training.fast.net import FastNet
 from plushsense.windows.cut import WindowSpec
 
@@ -92,7 +96,7 @@ class Loops:
         self.model, self.fast = Plain(arch), FastNet(net, batch, threads)
         self.model.take(net)
         self.adam = torch.optim.Adam(self.model.parameters(), lr=RATE, fused=True)
-        self.fast_adam = torch.optim.Adam(self.fast.parameters, lr=RATE, fused=True)
+        self.fast_adam = Adam(self.fast.parameters, fused=True)
 
     def take_plain(self, model: Plain) -> None:
         """Copy the plain loop's weights into ours."""
@@ -121,7 +125,7 @@ class Loops:
             torch.index_select(self.time_first, 1, batch[start:end], out=out)
 
         loss, _, _ = self.fast.step(fill, self.y[batch])
-        self.fast_adam.step()
+        self.fast_adam.step(RATE)
         return loss
 
 
@@ -188,11 +192,14 @@ def steps(args: argparse.Namespace) -> None:
     random = torch.Generator().manual_seed(1)
     x, y = noise()
     beside = Beside(args.cores) if args.cores > 1 else None
+    clock = time.process_time if beside is None else time.perf_counter
     plain_s = ours_s = 0.0
-    print(f"{platform.machine()}, {args.cores} core(s), torch {torch.__version__}; the fastest of interleaved steps")
+    rows: list[dict[str, Any]] = []
+    say = partial(print, file=sys.stderr if args.json else sys.stdout, flush=True)
+    say(f"{platform.machine()}, {args.cores} core(s), torch {torch.__version__}; the fastest of interleaved steps")
     if beside is not None:
-        print(f"plain: one training on {args.cores} threads; ours: {args.cores} trainings side by side, a thread each")
-    print(f"{'network':38s} {'batch':>5s} {'plain ms':>9s} {'ours ms':>9s} {'ratio':>6s} {'MB':>6s}")
+        say(f"plain: one training on {args.cores} threads; ours: {args.cores} trainings side by side, a thread each")
+    say(f"{'network':38s} {'batch':>5s} {'plain ms':>9s} {'ours ms':>9s} {'ratio':>6s} {'MB':>6s}")
     for arch in networks(filters):
         for batch in batches:
             loops = Loops(arch, x, y, batch, args.cores)
@@ -203,15 +210,15 @@ def steps(args: argparse.Namespace) -> None:
             took: tuple[list[float], list[float]] = ([], [])
             for turn in range(max(1, args.repeats // 3) if few else args.repeats + 1):
                 at = torch.randperm(WINDOWS, generator=random)[:batch]
-                began = time.perf_counter()
+                began = clock()
                 loops.plain(at)
-                plain = time.perf_counter() - began
+                plain = clock() - began
                 if beside is not None:
                     ours = beside.step_s(1 if few else 4)
                 else:
-                    began = time.perf_counter()
+                    began = clock()
                     loops.ours(at)
-                    ours = time.perf_counter() - began
+                    ours = clock() - began
                 if turn or few:
                     took[0].append(plain)
                     took[1].append(ours)
@@ -220,19 +227,23 @@ def steps(args: argparse.Namespace) -> None:
             each = math.ceil(WINDOWS / batch)
             plain_s += plain * each
             ours_s += ours * each
-            print(
+            rows.append({"network": named(arch), "batch": batch, "plain_s": plain, "ours_s": ours})
+            say(
                 f"{named(arch):38s} {batch:5d} {1e3 * plain:9.1f} {1e3 * ours:9.1f} {plain / ours:6.2f} "
                 f"{loops.fast.plan.bytes / 1e6:6.0f}",
-                flush=True,
             )
     if beside is not None:
         for pipe in beside.pipes:
             pipe.send(None)
+    hours = {"plain": plain_s * APART / 3600, "ours": ours_s * NESTED / 3600}
+    if args.json:
+        print(json.dumps({"rows": rows, "step_ratio": plain_s / ours_s, "hours": hours}))
+        return
     print(f"an epoch of everything: plain {plain_s:.1f} s, ours {ours_s:.1f} s")
     print(f"step for step:                       {plain_s / ours_s:.2f} times less")
     print(f"nested epochs (1350 → 1000):         {APART / NESTED:.2f} times less")
-    print(f"the whole grid:                      {plain_s * APART / (ours_s * NESTED):.2f} times less")
-    print(f"in hours: plain {plain_s * APART / 3600:.1f}, ours {ours_s * NESTED / 3600:.1f}")
+    print(f"the whole grid:                      {hours['plain'] / hours['ours']:.2f} times less")
+    print(f"in hours: plain {hours['plain']:.1f}, ours {hours['ours']:.1f}")
 
 
 def data(path: str) -> tuple[Tensor, Tensor, Any]:
@@ -329,6 +340,7 @@ def main() -> int:
     parser.add_argument("--batches", default="64,256,3936")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--epochs", type=int, default=30)
+    parser.add_argument("--json", action="store_true", help="for steps: one JSON object")
     args = parser.parse_args()
     if args.what != "steps" and not args.dataset:
         parser.error(f"{args.what} needs a data set")
