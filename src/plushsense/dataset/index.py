@@ -140,6 +140,10 @@ def open_dataset(path: str | Path) -> Dataset:
     return built.dataset
 
 
+def _digests(recordings: Iterable[RecordingInfo], streams: Iterable[StreamInfo]) -> dict[str, str]:
+    return {r.file: r.sha256 for r in recordings} | {s.file: s.sha256 for s in streams}
+
+
 def _refuse_changed(folder: Path, now: Dataset) -> None:
     """Raise DatasetError if a raw file is not the one that the index on disk describes."""
     if not is_index_intact(folder):
@@ -149,8 +153,8 @@ def _refuse_changed(folder: Path, now: Dataset) -> None:
         streams = read_index(folder / STREAMS_INDEX, StreamInfo)
     except DatasetError:
         return
-    before = {info.file: info.sha256 for info in (*recordings, *streams)}
-    files = {info.file: info.sha256 for info in (*now.recordings, *now.streams)}
+    before = _digests(recordings, streams)
+    files = _digests(now.recordings, now.streams)
     changed = sorted(file for file, sha256 in files.items() if before.get(file, sha256) != sha256)
     if changed:
         raise DatasetError(
