@@ -68,8 +68,8 @@ SLOW_FIXTURES = {"real_data", "c_compiler", "target_here", "two_nodes", "lsl_pos
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Run five tests on two processors: those of the studio, of processes and of devices wait half of their time."""
-    return max(2, 5 * (os.cpu_count() or 1) // 2)
+    """Run three tests on two processors, as the tests of the studio wait a third of their time; with five, pages stall."""
+    return max(2, 3 * (os.cpu_count() or 1) // 2)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

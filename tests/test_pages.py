@@ -277,6 +277,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ):
             status, said = run(command)
             assert status == 0, said
+    shutil.copytree(ROOT / "examples", folder / "examples")
     shutil.copytree(folder / "RECORDINGS", folder / "SRC")
     for name in ("SESSION", "visit"):
         shutil.copytree(folder / "RECORDINGS" / "P01", folder / name)

@@ -27,7 +27,7 @@ from support.requirements import LONG
 from support.trainings import train_apart
 
 Fixture = Callable[..., Any]
-SPEED = 20.0
+SPEED = 10.0
 TOY_S = 600.0 if LONG else 240.0 if os.environ.get("PLUSHSENSE_REQUIRE") else 120.0
 TOY = "virtual://?person=31&seed=1"
 # An event may be told so long after the hand has gone.

@@ -493,7 +493,7 @@ def test_an_event_is_marked_as_wrong_and_the_network_improved(
 
 
 def test_a_new_person_is_led_through_the_validation(studio: Fixture, look: Fixture, shots: Fixture, home: Path) -> None:
-    url = studio("--device", "virtual://?person=31", "--speed", "8", home=home).url
+    url = studio("--device", "virtual://?person=31", "--speed", "3", home=home).url
     browser = look(PHONE, True, "lv", touch=True)
     page = live(browser, url)
     assert marked(page, "validate").is_disabled()

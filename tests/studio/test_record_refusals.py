@@ -162,7 +162,7 @@ def test_a_toy_that_goes_away_and_comes_back(studio: Fixture, look: Fixture, tmp
             marked(page, "change-toy").click()
             marked(page, "exchange-other_toy").fill(other)
             marked(page, "exchange-go").click()
-            page.get_by_text("The session goes on with another toy").wait_for()
+            marked(page, "recorder-message").get_by_text("The session goes on with another toy").wait_for()
             page.wait_for_load_state("load")
             connected(page)
             heard(page)

@@ -39,6 +39,8 @@ CHROMIUM = [
     "--disable-component-update",
     "--disable-sync",
 ]
+# What Chromium says of a message that a page sends just when its connection is closed, as on leaving the page.
+_CLOSED = "WebSocket is already in CLOSING or CLOSED state."
 _PROGRAMS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 _START_S = 120.0
 _WAIT_MS = 120_000
@@ -177,7 +179,9 @@ class Look:
         page.set_default_timeout(_WAIT_MS)
         # By default a wait looks at every frame, which keeps the browser drawing frames.
         setattr(page, "wait_for_function", functools.partial(page.wait_for_function, polling=_POLL_MS))  # noqa: B010
-        page.on("console", lambda m: self.complaints.append(m.text) if m.type == "error" else None)
+        page.on(
+            "console", lambda m: self.complaints.append(m.text) if m.type == "error" and m.text != _CLOSED else None
+        )
         page.on("pageerror", lambda e: self.complaints.append(str(e)))
         page.goto(url)
         connected(page)
