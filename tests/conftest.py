@@ -68,7 +68,7 @@ SLOW_FIXTURES = {"real_data", "c_compiler", "target_here", "two_nodes", "lsl_pos
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Run three tests on two processors, as the tests of the studio wait a third of their time; with five, pages stall."""
+    """Run three tests on two processors: those of the studio wait a third of their time, and with five, pages stall."""
     return max(2, 3 * (os.cpu_count() or 1) // 2)
 
 
