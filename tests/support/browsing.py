@@ -25,7 +25,7 @@ from urllib.parse import urlsplit
 from plushsense.studio.app.shell import PAGES
 
 if TYPE_CHECKING:
-    from playwright.sync_api import BrowserContext, ConsoleMessage, Page, Request
+    from playwright.sync_api import BrowserContext, Page, Request
 
 T = TypeVar("T")
 TESTS = Path(__file__).parents[1]
@@ -186,10 +186,6 @@ class Look:
         page.goto(url)
         connected(page)
         return page
-
-    def _listen(self, message: ConsoleMessage) -> None:
-        if message.type == "error" and message.text != _CLOSED:
-            self.complaints.append(message.text)
 
 
 def find_chromium() -> str | None:
