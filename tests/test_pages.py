@@ -96,9 +96,13 @@ NOT_RUN = {
         "corrections of events",
         "tests/cli/test_adapt.py::test_events_marked_as_wrong_correct_the_bundle",
     ),
-    "plushsense toy ": (
+    "plushsense toy --tcp": (
         "it serves until Ctrl-C",
         "tests/cli/test_live.py::test_over_tcp",
+    ),
+    "plushsense toy --scenario examples/scenarios/rainy-afternoon.toml --tcp": (
+        "it serves until Ctrl-C",
+        "tests/cli/test_toy.py::test_the_truth_is_written_while_a_scenario_is_read",
     ),
     "plushsense publish ": (
         "the validators of a package take long",

@@ -94,8 +94,8 @@ def test_the_tutorial_ends_with_the_same_answers_in_c(tmp_path: Path, monkeypatc
     monkeypatch.setattr("plushsense.deploy.proof.verify.settings_of", lambda name: [Setting(name, "gcc", "-O2")])
     said = ""
     for command in blocks(TUTORIAL):
-        if command.startswith("make "):
-            continue
+        if not command.startswith(("plushsense ", "python ")):
+            continue  # of the shell
         status, said = run(command)
         assert status == 0, f"{command}: exit status {status}\n{said}"
         if "--guess" in command:
