@@ -36,8 +36,11 @@ def is_unfinished(name: str) -> bool:
 
 
 def abandoned_folders(place: Path) -> list[Path]:
-    """Return the work folders in ``place`` that no process uses any more, as a killed program leaves them."""
-    found = [entry for entry in place.glob(f".*{_UNFINISHED}*") if (entry / _OWNER).is_file()]
+    """Return the work folders in ``place`` that no process uses any more, as a killed program leaves them.
+
+    Folders of other users, which this one may not read, are left out.
+    """
+    found = [entry for entry in place.glob(f".*{_UNFINISHED}*") if os.path.isfile(entry / _OWNER)]
     return sorted(entry for entry in found if not is_in_use(entry))
 
 
