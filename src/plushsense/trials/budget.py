@@ -305,7 +305,7 @@ def _planned(config: RunConfig, plan: BudgetPlan) -> RunConfig:
 
 
 def _adjusted(plan: BudgetPlan, cost: TrainingCost, training_s: float, left_s: float) -> BudgetPlan:
-    """Return the plan with fewer folds if the training took longer than estimated, and ``left_s`` is not enough."""
+    """Return the plan with fewer folds if one training took longer than estimated, and ``left_s`` is not enough."""
     cost = replace(cost, window_epoch_s=max(cost.window_epoch_s, training_s / (cost.windows * plan.epochs)))
     trained_s = cost.training_s(plan.epochs)
     if plan_s(cost, plan) - trained_s <= left_s:
@@ -339,6 +339,7 @@ def _train(
     progress: Reporter,
     warn: Warn,
 ) -> tuple[Path, float]:
+    """Train the network and save it; return its path, and the seconds that one training on everybody took."""
     each = networks // (1 + again)
 
     def epoch_done(epoch: int, epochs: int, row: dict[str, Any]) -> None:
@@ -350,7 +351,7 @@ def _train(
             progress(BudgetProgress(DECIDING, done / whole, {}))
 
     done = train(dataset, config, journal=unfinished(dataset), progress=epoch_done, warn=warn)
-    return done.save(free_path(out, done.bundle.to_bytes())), done.seconds
+    return done.save(free_path(out, done.bundle.to_bytes())), done.seconds / (1 + again)
 
 
 def _folds(

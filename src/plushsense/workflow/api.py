@@ -39,7 +39,7 @@ from plushsense.evaluation.scores import compute_scores as score_predictions
 from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possible
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
-from plushsense.models.bundle import Bundle, known_people
+from plushsense.models.bundle import Bundle, is_training_content, known_people
 from plushsense.models.reference import softmax
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import parse_split
@@ -411,7 +411,7 @@ def validation_predictions(bundle: Bundle, dataset: Dataset | str | os.PathLike[
     lost = bundle.provenance.get("refit") and stored is None
     if bundle.provenance.get("split") != WHOLE_PEOPLE or not people or lost:
         raise DatasetError("This network has no validation people: evaluate it instead.", reason="no_validation_people")
-    if bundle.provenance.get("dataset_hash") != dataset.hash:
+    if not is_training_content(bundle, dataset):
         raise DatasetError(
             f"The data set '{dataset.head.name}' was changed since this network was trained: evaluate it instead.",
             reason="data_changed",
