@@ -48,7 +48,8 @@ def test_a_training_as_long_as_estimated_cuts_no_folds(
     done = SimpleNamespace(seconds=cost.training_s(2), bundle=SimpleNamespace(to_bytes=lambda: b""))
     done.save = lambda path: path
     monkeypatch.setattr(budget, "train", lambda *_, **__: done)
-    _, training_s = budget._train(dataset, from_settings(), tmp_path / "n", 1.0, 2, True, lambda _: None, lambda _: None)
+    nothing = lambda _: None  # noqa: E731
+    _, training_s = budget._train(dataset, from_settings(), tmp_path / "n", 1.0, 2, True, nothing, nothing)
     left_s = plan_s(cost, plan) - cost.training_s(2)
     assert budget._adjusted(plan, cost, training_s, left_s + 1e-9) == plan
 

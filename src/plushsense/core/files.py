@@ -36,12 +36,14 @@ def is_unfinished(name: str) -> bool:
 
 
 def abandoned_folders(place: Path) -> list[Path]:
-    """Return the work folders in ``place`` that no process uses any more, as a killed program leaves them.
-
-    Folders of other users, which this one may not read, are left out.
-    """
-    found = [entry for entry in place.glob(f".*{_UNFINISHED}*") if os.path.isfile(entry / _OWNER)]
-    return sorted(entry for entry in found if not is_in_use(entry))
+    """Return the work folders in ``place`` that no process uses any more, as a killed program leaves them."""
+    found = []
+    for entry in place.glob(f".*{_UNFINISHED}*"):
+        # Those of other users cannot be read.
+        with contextlib.suppress(PermissionError):
+            if (entry / _OWNER).is_file() and not is_in_use(entry):
+                found.append(entry)
+    return sorted(found)
 
 
 def abandoned_temporary_folders() -> list[Path]:

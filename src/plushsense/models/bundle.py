@@ -329,7 +329,7 @@ def known_people(provenance: Mapping[str, Any], keys: Sequence[str] = _PEOPLE) -
 
 
 def is_training_content(bundle: Bundle, dataset: Dataset) -> bool:
-    """Return whether a bundle was trained on the present content of a data set, its gestures merged as in the bundle."""
+    """Return whether a bundle was trained on the present content of a data set, with gestures merged as in it."""
     return bundle.provenance.get("dataset_hash") == dataset.with_gestures(bundle.gestures).hash
 
 
