@@ -239,6 +239,7 @@ def test_cells_and_counts_are_no_faults_unless_they_never_change(tmp_path: Path)
         ('separator = ";;"\n', "accepted is one character"),
         ('decimal = ","\nseparator = ","\n', "line 1: decimal and separator are both"),
         ('encoding = "utf-9"\n', "accepted are names such as utf-8"),
+        ('encoding = "utf\\u0000"\n', "accepted are names such as utf-8"),
         ('[aliases]\nTap = ["t"]\nTip = ["t"]\n', "'t' is an alias of 'Tap' and of 'Tip'"),
         ("paths = = 1\n", "is not valid TOML: .*line 1"),
     ],
