@@ -18,6 +18,7 @@ from plushsense.models.bundle import trained_people
 from plushsense.workflow.api import simulate, validation_predictions
 from plushsense.workflow.datasets import trained_on
 from plushsense.workflow.networks import REFIT
+from plushsense.workflow.preparation import count_people
 
 
 def test_the_public_api_is_small_and_all_of_its_names_load() -> None:
@@ -69,6 +70,12 @@ def test_a_network_of_merged_gestures_knows_its_data_set(dataset: Dataset, tmp_p
     # Under another name, the data set is still the one of the training.
     renamed = Dataset(dataset.path, replace(dataset.head, name="other"), dataset.recordings, dataset.streams)
     assert trained_people(bundle, renamed) == set(dataset.subjects)
+
+
+def test_people_whose_recordings_are_all_excluded_do_not_count(dataset: Dataset) -> None:
+    assert count_people(dataset) == len(dataset.subjects) == 5
+    left = [replace(r, excluded=r.subject in ("P1", "P2", "P3")) for r in dataset.recordings]
+    assert count_people(Dataset(dataset.path, dataset.head, left, dataset.streams)) == 2
 
 
 def test_early_stopping_keeps_whole_people_apart_and_says_on_whom(dataset: Dataset) -> None:

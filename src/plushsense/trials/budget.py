@@ -21,9 +21,8 @@ import numpy as np
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.files import free_path, write_file
-from plushsense.core.gestures import NOBODY
 from plushsense.dataset.index import as_dataset
-from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
+from plushsense.dataset.store import Dataset
 from plushsense.jobs.journal import job_id
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.bundle import Bundle
@@ -33,7 +32,7 @@ from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import evaluate, train, unfinished
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.networks import FIRST_NETWORK, REFIT
-from plushsense.workflow.preparation import Warn, refits, silent
+from plushsense.workflow.preparation import Warn, count_people, refits, silent
 from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, evaluation_id, journal_of, name_of, write_report
 
 TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
@@ -219,7 +218,7 @@ def make_network(
         streams = any(recording.stream_row >= 0 for recording in dataset.used)
         config = from_settings(context=ANYWHERE) if streams else from_settings()
     networks = 2 if config.anywhere.hard_share and config.windows.context == ANYWHERE else 1
-    again = refits(config, _count_people(dataset))
+    again = refits(config, count_people(dataset))
     networks *= 1 + again
     # A resumed run must not choose other folds because the computer is faster or slower than before.
     journal = journal_of(dataset, "budgets")
@@ -228,7 +227,7 @@ def make_network(
     cost = None
     if stored is None:
         cost = _measured(dataset, config, networks)
-        plan = choose_plan(cost, _count_people(dataset), config.training.epochs, _USED * budget_s)
+        plan = choose_plan(cost, count_people(dataset), config.training.epochs, _USED * budget_s)
         if cost.side_by_side * cost.evaluation_s(plan.epochs, plan.folds) < _START_S:
             plan = replace(plan, workers=1)
         journal.save(key, {"plan": asdict(plan), "bundle": ""})
@@ -282,12 +281,8 @@ def make_network(
     }
 
 
-def _count_people(dataset: Dataset) -> int:
-    return len({r.subject for r in dataset.used} - {NOBODY, UNKNOWN_SUBJECT})
-
-
 def _measured(dataset: Dataset, config: RunConfig, networks: int) -> TrainingCost:
-    split = "leave-one-subject-out" if _count_people(dataset) >= _PEOPLE_FOR_SPLIT else _KNOWN_PEOPLE
+    split = "leave-one-subject-out" if count_people(dataset) >= _PEOPLE_FOR_SPLIT else _KNOWN_PEOPLE
     seen = preview_evaluation(dataset, replace(config, evaluation=replace(config.evaluation, split=split)))
     return TrainingCost(seen["window_epoch_s"], seen["windows"], config.evaluation.processes, networks)
 

@@ -252,6 +252,11 @@ class TrainValidationSplit:
     refit: bool
 
 
+def count_people(dataset: Dataset) -> int:
+    """Return the number of people with a recording that is not excluded."""
+    return len({r.subject for r in dataset.used} - {NOBODY, UNKNOWN_SUBJECT})
+
+
 def refits(config: RunConfig, people: int) -> bool:
     """Return whether `api.train` trains a second time, on everybody: where whole people are held out for nothing else.
 
