@@ -224,9 +224,9 @@ HEAD = """\
 <!-- Written by bench/measure.py (make bench) from docs/numbers.json: do not edit. -->
 # Numbers
 
-The headline figures of PlushSense in one table, with what each was measured on. Other pages have more, and say how;
-where they or the README quote one of these figures, a test compares it with this table. For programs there is
-[numbers.json](numbers.json).
+The headline figures of PlushSense in one table, with what each was measured on. Other pages have more figures and say
+how they were measured. Where they or the README quote one of these, a test compares it with this table. Programs find
+the same figures in [numbers.json](numbers.json).
 
 ```sh
 make bench                              # every row: about {hours} hours on two idle cores; can be stopped and continued
@@ -235,11 +235,11 @@ make bench ROWS=strangers SEEDS=0       # with one seed
 make bench BENCH_FLAGS=--list           # how long each takes, and when it was measured
 ```
 
-*Measured* names the last commit of `src`, the date, the [machine](#machines) and its load (average of a minute, before
-and after; two cores are busy at 2). A row that says *as documented* was not measured again since: commit and date are
-those at which its figures were written down. **Times on a busy machine are not those of an idle one**: rely on ratios,
-which are taken in turn within a run, and on counts, which do not depend on the machine. Standard deviations over people
-are means over the seeds. Nothing was measured on a real toy or a real chip.
+The column *measured* names the last commit of `src`, the date, the [machine](#machines) and its load (average of a
+minute, before and after; at 2, two cores are busy). A row with *as documented* was not measured again: commit and date
+are those at which its figures were written down. **Times on a busy machine are longer than on an idle one**: rely on
+ratios, whose two parts were measured alternately in one run, and on counts, which do not depend on the machine.
+Standard deviations over people are means over the seeds. Nothing was measured on a real toy or a real chip.
 """
 
 

@@ -294,10 +294,13 @@ def small_model(work: Path) -> Path:
 
 
 def faults_of(found: dict[str, Any]) -> list[str]:
-    """Return what is not as promised in the results of all parts, but for memory; empty if all is."""
+    """Return what is not as promised in the results of the parts, or was not compared at all; empty if all is well."""
     frames, wrong = found["frames"]["frames"], []
-    for part in found.keys() & {"record", "live", "chip"}:
+    for part, compared in (("record", "recordings"), ("live", "decisions"), ("chip", "rows_compared")):
+        if part not in found:
+            continue
         result = found[part]
+        wrong += [f"{part}: {compared} is 0, so that nothing is compared"] if not result[compared] else []
         count = result["rows" if part == "record" else "frames"]
         wrong += [f"{part}: {count} of {frames} frames"] if count != frames else []
         wrong += [f"{part}: {key} is {n}" for key, n in result.items() if key in _ZERO and n]
@@ -332,6 +335,8 @@ def main() -> int:
     parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
     parser.add_argument("--json", action="store_true", help="one JSON object, nothing else")
     args = parser.parse_args()
+    if unknown := set(args.parts.split(",")) - {"record", "live", "chip", "studio"}:
+        parser.error(f"there is no part {', '.join(sorted(unknown))}; accepted are record, live, chip and studio")
     if args.hours < SHORTEST_H:
         parser.error(f"--hours is {args.hours:g}; at least {SHORTEST_H:g} is accepted")
     if args.part:

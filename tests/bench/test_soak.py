@@ -24,4 +24,5 @@ def test_a_minute_of_it(c_compiler: str, tmp_path: Path) -> None:
     found["live"]["frames"] -= 1
     found["record"]["rows_that_differ"] = 3
     found["batch"]["differ"] = 1
-    assert len(bench.faults_of(found)) == 3
+    found["chip"]["rows_compared"] = 0
+    assert len(bench.faults_of(found)) == 4

@@ -124,3 +124,24 @@ def test_temporary_copies_of_a_killed_program_go_too(tmp_path: Path, monkeypatch
         with temporary_folder() as other:
             assert names(tmp_path) == sorted([one.name, other.name])
     assert names(tmp_path) == []
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes are POSIX")
+def test_a_folder_of_another_user_is_no_obstacle() -> None:
+    user = os.geteuid()
+    with tempfile.TemporaryDirectory() as shared:
+        place = Path(shared)
+        theirs = place / ".plushsense-unfinished-theirs"
+        theirs.mkdir()
+        (theirs / "owner.lock").touch()
+        theirs.chmod(0)
+        place.chmod(0o777)
+        if user == 0:  # who may read everything
+            os.seteuid(65534)
+        try:
+            with work_folder(place / "plushsense") as mine:
+                assert mine.parent == place.resolve()
+        finally:
+            os.seteuid(user)
+            theirs.chmod(0o700)
+        assert names(place) == [theirs.name]

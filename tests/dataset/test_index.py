@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -291,6 +292,14 @@ def test_a_damaged_index_with_a_right_stamp_is_made_anew(folder: Path, old: str,
     write_stamp(folder, current_stamp(folder))
     assert open_dataset(folder).recordings == expected
     assert path.read_text() == text
+
+
+@pytest.mark.parametrize("marks", [[], ["1"], [1], [True, "x"], None])
+def test_a_damaged_stamp_is_made_anew(folder: Path, marks: object) -> None:
+    expected = open_dataset(folder).recordings
+    stamp = json.loads((folder / "index.json").read_text())
+    (folder / "index.json").write_text(json.dumps(stamp | {"marks": marks}))
+    assert open_dataset(folder).recordings == expected and is_index_fresh(folder)
 
 
 def test_an_index_without_a_raw_file_is_made_anew(folder: Path) -> None:

@@ -245,6 +245,14 @@ def test_floods_do_not_multiply_without_end() -> None:
     assert 900_000 < max(len(line.data) for line in lines) <= 1_000_000
 
 
+def test_lines_that_are_broken_already_are_torn_no_further() -> None:
+    torn = Fault("torn", BEGIN_S, LENGTH_S)
+    read = reading(torn, torn, torn)
+    assert read.counters.malformed == read.counters.lost > 90
+    scenario = ToyScenario((ScenarioPart("idle", duration_s=6.0),), garbled=0.9, faults=(torn,))
+    assert sum(len(line.data) > 1 for line in ToyStream(ToySpec.of(scenario), PLUSH)) > 500
+
+
 def test_firmware_without_a_clock_shows_no_reset() -> None:
     clocks = [ms for ms, _ in reading(Fault("reset", 3.0, 1.0), layout="plush-14").frames]
     assert np.diff(clocks).min() >= 9

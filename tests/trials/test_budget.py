@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -37,6 +38,20 @@ def test_a_plan_uses_the_time_for_folds_and_the_learning_curve_first() -> None:
     # The training took three times as long as estimated: fewer folds are left.
     slow = budget._adjusted(plans[10], cost, 3 * training_s, 480 - 3 * training_s)
     assert (slow.split, slow.sizes, slow.epochs, slow.usual_epochs) == ("by-subject:5", (), 60, 60)
+
+
+def test_a_training_as_long_as_estimated_cuts_no_folds(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cost = TrainingCost(window_epoch_s=1e-3, windows=100, networks=2)
+    plan = choose_plan(cost, len(dataset.subjects), 2, 600)
+    done = SimpleNamespace(seconds=cost.training_s(2), bundle=SimpleNamespace(to_bytes=lambda: b""))
+    done.save = lambda path: path
+    monkeypatch.setattr(budget, "train", lambda *_, **__: done)
+    nothing = lambda _: None  # noqa: E731
+    _, training_s = budget._train(dataset, from_settings(), tmp_path / "n", 1.0, 2, True, nothing, nothing)
+    left_s = plan_s(cost, plan) - cost.training_s(2)
+    assert budget._adjusted(plan, cost, training_s, left_s + 1e-9) == plan
 
 
 def test_what_more_people_would_add_has_an_uncertainty_or_is_not_named() -> None:

@@ -118,6 +118,13 @@ def test_the_past_of_the_session_is_used_and_nothing_else(tmp_path: Path) -> Non
     expected = [state.apply(resample(dataset.read(r), LAYOUT)[0].data) for r in ben]
     for r, data in reversed(list(zip(ben, expected, strict=True))):
         assert np.array_equal(sessions.recording(r)[0].data, data)
+    # An excluded recording is read with what came before it, and leaves nothing to those after it.
+    without = Dataset(dataset.path, dataset.head, [replace(r, excluded=r == ben[1]) for r in dataset.recordings], [])
+    assert np.array_equal(SessionReader(without).recording(ben[1])[0].data, expected[1])
+    state = SelfCalibration(LAYOUT)
+    for r in (ben[0], ben[2]):
+        kept = state.apply(resample(dataset.read(r), LAYOUT)[0].data)
+        assert np.array_equal(SessionReader(without).recording(r)[0].data, kept)
     windows = cut_windows(dataset)
     assert windows.self_calibration == "causal"
     assert cut_windows(dataset.with_inputs(replace(LAYOUT, self_calibration=()))).self_calibration == ""

@@ -14,8 +14,11 @@ import pytest
 import plushsense as ps
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.store import Dataset
+from plushsense.models.bundle import trained_people
 from plushsense.workflow.api import simulate, validation_predictions
+from plushsense.workflow.datasets import trained_on
 from plushsense.workflow.networks import REFIT
+from plushsense.workflow.preparation import count_people
 
 
 def test_the_public_api_is_small_and_all_of_its_names_load() -> None:
@@ -55,6 +58,24 @@ def test_train_learns_from_everybody_once_scores_and_decisions_are_found(
     shutil.rmtree(dataset.path / "cache")
     with pytest.raises(DatasetError, match="no validation people"):
         validation_predictions(trained.bundle, dataset)
+
+
+def test_a_network_of_merged_gestures_knows_its_data_set(dataset: Dataset, tmp_path: Path) -> None:
+    merged = tmp_path / "merged.toml"
+    merged.write_text('name = "m"\ngestures = [{label = "Rest"}, {label = "Move", labels = ["Slow", "Fast"]}]\n')
+    bundle = ps.train(dataset, epochs=1, filters=(2, 2, 2), classes=str(merged), fit_decisions=False).bundle
+    assert validation_predictions(bundle, dataset).labels == bundle.gestures.labels == ("Rest", "Move")
+    bundle.save(tmp_path / "m.plush")
+    assert [found.certain for found in trained_on(dataset.path, dataset.subjects[0], [tmp_path])] == [True]
+    # Under another name, the data set is still the one of the training.
+    renamed = Dataset(dataset.path, replace(dataset.head, name="other"), dataset.recordings, dataset.streams)
+    assert trained_people(bundle, renamed) == set(dataset.subjects)
+
+
+def test_people_whose_recordings_are_all_excluded_do_not_count(dataset: Dataset) -> None:
+    assert count_people(dataset) == len(dataset.subjects) == 5
+    left = [replace(r, excluded=r.subject in ("P1", "P2", "P3")) for r in dataset.recordings]
+    assert count_people(Dataset(dataset.path, dataset.head, left, dataset.streams)) == 2
 
 
 def test_early_stopping_keeps_whole_people_apart_and_says_on_whom(dataset: Dataset) -> None:

@@ -37,8 +37,13 @@ def is_unfinished(name: str) -> bool:
 
 def abandoned_folders(place: Path) -> list[Path]:
     """Return the work folders in ``place`` that no process uses any more, as a killed program leaves them."""
-    found = [entry for entry in place.glob(f".*{_UNFINISHED}*") if (entry / _OWNER).is_file()]
-    return sorted(entry for entry in found if not is_in_use(entry))
+    found = []
+    for entry in place.glob(f".*{_UNFINISHED}*"):
+        # Those of other users cannot be read.
+        with contextlib.suppress(PermissionError):
+            if (entry / _OWNER).is_file() and not is_in_use(entry):
+                found.append(entry)
+    return sorted(found)
 
 
 def abandoned_temporary_folders() -> list[Path]:

@@ -113,7 +113,7 @@ def rewritten_marks(folder: Path) -> bool:
     """
     stamp = _read_stamp(folder)
     before = stamp.get("marks")
-    if stamp.get("format") != STAMP_VERSION or not isinstance(before, list) or not isinstance(before[0], int):
+    if stamp.get("format") != STAMP_VERSION or not isinstance(before, list) or list(map(type, before)) != [int, str]:
         return False
     return _marks_stamp(_marks(folder)[: before[0]]) != before
 

@@ -328,6 +328,11 @@ def known_people(provenance: Mapping[str, Any], keys: Sequence[str] = _PEOPLE) -
     return codes - {NOBODY, UNKNOWN_SUBJECT}
 
 
+def is_training_content(bundle: Bundle, dataset: Dataset) -> bool:
+    """Return whether a bundle was trained on the present content of a data set, with gestures merged as in it."""
+    return bundle.provenance.get("dataset_hash") == dataset.with_gestures(bundle.gestures).hash
+
+
 def trained_people(bundle: Bundle, dataset: Dataset) -> set[str]:
     """Return the people of a data set on whom a bundle was trained or tuned, or to whom it was adapted.
 
@@ -335,7 +340,7 @@ def trained_people(bundle: Bundle, dataset: Dataset) -> set[str]:
     person that it was adapted to is always included, because the bundle does not name that person's data set.
     """
     origin = bundle.provenance
-    same = origin.get("dataset") in (None, dataset.head.name) or origin.get("dataset_hash") == dataset.hash
+    same = origin.get("dataset") in (None, dataset.head.name) or is_training_content(bundle, dataset)
     adapted = set() if bundle.adapted_to is None else {bundle.adapted_to}
     return adapted | (known_people(origin) if same else set())
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -235,47 +236,45 @@ def play_to_folder(spec: ToySpec, out: str | os.PathLike[str], layout: Layout | 
     if spec.scenario is None:
         raise ConfigError("A toy that is played into a folder needs an end: give it a scenario.")
     resolved = layout if isinstance(layout, Layout) else load_layout(layout)
-    log = _PlayLog()
-    for line, frames, counters in received(spec, resolved):
-        log.counters, log.passed_ms = counters, line.passed_ms
-        if line.begins is not None:
-            log.truth.append(line.begins)
-        for frame in frames:
-            log.rows.append(frame.values)
-            log.clocks.append((frame.device_ms, START_MS + line.passed_ms))
-            log.people.append(line.person)
-    stream = log.frames(resolved)
     with new_folder(Path(out), DatasetError) as work:
+        log = _PlayLog()
+        for line, frames, counters in received(spec, resolved):
+            log.counters, log.passed_ms = counters, line.passed_ms
+            if line.begins is not None:
+                log.truth.append(line.begins)
+            for frame in frames:
+                log.rows.extend((line.person, START_MS + line.passed_ms, frame.device_ms, *frame.values))
+        stream, people = log.received(resolved)
         mark = f"Scenario '{spec.scenario.name}' of the virtual toy, seed {spec.seed}. Nobody touched anything.\n"
         (work / SIMULATION_MARK).write_text(mark, "utf-8")
         truth = "".join(json.dumps(made.to_dict(), ensure_ascii=False) + "\n" for made in log.truth)
         (work / TRUTH).write_text(truth, encoding="utf-8", newline="\n")
         _write(work, _Take(stream, [], 0), resolved)
-        people = np.array(log.people, dtype=np.int64)
-        for who in sorted(set(log.people)):
+        everybody = np.unique(people).tolist()
+        for who in everybody:
             mine = people == who
             take = _Take(_rows_of(stream, mine), log.cuts(who, stream, mine), 0)
             _write(work / RECORDED / f"P{who:02d}", take, resolved)
-    return PlayedScenario(
-        str(out), tuple(sorted(set(log.people))), len(log.truth), log.passed_ms / 1000.0, log.counters
-    )
+    return PlayedScenario(str(out), tuple(everybody), len(log.truth), log.passed_ms / 1000.0, log.counters)
 
 
 class _PlayLog:
-    """What a reader receives from a toy that plays a scenario; ``people`` has the person with the toy at each row."""
+    """What a reader receives from a toy that plays a scenario.
+
+    ``rows`` has, one after another, person, time of arrival, the toy's clock and the values of each frame. It is an
+    array because an afternoon has more than a million frames.
+    """
 
     def __init__(self) -> None:
-        self.rows: list[tuple[int, ...]] = []
-        self.clocks: list[tuple[int, int]] = []
-        self.people: list[int] = []
+        self.rows = array("q")
         self.truth: list[PerformedGesture] = []
         self.counters = Counters()
         self.passed_ms = 0
 
-    def frames(self, layout: Layout) -> Frames:
-        values = np.array(self.rows, dtype=np.int64).reshape(-1, layout.n_channels)
-        clocks = np.array(self.clocks, dtype=np.int64).reshape(-1, 2)
-        return Frames(values, clocks[:, 0], clocks[:, 1])
+    def received(self, layout: Layout) -> tuple[Frames, NDArray[np.int64]]:
+        """Return the frames, and the number of the person (T,) who had the toy at each."""
+        table = np.frombuffer(self.rows, dtype=np.int64).reshape(-1, 3 + layout.n_channels)
+        return Frames(table[:, 3:], table[:, 2], table[:, 1]), table[:, 0]
 
     def cuts(self, who: int, stream: Frames, mine: NDArray[np.bool_]) -> list[tuple[str, int, int]]:
         """Return label and rows, of this person's stream, of each gesture of which anything was received."""

@@ -47,7 +47,7 @@ from plushsense.workflow.config import from_settings
 from plushsense.workflow.datasets import check_dataset, publish_dataset
 from plushsense.workflow.export import export
 from plushsense.workflow.networks import FIRST_NETWORK, REFIT
-from plushsense.workflow.preparation import refits
+from plushsense.workflow.preparation import count_people, refits
 from plushsense.workflow.reporting import check_folder
 
 
@@ -327,7 +327,7 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     reporter.progress(stage="reading", share=0.0)
     clock, tuning, epochs = Clock(), int(spec.get("quantize_aware", 0)), config.training.epochs
     first = epochs if config.windows.context == ANYWHERE and config.anywhere.hard_share > 0 else 0
-    each, again = first + epochs + tuning, refits(config, len(open_dataset(spec["dataset"]).subjects))
+    each, again = first + epochs + tuning, refits(config, count_people(open_dataset(spec["dataset"])))
 
     def epoch(at: int, of: int, row: dict[str, Any]) -> None:
         what = str(row.get("what", ""))

@@ -21,9 +21,8 @@ import numpy as np
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.files import free_path, write_file
-from plushsense.core.gestures import NOBODY
 from plushsense.dataset.index import as_dataset
-from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
+from plushsense.dataset.store import Dataset
 from plushsense.jobs.journal import job_id
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.bundle import Bundle
@@ -33,7 +32,7 @@ from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import evaluate, train, unfinished
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.networks import FIRST_NETWORK, REFIT
-from plushsense.workflow.preparation import Warn, refits, silent
+from plushsense.workflow.preparation import Warn, count_people, refits, silent
 from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, evaluation_id, journal_of, name_of, write_report
 
 TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
@@ -219,7 +218,7 @@ def make_network(
         streams = any(recording.stream_row >= 0 for recording in dataset.used)
         config = from_settings(context=ANYWHERE) if streams else from_settings()
     networks = 2 if config.anywhere.hard_share and config.windows.context == ANYWHERE else 1
-    again = refits(config, _count_people(dataset))
+    again = refits(config, count_people(dataset))
     networks *= 1 + again
     # A resumed run must not choose other folds because the computer is faster or slower than before.
     journal = journal_of(dataset, "budgets")
@@ -228,7 +227,7 @@ def make_network(
     cost = None
     if stored is None:
         cost = _measured(dataset, config, networks)
-        plan = choose_plan(cost, _count_people(dataset), config.training.epochs, _USED * budget_s)
+        plan = choose_plan(cost, count_people(dataset), config.training.epochs, _USED * budget_s)
         if cost.side_by_side * cost.evaluation_s(plan.epochs, plan.folds) < _START_S:
             plan = replace(plan, workers=1)
         journal.save(key, {"plan": asdict(plan), "bundle": ""})
@@ -282,12 +281,8 @@ def make_network(
     }
 
 
-def _count_people(dataset: Dataset) -> int:
-    return len({r.subject for r in dataset.used} - {NOBODY, UNKNOWN_SUBJECT})
-
-
 def _measured(dataset: Dataset, config: RunConfig, networks: int) -> TrainingCost:
-    split = "leave-one-subject-out" if _count_people(dataset) >= _PEOPLE_FOR_SPLIT else _KNOWN_PEOPLE
+    split = "leave-one-subject-out" if count_people(dataset) >= _PEOPLE_FOR_SPLIT else _KNOWN_PEOPLE
     seen = preview_evaluation(dataset, replace(config, evaluation=replace(config.evaluation, split=split)))
     return TrainingCost(seen["window_epoch_s"], seen["windows"], config.evaluation.processes, networks)
 
@@ -305,7 +300,7 @@ def _planned(config: RunConfig, plan: BudgetPlan) -> RunConfig:
 
 
 def _adjusted(plan: BudgetPlan, cost: TrainingCost, training_s: float, left_s: float) -> BudgetPlan:
-    """Return the plan with fewer folds if the training took longer than estimated, and ``left_s`` is not enough."""
+    """Return the plan with fewer folds if one training took longer than estimated, and ``left_s`` is not enough."""
     cost = replace(cost, window_epoch_s=max(cost.window_epoch_s, training_s / (cost.windows * plan.epochs)))
     trained_s = cost.training_s(plan.epochs)
     if plan_s(cost, plan) - trained_s <= left_s:
@@ -339,6 +334,7 @@ def _train(
     progress: Reporter,
     warn: Warn,
 ) -> tuple[Path, float]:
+    """Train the network and save it; return its path, and the seconds that one training on everybody took."""
     each = networks // (1 + again)
 
     def epoch_done(epoch: int, epochs: int, row: dict[str, Any]) -> None:
@@ -350,7 +346,7 @@ def _train(
             progress(BudgetProgress(DECIDING, done / whole, {}))
 
     done = train(dataset, config, journal=unfinished(dataset), progress=epoch_done, warn=warn)
-    return done.save(free_path(out, done.bundle.to_bytes())), done.seconds
+    return done.save(free_path(out, done.bundle.to_bytes())), done.seconds / (1 + again)
 
 
 def _folds(

@@ -24,7 +24,14 @@ from plushsense.training.spec import TrainSpec
 from plushsense.trials.plan import PASSES, Plan, Task
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.config import RunConfig
-from plushsense.workflow.preparation import Warn, classes_for, divide, network_inputs_of, silent, windows_for
+from plushsense.workflow.preparation import (
+    Warn,
+    classes_for,
+    network_inputs_of,
+    prepare_training,
+    silent,
+    windows_for,
+)
 
 _BATCHES, _EPOCHS = 3, 3
 
@@ -33,18 +40,12 @@ def preview_training(
     dataset: Dataset | str | os.PathLike[str], config: RunConfig, *, warn: Warn = silent
 ) -> dict[str, Any]:
     """Return what `api.train` would train on and its cost; see `preview_evaluation` for the keys."""
-    dataset, config = network_inputs_of(as_dataset(dataset), config)
-    gestures = classes_for(dataset, config.evaluation.classes, config.windows.context, warn)
-    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
-    windows = windows_for(dataset, network, config.windows, gestures, warn, config.anywhere)
-    scored = windows
-    if config.scored_on != config.windows:
-        scored = windows_for(dataset, network, config.scored_on, gestures)
-    division = divide(windows, config, scored)
-    rate = _seconds_a_mac(windows, network, config.training)
+    made = prepare_training(as_dataset(dataset), config, warn)
+    windows, division, config = made.windows, made.division, made.config
+    rate = _seconds_a_mac(windows, made.network, config.training)
     head = {"split": division.kind, "leaky": division.split.leaky, "context": config.windows.context, "folds": 1}
     sizes = [len(division.train), *([len(windows)] if division.refit else [])]
-    return head | _describe(dataset, network, config, windows, sizes, rate, 1)
+    return head | _describe(made.dataset, made.network, config, windows, sizes, rate, 1)
 
 
 def preview_evaluation(

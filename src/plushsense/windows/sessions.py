@@ -2,8 +2,8 @@
 
 Without a self-calibration in the layout (`plushsense.windows.calibration`), these are the samples of
 `plushsense.windows.clock.resample`. With one, its state at the beginning of a recording is what all earlier frames of
-the person's session gave: those of the stream that contains it, or else the earlier recordings of the session, by time.
-A recording with nothing before it, or of nobody, uses only itself. So every score is causal.
+the person's session gave: those of the stream that contains it, or else the earlier recordings of the session, by time,
+without excluded ones. A recording with nothing before it, or of nobody, uses only itself. So every score is causal.
 """
 
 from __future__ import annotations
@@ -63,15 +63,16 @@ class SessionReader:
             self.stream(recording.stream)
             return
         dataset = self._dataset
-        state = self._states[recording.id] = SelfCalibration(dataset.layout)
+        state = SelfCalibration(dataset.layout)
         if recording.subject in (NOBODY, UNKNOWN_SUBJECT):
+            self._states[recording.id] = state
             return
         session = [
             r
-            for r in dataset.used
+            for r in dataset.recordings
             if (r.subject, r.session) == (recording.subject, recording.session) and r.stream_row < 0
         ]
         for r in sorted(session, key=lambda r: (r.epoch_ms, r.start_ms, r.id)):
             self._states[r.id] = state.copy()
-            for segment in resample(dataset.read(r), dataset.layout):
+            for segment in () if r.excluded else resample(dataset.read(r), dataset.layout):
                 state.apply(segment.data)

@@ -39,7 +39,7 @@ from plushsense.evaluation.scores import compute_scores as score_predictions
 from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possible
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.arch import Arch
-from plushsense.models.bundle import Bundle, known_people
+from plushsense.models.bundle import Bundle, is_training_content, known_people
 from plushsense.models.reference import softmax
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import parse_split
@@ -47,13 +47,14 @@ from plushsense.training.spec import TrainSpec
 from plushsense.tuning.decisions import fit_decisions as fit_on_people
 from plushsense.windows.cut import ANYWHERE, WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.networks import KEPT_S, REFIT, NetworkTrainer
+from plushsense.workflow.networks import KEPT_S, REFIT, NetworkTrainer, TrainedNetwork
 from plushsense.workflow.preparation import (
     WHOLE_PEOPLE,
+    PreparedTraining,
     Warn,
     classes_for,
-    divide,
     network_inputs_of,
+    prepare_training,
     silent,
     warn_of_files_twice,
     warn_of_single_people,
@@ -181,78 +182,37 @@ def train(
         warn: called with a sentence for everything that is left out, and if 8-bit arithmetic changes many predictions.
     """
     given = config or from_settings(arch=arch, filters=filters, **settings)
-    dataset, config = network_inputs_of(as_dataset(dataset), given)
     if quantize_aware < 0:
         raise ConfigError(f"quantize_aware is {quantize_aware}: accepted are 0 (off) and more epochs.")
-    gestures = classes_for(dataset, config.evaluation.classes, config.windows.context, warn)
-    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
-    if quantize_aware:
-        refuse_undeployable(network)
-    warn_of_files_twice(dataset, gestures, warn)
-    windows = windows_for(dataset, network, config.windows, gestures, warn, config.anywhere)
-    scored = windows
-    if config.scored_on != config.windows:
-        scored = windows_for(dataset, network, config.scored_on, gestures)
-    division = divide(windows, config, scored)
-    from plushsense.training.fit import predict
-
+    made = prepare_training(as_dataset(dataset), given, warn, deployable=quantize_aware > 0)
+    dataset, config, scored, division = made.dataset, made.config, made.scored, made.division
     trainer = NetworkTrainer(
-        dataset, config, network, gestures, windows, division.kind == WHOLE_PEOPLE, quantize_aware, journal,
-        _reporting(progress, division.split.apart),
+        dataset, config, made.network, made.gestures, made.windows, division.kind == WHOLE_PEOPLE, quantize_aware,
+        journal, _reporting(progress, division.split.apart),
     )  # fmt: skip
     checked = trainer.train(division.train, scored.take(division.watch), division.fold.subjects)
     final = checked
     if division.refit:
-        final = trainer.train(np.arange(len(windows)), scored.take(division.watch[:0]), what=REFIT)
+        final = trainer.train(np.arange(len(made.windows)), scored.take(division.watch[:0]), what=REFIT)
     fitted = checked.fitted
-    test = scored.take(division.fold.test)
-    sizes = (len(checked.at), len(division.watch), len(test))
-    record = FoldRecord(division.fold.name, division.fold.subjects, sizes, len(fitted.history), fitted.seconds)
-
-    def score(probabilities: NDArray[np.float32]) -> tuple[Predictions, dict[str, Any], dict[str, Any]]:
-        predictions = gather_predictions(scored, [(division.fold.name, division.fold.test)], [probabilities])
-        found = score_predictions(predictions, [record], scored.affects, division.split.apart)
-        return predictions, {name: found[name]["mean"] for name in ("accuracy", "macro_f1")}, found["nobody"]
-
-    predictions, means, nobody = score(predict(network, checked.weights, fitted.scaler, test, config.training.device))
-    scores: dict[str, Any] = {
-        "split": division.kind,
-        "leaky": division.split.leaky,
-        "said": division.description,
-        "windows": len(test),
-        **means,
-        "nobody": nobody,
-        "best_epoch": fitted.best_epoch,
-        "simulated": dataset.head.simulated,
-        "int8": None,
-    }
-    if checked.ranges:
-        integer = quantize(network, checked.weights, fitted.scaler, Ranges.from_dict(checked.ranges))
-        deployed, means, _ = score(integer_probabilities(integer, test.x))
-        agreement = float((deployed.predicted == predictions.predicted).mean())
-        scores["int8"] = {**means, "agreement": agreement}
-        if agreement < _AGREEMENT:
-            advice = "more epochs of --quantize-aware" if quantize_aware else "--quantize-aware 10"
-            changed = 100 * (1 - agreement)
-            sentence = f"8 bits change {changed:.1f} % of the answers on the validation windows: try {advice}"
-            warn(Sentence(sentence, "bits_change", percent=changed))
+    predictions, scores = _validated(made, checked, warn)
     bundle = Bundle(
-        arch=network,
+        arch=made.network,
         weights=final.weights,
         layout=dataset.layout,
         scaler=final.fitted.scaler,
-        gestures=gestures,
+        gestures=made.gestures,
         windowing=_windowing(config),
         decision=config.live.to_dict(),
         provenance={
             "dataset": dataset.head.name,
             "dataset_hash": dataset.hash,
             "simulated": dataset.head.simulated,
-            "subjects": sorted({str(s) for s in windows.subject[final.at]}),
+            "subjects": sorted({str(s) for s in made.windows.subject[final.at]}),
             "validation_subjects": sorted({str(s) for s in scored.subject[division.watch]}),
             "split": division.kind,
             "refit": division.refit,
-            "context": dict(sorted(Counter(windows.context.tolist()).items())),
+            "context": dict(sorted(Counter(made.windows.context.tolist()).items())),
             "preset": config.preset,
             "training": config.training.to_dict(),
             "quantize_aware": quantize_aware,
@@ -272,6 +232,49 @@ def train(
     history = with_accuracy(fitted.history, division.split.apart)
     seconds = checked.seconds + (final.seconds if division.refit else 0.0)
     return Trained(bundle, history, scores, seconds, dataset.generation)
+
+
+def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> tuple[Predictions, dict[str, Any]]:
+    """Return the predictions for the validation windows, and their scores; also those in 8 bits if there are ranges.
+
+    ``warn`` gets a sentence if 8-bit arithmetic changes many predictions.
+    """
+    from plushsense.training.fit import predict
+
+    division, fitted, config = made.division, trained.fitted, made.config
+    test = made.scored.take(division.fold.test)
+    sizes = (len(trained.at), len(division.watch), len(test))
+    record = FoldRecord(division.fold.name, division.fold.subjects, sizes, len(fitted.history), fitted.seconds)
+
+    def score(probabilities: NDArray[np.float32]) -> tuple[Predictions, dict[str, Any], dict[str, Any]]:
+        predictions = gather_predictions(made.scored, [(division.fold.name, division.fold.test)], [probabilities])
+        found = score_predictions(predictions, [record], made.scored.affects, division.split.apart)
+        return predictions, {name: found[name]["mean"] for name in ("accuracy", "macro_f1")}, found["nobody"]
+
+    answers = predict(made.network, trained.weights, fitted.scaler, test, config.training.device)
+    predictions, means, nobody = score(answers)
+    scores: dict[str, Any] = {
+        "split": division.kind,
+        "leaky": division.split.leaky,
+        "said": division.description,
+        "windows": len(test),
+        **means,
+        "nobody": nobody,
+        "best_epoch": fitted.best_epoch,
+        "simulated": made.dataset.head.simulated,
+        "int8": None,
+    }
+    if trained.ranges:
+        integer = quantize(made.network, trained.weights, fitted.scaler, Ranges.from_dict(trained.ranges))
+        deployed, means, _ = score(integer_probabilities(integer, test.x))
+        agreement = float((deployed.predicted == predictions.predicted).mean())
+        scores["int8"] = {**means, "agreement": agreement}
+        if agreement < _AGREEMENT:
+            advice = "more epochs of --quantize-aware" if trained.tuned else "--quantize-aware 10"
+            changed = 100 * (1 - agreement)
+            sentence = f"8 bits change {changed:.1f} % of the answers on the validation windows: try {advice}"
+            warn(Sentence(sentence, "bits_change", percent=changed))
+    return predictions, scores
 
 
 def _reporting(progress: EpochProgress | None, apart: bool) -> EpochProgress:
@@ -411,7 +414,7 @@ def validation_predictions(bundle: Bundle, dataset: Dataset | str | os.PathLike[
     lost = bundle.provenance.get("refit") and stored is None
     if bundle.provenance.get("split") != WHOLE_PEOPLE or not people or lost:
         raise DatasetError("This network has no validation people: evaluate it instead.", reason="no_validation_people")
-    if bundle.provenance.get("dataset_hash") != dataset.hash:
+    if not is_training_content(bundle, dataset):
         raise DatasetError(
             f"The data set '{dataset.head.name}' was changed since this network was trained: evaluate it instead.",
             reason="data_changed",

@@ -33,7 +33,7 @@ from plushsense.dataset.quality.findings import CheckLimits
 from plushsense.dataset.store import Dataset, DatasetHead, Progress
 from plushsense.evaluation.reidentification import reidentify, report, verdict
 from plushsense.live.feedback import FOLDER
-from plushsense.models.bundle import Bundle
+from plushsense.models.bundle import Bundle, is_training_content
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -335,15 +335,16 @@ def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[Train
     Bundles that cannot be read, and exports of this data set, are listed too, because they may depend on the person.
     """
     name = DatasetHead.read(folder).name
+    dataset: Dataset | None
     try:
-        content = open_dataset(folder).hash
+        dataset = open_dataset(folder)
     except DatasetError:
         # After an interrupted removal, only the name can be compared.
-        content = ""
+        dataset = None
     entries = []
     for path in _bundles(places):
         try:
-            message, certain = _training_of(Bundle.load(path), subject, name, content)
+            message, certain = _training_of(Bundle.load(path), subject, name, dataset)
         except BundleError as error:
             message, certain = f"cannot be read, so its training people are unknown: {error}", False
         if message:
@@ -351,10 +352,11 @@ def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[Train
     return entries
 
 
-def _training_of(bundle: Bundle, subject: str, name: str, content: str) -> tuple[str, bool]:
-    """Return how a bundle depends on a person ("" if not), and whether that is certain."""
+def _training_of(bundle: Bundle, subject: str, name: str, dataset: Dataset | None) -> tuple[str, bool]:
+    """Return how a bundle depends on a person ("" if not), and whether that is certain; ``dataset`` if it opens."""
     provenance = bundle.provenance
-    same_content, same_name = provenance.get("dataset_hash") == content, provenance.get("dataset") == name
+    same_content = dataset is not None and is_training_content(bundle, dataset)
+    same_name = provenance.get("dataset") == name
     people = [provenance.get(key, ()) for key in ("subjects", "validation_subjects")]
     if any(isinstance(each, int) for each in people):
         # An export states the number of people, not their codes.

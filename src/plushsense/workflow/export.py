@@ -21,7 +21,7 @@ from plushsense.deploy.convert import CONVERTERS, check_format, convert
 from plushsense.deploy.emit import IMAGE, ExportResult, check_model_version, check_name, check_page, emit, read_facts
 from plushsense.deploy.package import package
 from plushsense.deploy.quantize import calibrated, integer_model, refuse_undeployable
-from plushsense.models.bundle import Bundle
+from plushsense.models.bundle import Bundle, is_training_content
 from plushsense.runtime.image import image_check, patch_bytes
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
@@ -79,7 +79,7 @@ def training_windows(
             reason="calibration_layout",
             name=dataset.head.name,
         )
-    if origin.get("dataset_hash") != dataset.hash:
+    if not is_training_content(bundle, dataset):
         message = f"'{dataset.head.name}' has changed since the training of the bundle: its present content is used"
         warn(Sentence(message, reason="dataset_changed", name=dataset.head.name))
     known = {field.name for field in fields(WindowSpec)}

@@ -69,7 +69,7 @@ class ResumableTraining:
 class TrainedNetwork:
     """A trained network: the indices ``at`` of its windows, its fit, its ``weights``, and ``ranges`` for 8 bits.
 
-    ``weights`` are those of the fit, or after fine-tuning for 8 bits; ``ranges`` is the result of
+    ``weights`` are those of the fit, or if ``tuned``, those after fine-tuning for 8 bits; ``ranges`` is the result of
     `plushsense.deploy.quantize.calibration`; ``seconds`` includes those before an interruption.
     """
 
@@ -78,6 +78,7 @@ class TrainedNetwork:
     weights: dict[str, NDArray[np.float32]]
     ranges: dict[str, Any]
     seconds: float
+    tuned: bool
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,8 @@ class NetworkTrainer:
 
             tuned = fine_tune(train_on, network, weights, fitted.scaler, ranges, spec, self.quantize_aware, epoch_done)
             weights = tuned.weights
-        return TrainedNetwork(at, fitted, weights, ranges, fitted.seconds + (state.before_s if state else 0.0))
+        seconds = fitted.seconds + (state.before_s if state else 0.0)
+        return TrainedNetwork(at, fitted, weights, ranges, seconds, self.quantize_aware > 0)
 
     def discard(self) -> None:
         """Delete the stored states of all these trainings."""

@@ -14,6 +14,7 @@ from plushsense.core.gestures import NOBODY, GestureSet, merge_names
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.proposals import median_gesture_s
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
+from plushsense.deploy.quantize import refuse_undeployable
 from plushsense.evaluation.crossval import fold_windows
 from plushsense.models.arch import Arch, parse_symbol, symbol_within
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
@@ -251,6 +252,11 @@ class TrainValidationSplit:
     refit: bool
 
 
+def count_people(dataset: Dataset) -> int:
+    """Return the number of people with a recording that is not excluded."""
+    return len({r.subject for r in dataset.used} - {NOBODY, UNKNOWN_SUBJECT})
+
+
 def refits(config: RunConfig, people: int) -> bool:
     """Return whether `api.train` trains a second time, on everybody: where whole people are held out for nothing else.
 
@@ -291,3 +297,37 @@ def divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = Non
         description += ", ".join(fold.subjects)
     rest = np.sort(np.concatenate([fold.train, fold.validation]))
     return TrainValidationSplit(split, kind, description, fold, rest, fold.test, refits(config, len(people)))
+
+
+@dataclass(frozen=True)
+class PreparedTraining:
+    """All that a single training starts from; ``scored`` are the windows of validation, cut as `divide` says."""
+
+    dataset: Dataset
+    config: RunConfig
+    gestures: GestureSet
+    network: Arch
+    windows: WindowSet
+    scored: WindowSet
+    division: TrainValidationSplit
+
+
+def prepare_training(
+    dataset: Dataset, config: RunConfig, warn: Warn = silent, *, deployable: bool = False
+) -> PreparedTraining:
+    """Choose the gestures and the network, cut the windows and divide them.
+
+    Args:
+        deployable: refuse a network that cannot run in 8 bits.
+    """
+    dataset, config = network_inputs_of(dataset, config)
+    gestures = classes_for(dataset, config.evaluation.classes, config.windows.context, warn)
+    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
+    if deployable:
+        refuse_undeployable(network)
+    warn_of_files_twice(dataset, gestures, warn)
+    windows = windows_for(dataset, network, config.windows, gestures, warn, config.anywhere)
+    scored = windows
+    if config.scored_on != config.windows:
+        scored = windows_for(dataset, network, config.scored_on, gestures)
+    return PreparedTraining(dataset, config, gestures, network, windows, scored, divide(windows, config, scored))

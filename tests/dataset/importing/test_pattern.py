@@ -176,6 +176,19 @@ def test_values_of_the_five_folders(tmp_path: Path) -> None:
     assert wave.epoch_ms == 1_700_000_001_500
 
 
+@pytest.mark.filterwarnings("error")
+def test_missing_times_and_numbers_of_hundreds_of_digits(tmp_path: Path) -> None:
+    rows = ["1,1,hit", "OL,2,hit", "OL,3,hit", "1.02,4,hit", "1.04,5,hit"]
+    (tmp_path / "src").mkdir()
+    (tmp_path / "src" / "P1.csv").write_text("\n".join(["t,a,label", *rows]))
+    layout = {**LAYOUT, "channels": LAYOUT["channels"][:1]}
+    pattern = ImportPattern(layout=layout, missing=("OL",), paths=("{subject}.csv",), columns={"time": "t"})
+    found = preview_import(tmp_path / "src", pattern=pattern)
+    assert [row.values["a"] for row in found.rows] == [1.0, 4.0, 5.0]
+    (tmp_path / "src" / "P1.csv").write_text("\n".join(["t,acc_x,label", f"0.01,1{'0' * 400},hit", *rows]))
+    assert "acc_x" in guess_pattern(tmp_path / "src").toml
+
+
 def test_a_preview_shows_rows_and_writes_nothing(tmp_path: Path) -> None:
     FOLDERS["multimeter"](tmp_path / "src")
     found = preview_import(tmp_path / "src", pattern=PATTERNS / "multimeter.toml")
@@ -239,6 +252,7 @@ def test_cells_and_counts_are_no_faults_unless_they_never_change(tmp_path: Path)
         ('separator = ";;"\n', "accepted is one character"),
         ('decimal = ","\nseparator = ","\n', "line 1: decimal and separator are both"),
         ('encoding = "utf-9"\n', "accepted are names such as utf-8"),
+        ('encoding = "utf\\u0000"\n', "accepted are names such as utf-8"),
         ('[aliases]\nTap = ["t"]\nTip = ["t"]\n', "'t' is an alias of 'Tap' and of 'Tip'"),
         ("paths = = 1\n", "is not valid TOML: .*line 1"),
     ],

@@ -89,6 +89,12 @@ def test_two_references_of_an_analogue_converter_are_named(tmp_path: Path, cli: 
     assert any(s["zero"] for s in found["groups"][1]["sessions"])
 
 
+def test_axes_that_are_turned_by_a_negative_scale_have_a_positive_g(tmp_path: Path) -> None:
+    turned = replace(ACCEL, channels=tuple(replace(c, scale=-0.015) for c in ACCEL.channels))
+    (sensor,) = import_recordings(analogue(tmp_path / "R", 330, 65), tmp_path / "DS", layout=turned).sensors
+    assert sensor["one_g"] == pytest.approx(0.98, rel=0.1)
+
+
 def test_each_session_of_a_person_has_its_own_sensor(tmp_path: Path) -> None:
     source = analogue(analogue(tmp_path / "R", 330, 68), 511, 102, people=range(3, 6))
     dataset = import_recordings(source, tmp_path / "DS", layout="accel-3").dataset

@@ -193,7 +193,7 @@ def _lines(path: Path, guess: _PatternDraft) -> list[str]:
 
 
 def _is_number(text: str) -> bool:
-    return bool(re.fullmatch(r"\s*[-+]?(\d{1,30}[.,]?\d*|[.,]\d+)([eE][-+]?\d{1,2})?\s*", text))
+    return bool(re.fullmatch(r"\s*[-+]?(\d{1,30}([.,]\d*)?|[.,]\d+)([eE][-+]?\d{1,2})?\s*", text))
 
 
 def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[_Column]:

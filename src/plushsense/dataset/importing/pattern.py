@@ -150,7 +150,7 @@ class ImportPattern:
             yield "decimal", f"decimal and separator are both '{self.decimal}': they must differ."
         try:
             "".encode(self.encoding)
-        except LookupError:
+        except (LookupError, ValueError):
             yield "encoding", f"encoding is '{self.encoding}': accepted are names such as utf-8, utf-16 or latin-1."
         spellings: dict[str, str] = {}
         for label, others in self.aliases.items():

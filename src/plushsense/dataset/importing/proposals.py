@@ -122,7 +122,7 @@ class Sensor:
             return {n: float(f"{c * step:.4g}") for n, c, step in zip(axes, fit[0], steps, strict=True)}
 
         def one_g(fit: Sphere) -> float:
-            return float(f"{fit[1] * steps[0] * channel.scale:.4g}")
+            return float(f"{fit[1] * steps[0] * abs(channel.scale):.4g}")
 
         known = tuple(
             {"subject": subject, "session": session, "zero": own and zero(own), "one_g": own and one_g(own)}

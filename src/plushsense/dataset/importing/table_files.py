@@ -516,6 +516,13 @@ def read_rows(file: TableFile) -> ImportedColumns:
     return READERS[file.pattern.format_of(file.path)](file)
 
 
+def forward_steps(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the differences of neighbouring times that are numbers above 0."""
+    with np.errstate(invalid="ignore"):  # two missing times
+        steps = np.diff(times)
+    return steps[np.isfinite(steps) & (steps > 0)]
+
+
 def unit_of_time(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple[str, bool]:
     """Return the unit of a column of times, and whether its name states it.
 
@@ -525,8 +532,7 @@ def unit_of_time(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple
     for unit in UNITS:
         if plain.endswith((f"_{unit}", f"({unit}", f"[{unit}]")):
             return unit, True
-    steps = np.diff(times[:100_000])
-    forward = steps[np.isfinite(steps) & (steps > 0)]
+    forward = forward_steps(times[:100_000])
     if not len(forward):
         return "ms", False
     step = float(np.median(forward))

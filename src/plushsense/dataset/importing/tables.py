@@ -36,7 +36,7 @@ from plushsense.core.sentences import Sentence
 from plushsense.dataset.files import sha256_of
 from plushsense.dataset.importing.pattern import UNITS, ImportPattern
 from plushsense.dataset.importing.sources import COMPANIONS, SourceFile
-from plushsense.dataset.importing.table_files import ImportedColumns, TableFile, read_rows, unit_of_time
+from plushsense.dataset.importing.table_files import ImportedColumns, TableFile, forward_steps, read_rows, unit_of_time
 from plushsense.dataset.quality.measurements import in_order
 from plushsense.dataset.store import RECORDINGS, STREAMS
 
@@ -310,7 +310,7 @@ class TableImport:
         unit, stated = unit_of_time(name, times, self.layout.rate_hz)
         if stated:
             return UNITS[unit], ""
-        suggests = len(times) > 1 and np.any(np.diff(times) > 0)
+        suggests = len(forward_steps(times)) > 0
         why = f", as the rate of {self.layout.rate_hz:g} Hz suggests" if suggests else ""
         message = f"column '{name}' is read as {unit if suggests else 'milliseconds'}{why}"
         return UNITS[unit], Sentence(message, reason="time_unit", column=name, unit=unit)

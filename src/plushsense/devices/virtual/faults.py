@@ -312,7 +312,8 @@ class FaultyToy:
             return garble(line, rng)
         if kind == "torn":
             fields = line.split()
-            return b" ".join(fields[: int(rng.integers(1, len(fields)))]) + b"\n"
+            # Another fault may have left only one number, or none.
+            return b" ".join(fields[: int(rng.integers(1, len(fields)))]) + b"\n" if len(fields) > 1 else line
         if kind in ("duplicated", "flood"):
             times = 2 if kind == "duplicated" else int(fault.setting("times"))
             return line * min(times, max(1, _MOST_BYTES // len(line)))
