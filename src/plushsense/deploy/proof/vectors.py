@@ -351,7 +351,8 @@ class Export:
         frames = np.fromiter(numbers, dtype=np.int64).reshape(-1, 1 + len(layout.channels))
         if not len(frames):
             raise ConfigError(
-                "No frame of the scenario arrives, so nothing can be verified: give its faults a share below 1, or an end."
+                "No frame of the scenario arrives, so nothing can be verified: give its faults an end, or a share "
+                "below 1."
             )
         return [self.answered("virtual toy", part) for part in in_parts(frames)]
 
