@@ -138,6 +138,16 @@ def test_a_device_url_plays_it_and_comes_back_after_a_lost_connection(tmp_path: 
     assert [ms for ms, _ in frames] == [line.device_ms for line in whole]
 
 
+def test_a_scenario_that_ends_while_disconnected_is_not_played_again(tmp_path: Path) -> None:
+    path = written(tmp_path, BREAKS.replace("duration_s = 0.5", "duration_s = 1000.0"))
+    with open_device(f"virtual://?scenario={path}&speed=0", reconnect=True) as device:
+        frames = []
+        for frame in device:
+            frames.append(frame.device_ms)
+            assert len(frames) < 3000
+    assert frames == sorted(frames)
+
+
 def test_a_toy_with_an_end_is_played_ahead(tmp_path: Path) -> None:
     url = f"virtual://?scenario={written(tmp_path, IDLE)}&speed=0"
     read_of = []

@@ -117,7 +117,7 @@ class Device(ABC):
         return ""
 
     def reopen(self) -> Device | None:
-        """Return a device that goes on after a lost connection; None: it must be opened anew by its URL.
+        """Return a device that continues, or ends, after a lost connection; None: it must be opened anew by its URL.
 
         Raises:
             DeviceError: if the toy is not connected yet.

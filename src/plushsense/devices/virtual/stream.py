@@ -405,17 +405,19 @@ class VirtualDevice(PacedDevice):
         return line
 
     def reopen(self) -> Self | None:
-        """Return this device, open again and with new counters, once the toy is connected again; None after its end.
+        """Return this device, open again and with new counters, once the toy is connected again or has ended.
+
+        Return None if it had ended before the connection was lost.
 
         Raises:
-            DeviceError: before that.
+            DeviceError: while the toy is not connected.
         """
+        if self._next_ms() is None:
+            return None
         while self._next_ms() is not None and self._next is not None and not self._next.connected:
             if self._pacer.due_s(self._next.passed_ms) > 0.0:
                 raise DeviceError(f"'{self.url}' is not connected.", reason="toy_unreachable", url=self.url)
             self._take()
-        if self._next_ms() is None:
-            return None
         self.closed = False
         self.counters = Counters()
         self._parser = LineParser(self.layout, self.counters)
