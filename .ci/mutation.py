@@ -27,6 +27,7 @@ import sys
 import tempfile
 import time
 import tomllib
+import traceback
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
@@ -238,18 +239,33 @@ def from_the_start(tasks: list[Task], parent: str, results: Any) -> None:
             results.put((mutant, forked(partial(run_pytest, Forks(tests)), seconds)))
 
 
+def reporting(work: Callable[..., None], tasks: list[Task], parent: str, results: Any) -> None:
+    """Run mutants in this process; put the traceback of an error among the results, as its output is not shown."""
+    try:
+        work(tasks, parent, results)
+    except BaseException:
+        results.put((None, traceback.format_exc()))
+        raise
+
+
 def judged(work: Callable[..., None], tasks: list[Task], jobs: int) -> Iterator[tuple[Mutant, str]]:
-    """Yield the results of a stage, by several processes."""
+    """Yield the results of a stage, by several processes; raise RuntimeError if one of them fails."""
     fork = multiprocessing.get_context("fork")
     results = fork.SimpleQueue()
     with tempfile.TemporaryDirectory() as parent:
-        workers = [fork.Process(target=work, args=(tasks[i::jobs], parent, results)) for i in range(jobs)]
+        workers = [fork.Process(target=reporting, args=(work, tasks[i::jobs], parent, results)) for i in range(jobs)]
         for worker in workers:
             worker.start()
-        for _ in tasks:
-            yield results.get()
-        for worker in workers:
-            worker.join()
+        try:
+            for _ in tasks:
+                mutant, result = results.get()
+                if mutant is None:
+                    raise RuntimeError(f"A process that runs mutants failed:\n{result}")
+                yield mutant, result
+        finally:
+            for worker in workers:
+                worker.terminate()
+                worker.join()
 
 
 def interval(k: int, n: int) -> str:
