@@ -176,6 +176,15 @@ def test_values_of_the_five_folders(tmp_path: Path) -> None:
     assert wave.epoch_ms == 1_700_000_001_500
 
 
+def test_a_line_of_json_ends_where_a_line_ends(tmp_path: Path) -> None:
+    (tmp_path / "src").mkdir()
+    rows = [{"t": 10 * n, "a": n, "b": n, "label": "pat\u2028and\x85hit"} for n in range(4)]
+    text = "\r\n".join(json.dumps(row, ensure_ascii=False) for row in rows)
+    (tmp_path / "src" / "P1.jsonl").write_text(text, encoding="utf-8", newline="")
+    found = preview_import(tmp_path / "src", pattern=ImportPattern(layout=LAYOUT, paths=("{subject}.jsonl",)))
+    assert len(found.rows) == 4 and found.warnings == [note for note in found.warnings if "left out" not in note]
+
+
 @pytest.mark.filterwarnings("error")
 def test_missing_times_and_numbers_of_hundreds_of_digits(tmp_path: Path) -> None:
     rows = ["1,1,hit", "OL,2,hit", "OL,3,hit", "1.02,4,hit", "1.04,5,hit"]

@@ -368,7 +368,8 @@ def _objects(text: str) -> Iterator[tuple[int, Any]]:
         except (ValueError, RecursionError):
             yield 1, text
         return
-    lines = [(line, row) for line, row in enumerate(text.splitlines(), 1) if row.strip()]
+    # Texts may hold other characters that `splitlines` takes for line ends.
+    lines = [(line, row) for line, row in enumerate(text.split("\n"), 1) if row.strip()]
     for line, row in lines:
         try:
             value = loads_json(row)
