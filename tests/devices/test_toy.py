@@ -18,6 +18,7 @@ from plushsense.core.layouts import load_layout
 from plushsense.devices.base import Device
 from plushsense.devices.opening import open_device
 from plushsense.devices.reconnect import ReconnectingDevice
+from plushsense.devices.virtual import server
 from plushsense.devices.virtual.faults import Fault
 from plushsense.devices.virtual.scenario import ScenarioPart, ToyScenario
 from plushsense.devices.virtual.server import ToyCounters, ToyServer
@@ -94,6 +95,18 @@ def test_tcp_counts_what_the_line_loses() -> None:
     assert counters.frames == pytest.approx(12_000 * 0.96, rel=0.02)
     assert 150 < counters.malformed < 350
     assert counters.frames + counters.lost == pytest.approx(12_000, abs=40)
+
+
+def test_a_toy_as_fast_as_its_reader_waits_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A toy in real time drops lines after this time.
+    monkeypatch.setattr(server, "_STALL_S", 0.0)
+    flood = scenario_with(Fault("flood", 0.0, 9.0, times=100))
+    with toy(over_tcp, flood, speed=0) as running, socket.socket() as reader:
+        reader.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        reader.connect(("127.0.0.1", int(running.url.rpartition(":")[2])))
+        lines = sum(data.count(b"\n") for data in iter(lambda: reader.recv(4096), b""))
+    assert running.counters is not None and running.counters.dropped == 0
+    assert running.counters.sent == lines > 10_000
 
 
 def test_one_reader_after_another() -> None:

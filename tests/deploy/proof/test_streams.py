@@ -13,7 +13,8 @@ from plushsense.core.layouts import load_layout
 from plushsense.dataset.index import open_dataset
 from plushsense.deploy.golden import FAULT, HEALTH, column
 from plushsense.deploy.proof.vectors import Export, recorded_frames
-from plushsense.devices.virtual.scenario import load_scenario
+from plushsense.devices.virtual.faults import Fault
+from plushsense.devices.virtual.scenario import ScenarioPart, ToyScenario, load_scenario
 from plushsense.devices.virtual.stream import ToySpec
 from plushsense.windows.clock import SampleClock
 from support.c_toy import seat
@@ -52,5 +53,8 @@ def test_the_c_reads_a_scenario_of_the_virtual_toy(c_library: Any, tmp_path: Pat
     assert FAULT in column(played.answers, "state", HEALTH)
     rows = seat(c_library, export.model).push(played.frames)
     assert np.array_equal(rows, played.answers)
+    silent = ToyScenario((ScenarioPart("idle", duration_s=1.0),), faults=(Fault("lost", 0.0, 9.0),))
+    with pytest.raises(ConfigError, match="No frame of the scenario arrives"):
+        export.played(ToySpec.of(silent))
     with pytest.raises(ConfigError, match="virtual toy has no sensor"):
         Export(exported(tmp_path / "phone", bundle_of("phone-6"))).played(toy)

@@ -179,6 +179,23 @@ def _codes(texts: Iterable[str]) -> tuple[NDArray[np.int64], list[str]]:
 PAUSE_MS = 1000.0
 
 
+@dataclass(frozen=True)
+class _TableSamples:
+    """The usable rows of a table: their ``frames`` (T,), and the number of each one's person, session, label and take.
+
+    ``people``, ``sessions`` and ``labels`` have the texts of these numbers; labels are as the source spells them.
+    """
+
+    frames: Frames
+    person: NDArray[np.int64]
+    session: NDArray[np.int64]
+    label: NDArray[np.int64]
+    take: NDArray[np.int64]
+    people: list[str]
+    sessions: list[str]
+    labels: list[str]
+
+
 @dataclass
 class TableImport:
     """Conversion of tables into recordings below the new ``folder``.
@@ -214,10 +231,36 @@ class TableImport:
                 "(file,subject)",
                 reason="person_unknown",
             )
+        notes: list[Sentence] = []
+        samples = self._samples(table, columns, subject or "", notes)
+        yield from notes
+        if not len(samples.frames):
+            raise table.error(
+                f"has no usable row: each needs a subject, a time and {self.layout.n_channels} numbers",
+                reason="rows_unusable",
+                n=self.layout.n_channels,
+            )
+        group = samples.person * len(samples.sessions) + samples.session
+        order = np.argsort(group, kind="stable")
+        edges = [0, *(np.flatnonzero(np.diff(group[order])) + 1).tolist(), len(order)]
+        original = ConvertedSource(path, display_name, {"columns": columns.names})
+        apart = "recording" in columns.names or columns.own_recordings or bool({"label", "recording"} & set(place))
+        for first, last in itertools.pairwise(edges):
+            mine = order[first:last]
+            moved = in_order(samples.frames.device_ms[mine])
+            if table.place is not None and (n := int(np.sum(moved != np.arange(len(moved))))):
+                yield about_file(display_name, f"{n} rows put into the order of their times")
+                mine = mine[moved]
+            yield from self._write(table, original, samples, mine, apart)
+
+    def _samples(
+        self, table: TableFile, columns: ImportedColumns, subject: str, notes: list[Sentence]
+    ) -> _TableSamples:
+        """Return the usable rows of a table as samples; add what is to be said about the file to ``notes``."""
+        name, place = table.display_name, table.place or {}
         times = columns.numbers["time"]
         factor, note = self._factor(columns, times)
-        if note:
-            yield about_file(display_name, note)
+        notes += [about_file(name, note)] if note else []
         device = times * factor
         host = columns.numbers.get(HOST_MS, device)
         rows = len(device)
@@ -225,80 +268,63 @@ class TableImport:
         def part(role: str, otherwise: str) -> tuple[NDArray[np.int64], list[str]]:
             return _codes(columns.texts.get(role) or itertools.repeat(place.get(role, otherwise), rows))
 
-        people, codes = part("subject", subject or "")
+        people, codes = part("subject", subject)
         # Files with rows between their recordings are sessions of their own, since each is a stream.
-        sessions, session_names = part(
-            "session", path.stem if table.place is not None and not place.get("label") else ""
-        )
+        own_session = table.place is not None and not place.get("label")
+        sessions, session_names = part("session", table.path.stem if own_session else "")
         labels, spellings = part("label", "")
         takes, _ = part("recording", "")
-        label_names = [self.pattern.label_of(text) for text in spellings]
         raw = np.column_stack([columns.numbers[n] for n in self.layout.names])
         invalid = np.isinf(raw)
         raw[invalid] = 0.0
         good = usable_rows(raw, device, host)
         known = np.array([bool(c) for c in codes], dtype=bool)[people] if rows else np.empty(0, bool)
-        yield from _left_out(table, columns, good, known)
+        notes += _left_out(table, columns, good, known)
         good &= known
-        if not good.any():
-            raise table.error(
-                f"has no usable row: each needs a subject, a time and {self.layout.n_channels} numbers",
-                reason="rows_unusable",
-                n=self.layout.n_channels,
-            )
         values, note = whole_steps(raw[good], self.layout)
-        if note:
-            yield about_file(display_name, note)
+        notes += [about_file(name, note)] if note else []
         if count := int(invalid[good].sum()):
             # A value beyond the valid range is invalid for every reader, which repeats the last valid one.
             values = np.where(invalid[good], self.layout.valid_max_int + 1, values)
             words = ", ".join(f"'{word}'" for word in self.pattern.missing)
-            yield about_file(display_name, f"{count} values are missing ({words}): they count as invalid")
+            notes.append(about_file(name, f"{count} values are missing ({words}): they count as invalid"))
         device_ms, host_ms = (np.round(clock[good]).astype(np.int64) for clock in (device, host))
-        people, sessions, labels, takes = people[good], sessions[good], labels[good], takes[good]
-        named = np.array([bool(plain_label(n)) and len(n) <= LONGEST_LABEL for n in label_names], dtype=bool)
-        whole_file = bool({"label", "recording"} & set(place)) or columns.own_recordings
-        group = people * len(session_names) + sessions
-        order = np.argsort(group, kind="stable")
-        edges = [0, *(np.flatnonzero(np.diff(group[order])) + 1).tolist(), len(order)]
-        original = ConvertedSource(path, display_name, {"columns": columns.names})
-        for first, last in itertools.pairwise(edges):
-            mine = order[first:last]
-            moved = in_order(device_ms[mine])
-            if table.place is not None and (n := int(np.sum(moved != np.arange(len(moved))))):
-                yield about_file(display_name, f"{n} rows put into the order of their times")
-                mine = mine[moved]
-            frames = Frames(values[mine], device_ms[mine], host_ms[mine])
-            new = (np.diff(labels[mine]) != 0) | (np.diff(takes[mine]) != 0)
-            if "recording" not in columns.names and not whole_file:
-                steps = np.diff(frames.device_ms)
-                new |= (steps < 0) | (steps > PAUSE_MS)
-            runs = [0, *(np.flatnonzero(new) + 1).tolist(), len(mine)]
-            labelled = named[labels[mine]]
-            texts = [(label_names[k], spellings[k]) for k in labels[mine[runs[:-1]]]]
-            cuts = [
-                LabelledSegment(label, a, b, spelling)
-                for (label, spelling), (a, b) in zip(texts, itertools.pairwise(runs), strict=True)
-                if labelled[a]
-            ]
-            key = codes[people[mine[0]]], session_names[sessions[mine[0]]]
-            taken = None if table.place is None else self._taken.setdefault(key, set())
-            written = write_session(
-                self.folder / str(self._written),
-                *key,
-                frames,
-                cuts,
-                self.layout,
-                original,
-                with_stream=not labelled.all(),
-                taken=taken,
-            )
-            self._written += 1
-            files = list(written)
-            yield from files
-            if taken is not None:
-                made = {f.source.name: f.origin for f in files if f.kind == RECORDINGS}
-                self._origins.setdefault(key, []).append(original.table | {"recordings": made})
+        frames = Frames(values, device_ms, host_ms)
+        return _TableSamples(
+            frames, people[good], sessions[good], labels[good], takes[good], codes, session_names, spellings
+        )
+
+    def _write(
+        self, table: TableFile, original: ConvertedSource, samples: _TableSamples, mine: NDArray[np.int64], apart: bool
+    ) -> Iterator[SourceFile]:
+        """Write the session whose rows are ``mine``; ``apart``: the file itself tells its recordings apart."""
+        every = samples.frames
+        assert every.host_ms is not None
+        frames = Frames(every.values[mine], every.device_ms[mine], every.host_ms[mine])
+        label, take = samples.label[mine], samples.take[mine]
+        names = [self.pattern.label_of(text) for text in samples.labels]
+        named = np.array([bool(plain_label(n)) and len(n) <= LONGEST_LABEL for n in names], dtype=bool)[label]
+        new = (np.diff(label) != 0) | (np.diff(take) != 0)
+        if not apart:
+            steps = np.diff(frames.device_ms)
+            new |= (steps < 0) | (steps > PAUSE_MS)
+        runs = [0, *(np.flatnonzero(new) + 1).tolist(), len(mine)]
+        cuts = [
+            LabelledSegment(names[label[a]], a, b, samples.labels[label[a]])
+            for a, b in itertools.pairwise(runs)
+            if named[a]
+        ]
+        key = samples.people[samples.person[mine[0]]], samples.sessions[samples.session[mine[0]]]
+        taken = None if table.place is None else self._taken.setdefault(key, set())
+        folder = self.folder / str(self._written)
+        self._written += 1
+        files = list(
+            write_session(folder, *key, frames, cuts, self.layout, original, with_stream=not named.all(), taken=taken)
+        )
+        yield from files
+        if taken is not None:
+            made = {f.source.name: f.origin for f in files if f.kind == RECORDINGS}
+            self._origins.setdefault(key, []).append(original.table | {"recordings": made})
 
     def _factor(self, columns: ImportedColumns, times: NDArray[np.float64]) -> tuple[float, str]:
         """Return the milliseconds per unit of the time column, and a note if the unit is stated nowhere."""

@@ -344,10 +344,16 @@ class Export:
         It has nothing to do with the test scenarios of `scenarios`, which are variants of the model.
 
         Raises:
-            ConfigError: for a model whose layout the virtual toy does not support.
+            ConfigError: for a model whose layout the virtual toy does not support, or if no frame arrives.
         """
-        rows = [(f.device_ms, *f.values) for _, frames, _ in received(toy, self.model.layout) for f in frames]
-        frames = np.array(rows, dtype=np.int64).reshape(-1, 1 + len(self.model.layout.channels))
+        layout = self.model.layout
+        numbers = (n for _, frames, _ in received(toy, layout) for f in frames for n in (f.device_ms, *f.values))
+        frames = np.fromiter(numbers, dtype=np.int64).reshape(-1, 1 + len(layout.channels))
+        if not len(frames):
+            raise ConfigError(
+                "No frame of the scenario arrives, so nothing can be verified: give its faults an end, or a share "
+                "below 1."
+            )
         return [self.answered("virtual toy", part) for part in in_parts(frames)]
 
 

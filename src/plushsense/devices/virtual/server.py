@@ -42,7 +42,7 @@ class ToyCounters:
 class _Outlet:
     """Non-blocking output that waits for a slow reader, and drops whole lines if there is none."""
 
-    write: Callable[[bytes], int]
+    write: Callable[[bytes | memoryview], int]
     fileno: int
     stall_s: float
     absent: bool = False
@@ -52,7 +52,7 @@ class _Outlet:
     def send(self, data: bytes, stop: threading.Event) -> bool:
         """Send lines; return False if some were dropped. Raise OSError if the reader has closed the connection."""
         whole = self._rest + data
-        pending = whole
+        pending = memoryview(whole)
         deadline = time.monotonic() + (0.0 if self.absent else self.stall_s)
         self.wait_for_reader(_FAST_QUEUE, stop)
         while pending:
@@ -65,10 +65,8 @@ class _Outlet:
                     select.select([], [self.fileno], [], min(left, 0.05))
                     continue
                 self.absent = True
-                sent = whole[: len(whole) - len(pending)]
-                if sent:
-                    begun = not sent.endswith(b"\n")
-                    self._rest = pending[: pending.find(b"\n") + 1] if begun else b""
+                if at := len(whole) - len(pending):
+                    self._rest = b"" if whole[at - 1 : at] == b"\n" else whole[at : whole.find(b"\n", at) + 1]
                 return False
         self._rest = b""
         return True
@@ -241,7 +239,7 @@ class ToyServer:
 
     @property
     def _stall_s(self) -> float:
-        return _STALL_S if self.speed <= 1.0 else _FAST_STALL_S
+        return _STALL_S if 0.0 < self.speed <= 1.0 else _FAST_STALL_S
 
     def _run(
         self,
