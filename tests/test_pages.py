@@ -118,7 +118,9 @@ NOT_RUN = {
     ),
 }
 # Programs that are not ours: they install or connect something.
-FOREIGN = ("pip", ".venv/bin/pip", "source", "git", "cd", "sudo", "bluetoothctl", "python3.11", "/tmp/peers/bin/pip")
+FOREIGN = (
+    "pip", ".venv/bin/pip", "source", "git", "mkdir", "cd", "sudo", "bluetoothctl", "python3.11", "/tmp/peers/bin/pip",
+)  # fmt: skip
 
 # 1 is no error: a check has findings, forget without --yes removes nothing, a network of one epoch is too bad to adapt.
 STATUS = {"check": (0, 1), "adapt": (0, 1), "forget": (0, 1)}
@@ -374,6 +376,15 @@ def test_every_command_of_the_page_runs(
     monkeypatch.chdir(tmp_path / "here")
     for command in once(page):
         check(command)
+
+
+def test_what_the_tutorial_makes_is_in_a_folder_that_git_ignores() -> None:
+    words = [shlex.split(command) for command in commands("docs/tutorial.md")]
+    at = words.index(["cd", "tutorial"])
+    assert {w[0] for w in words[:at]} == {"git", "cd", "make", "source", "mkdir"}
+    assert ["mkdir", "tutorial"] in words[:at]
+    assert all(w[0] == "plushsense" for w in words[at + 1 :])
+    assert "/tutorial/" in (ROOT / ".gitignore").read_text("utf-8").splitlines()
 
 
 @pytest.mark.usefixtures("few_settings")

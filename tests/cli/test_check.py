@@ -185,3 +185,11 @@ def test_from_python(folder: Path) -> None:
         ps.check_dataset(ps.open_dataset(folder), limits={"durations": 1})
     after, marked = decide(folder, exclude=["P2/Slow_*"], why="fell", who="Kim")
     assert (marked, after.excluded, after.ok) == (2, 2, True)
+
+
+def test_a_simulation_says_so_whatever_simulated_it(cli: Cli, folder: Path) -> None:
+    assert "SIMULATION" not in cli("check", folder).out
+    head = folder / "dataset.toml"
+    head.write_text(head.read_text().replace("simulated = false", "simulated = true"))
+    told = cli("check", folder).out
+    assert "SIMULATION: these recordings say nothing about a real toy." in told and "virtual" not in told

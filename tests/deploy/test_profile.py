@@ -11,7 +11,7 @@ import pytest
 from plushsense.cli.export import format_profile
 from plushsense.core.errors import BadInput, ProgramError, ToolError
 from plushsense.deploy.emit import TOY_BYTES, read_facts
-from plushsense.deploy.profile import Core, Cost, Estimate, cores, count, estimate, profile
+from plushsense.deploy.profile import Core, Cost, Estimate, _stack_usage, cores, count, estimate, profile
 from plushsense.deploy.targets import TARGETS
 from plushsense.models.arch import Arch
 from support.exports import bundle_of, exported
@@ -160,6 +160,19 @@ def test_sizes_on_the_host_without_counts(small: Path, target_here: Here) -> Non
     table = found.to_dict()
     assert table["instructions_per_step"] == {} and table["estimated_ms"] == {}
     assert found.costs["host"].flash_bytes > 0 and found.costs["host"].step is None
+
+
+def test_sizes_of_a_window_network_on_the_host(tmp_path: Path, target_here: Here) -> None:
+    folder = exported(tmp_path / "window", bundle_of("accel-3", padding="mirror", window=60, step=20))
+    found = profile(folder, [target_here("host")])
+    assert found.costs["host"].flash_bytes > 0 and found.costs["host"].stack_functions["plush_push"] > 0
+    assert "flash, all" in "\n".join(format_profile(found))
+    report = tmp_path / "plushsense.su"
+    report.write_text("a.c:1:1:pushes\t48\tdynamic,bounded\na.c:9:1:plain\t64\tstatic\n")
+    assert _stack_usage(report) == {"plain": 64, "pushes": 48}
+    report.write_text("a.c:1:1:endless\t48\tdynamic\n")
+    with pytest.raises(BadInput, match=r"The stack of a.c:1:1:endless is not known"):
+        _stack_usage(report)
 
 
 def test_nothing_to_count_on(small: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

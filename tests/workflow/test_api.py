@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import plushsense as ps
-from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.errors import ConfigError, DatasetError, PlushSenseWarning
 from plushsense.dataset.store import Dataset
 from plushsense.models.bundle import trained_people
 from plushsense.workflow.api import simulate, validation_predictions
@@ -121,6 +121,17 @@ def test_trained_anywhere_knows_idleness_and_is_scored_on_gestures(dataset: Data
     assert (bundle.windowing["context"], bundle.windowing["anywhere"]["idle_share"]) == ("anywhere", 0.25)
     ordinary = ps.train(dataset, **kwargs)
     assert trained.scores["windows"] == ordinary.scores["windows"], "gestures with their real past, nothing else"
+
+
+def test_a_script_gets_the_warnings_of_the_command_line(dataset: Dataset) -> None:
+    said: list[str] = []
+    kwargs: dict[str, Any] = {"context": "anywhere", "epochs": 1, "filters": (4, 4, 4), "every_s": 1.0}
+    ps.train(dataset, fit_decisions=False, warn=said.append, **kwargs)
+    with pytest.warns(PlushSenseWarning) as issued:
+        ps.train(dataset, fit_decisions=False, **kwargs)
+    ours = [each for each in issued if each.category is PlushSenseWarning]
+    assert [str(each.message) for each in ours] == said != []
+    assert {each.filename for each in ours} == {__file__}
 
 
 def test_training_anywhere_does_not_warn_of_trimmed_recordings(dataset: Dataset) -> None:

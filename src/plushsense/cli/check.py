@@ -71,7 +71,7 @@ def overview(result: CheckReport) -> Iterator[str]:
         f"{result.seconds:.1f} s"
     )
     if result.dataset.head.simulated:
-        yield "These recordings are of the virtual toy."
+        yield "SIMULATION: these recordings say nothing about a real toy."
     accepted = [f for f in result.findings if f.accepted]
     if accepted:
         yield f"{len(accepted)} finding{'s were' if len(accepted) > 1 else ' was'} accepted earlier and not listed."

@@ -37,7 +37,7 @@ def marks(result: Mapping[str, Any]) -> list[str]:
     """Return the notices to print above scores if they come from simulated data or a leaky split."""
     notices = []
     if result["simulated"]:
-        notices.append("SIMULATION: these scores are of the virtual toy and say nothing about a real one.")
+        notices.append("SIMULATION: these scores say nothing about a real toy.")
     if result["leaky"]:
         notices.append("LEAKY: windows of one recording are on both sides of this split; the scores are too high.")
     return notices

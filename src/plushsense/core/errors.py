@@ -20,7 +20,7 @@
     └── MissingExtraError       an optional package that is not installed
 
 Every message is one sentence: what is wrong, where, what is accepted, what to do.
-The command line prints it and exits with status 2.
+The command line prints it and exits with status 2. What is unusual but no error is a `PlushSenseWarning`.
 """
 
 from __future__ import annotations
@@ -61,6 +61,10 @@ class PlushSenseError(Exception):
     def __init__(self, message: str = "", *, reason: str = "", **values: object) -> None:
         super().__init__(printable(message))
         self.reason, self.values = reason, values
+
+
+class PlushSenseWarning(UserWarning):
+    """Something unusual that a function of the Python API reports by Python's `warnings`, as one sentence."""
 
 
 class BadInput(PlushSenseError):

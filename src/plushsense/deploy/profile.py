@@ -423,11 +423,14 @@ def _masking(target: str, file: Path) -> tuple[str, ...]:
 
 
 def _stack_usage(file: Path) -> dict[str, int]:
-    """Read each function's stack frame from the compiler's report, largest first; raise BadInput for a dynamic one."""
+    """Read each function's stack frame from the compiler's report, largest first; raise BadInput for one without limit.
+
+    Of a frame that is "dynamic,bounded", such as one that arguments of a call are pushed onto, the size is the maximum.
+    """
     frames: dict[str, int] = {}
     for line in file.read_text().splitlines() if file.is_file() else ():
         place, size, kind = line.split("\t")
-        if kind != "static":
+        if kind not in ("static", "dynamic,bounded"):
             raise BadInput(f"The stack of {place} is not known when compiling ({kind}): take out what makes it so.")
         frames[place.rsplit(":", 1)[-1]] = int(size)
     return dict(sorted(frames.items(), key=lambda item: -item[1]))

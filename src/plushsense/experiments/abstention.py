@@ -51,7 +51,7 @@ from plushsense.workflow.preparation import (
     choose_classes,
     network_inputs_of,
     outside_streams,
-    silent,
+    python_warning,
     windows_for,
 )
 from plushsense.workflow.reporting import journal_of
@@ -383,7 +383,7 @@ def abstaining(
     known_share: float = KNOWN_SHARE,
     out: str | os.PathLike[str] | None = None,
     progress: Callable[[JobProgress], None] | None = None,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
     **settings: Any,
 ) -> Abstaining:
     """Evaluate abstention: risk against coverage, the stated coverage, and known against unknown gestures.

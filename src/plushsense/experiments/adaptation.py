@@ -39,7 +39,7 @@ from plushsense.scoring import metrics
 from plushsense.scoring.splits import Fold, parse_split, purge
 from plushsense.windows.cut import WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, silent, windows_for
+from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, python_warning, windows_for
 from plushsense.workflow.reporting import keep_bundle
 
 Predictor = Callable[[WindowSet], NDArray[np.floating[Any]]]
@@ -295,7 +295,7 @@ def adapt(
     use: int | None = None,
     feedback: str | os.PathLike[str] | None = None,
     spec: PersonalSpec | None = None,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
 ) -> Adapted:
     """Adapt a bundle's last layer to one person, or leave it as it is where their own recordings do not show a gain.
 
@@ -443,7 +443,7 @@ def evaluate_adapting(
     int8: bool = False,
     spec: PersonalSpec | None = None,
     progress: Callable[[str], None] | None = None,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
     **settings: Any,
 ) -> dict[str, Any]:
     """Measure how much adaptation helps people left out: one network for each fold, adapted to each of its people.

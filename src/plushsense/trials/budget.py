@@ -32,7 +32,7 @@ from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import evaluate, train, unfinished
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.networks import FIRST_NETWORK, REFIT
-from plushsense.workflow.preparation import Warn, count_people, refits, silent
+from plushsense.workflow.preparation import Warn, count_people, python_warning, refits, silent
 from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, evaluation_id, journal_of, name_of, write_report
 
 TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
@@ -197,7 +197,7 @@ def make_network(
     budget_s: float,
     config: RunConfig | None = None,
     progress: Reporter = lambda at: None,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
 ) -> dict[str, Any]:
     """Train a network, save it as the bundle ``out``, and evaluate it on people left out, in about ``budget_s``.
 
@@ -261,7 +261,8 @@ def make_network(
         if stored is None and share * evaluation_s > left_s:
             break
         reported = _folds(LEARNING_CURVE, before, plan, share, whole, bundle, progress)
-        points[size] = _accuracies(evaluate(dataset, config, training_people=size, progress=reported).table)
+        smaller = evaluate(dataset, config, training_people=size, progress=reported, warn=silent)
+        points[size] = _accuracies(smaller.table)
         before += (plan.folds - 1) * share
     learning = learning_curve(points)
     if learning is not None:

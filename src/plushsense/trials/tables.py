@@ -147,6 +147,10 @@ def _seconds(trial: TrialScores) -> float | None:
     return sum(s.seconds for s in trial.scored) if trial.scored else None
 
 
+def _field_s(trial: TrialScores) -> float:
+    return round(float(trial.planned.trial.arch.receptive_field / trial.head["rate_hz"]), 3)
+
+
 def _acr(trial: TrialScores) -> float | None:
     return accuracy_complexity_ratio(trial.mean("accuracy"), trial.planned.trial.arch.parameters)
 
@@ -165,6 +169,7 @@ TRIAL_COLUMNS: dict[str, TrialColumn] = {
     "folds": TrialColumn(int, lambda t: len({run.fold for run in t.planned.runs})),
     "parameters": _of_network("parameters", "parameters"),
     "receptive_field": _of_network("receptive_field"),
+    "receptive_field_s": TrialColumn(float, _field_s, "reads (s)", "share"),
     "span": _of_network("span"),
     "macs_per_window": _of_network("macs_per_window"),
     "macs_per_step": _of_network("macs_per_step", "MAC/step"),
@@ -505,6 +510,7 @@ def summary_head(dataset: Dataset, planned: Plan) -> dict[str, Any]:
         "dataset": dataset.head.name,
         "dataset_hash": dataset.hash,
         "simulated": dataset.head.simulated,
+        "rate_hz": dataset.layout.rate_hz,
         "split": planned.split.text,
         "leaky": planned.split.leaky,
         "context": grid.context,

@@ -55,7 +55,7 @@ from plushsense.workflow.preparation import (
     classes_for,
     network_inputs_of,
     prepare_training,
-    silent,
+    python_warning,
     warn_of_files_twice,
     warn_of_single_people,
     windows_for,
@@ -154,7 +154,7 @@ def train(
     fit_decisions: bool = True,
     journal: Journal | None = None,
     progress: EpochProgress | None = None,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
     **settings: Any,
 ) -> Trained:
     """Train one network on a data set.
@@ -179,7 +179,8 @@ def train(
             Rows of the first network that finds hard negatives (``hard_share`` of the context "anywhere"), of the
             fine-tuning and of the training on everybody have ``what`` (see `workflow.networks`). The others have
             ``accuracy``, that of validation as ``scores`` counts it.
-        warn: called with a sentence for everything that is left out, and if 8-bit arithmetic changes many predictions.
+        warn: called with a sentence for everything that is left out, and if 8-bit arithmetic changes many predictions;
+            by default, they are Python warnings (`PlushSenseWarning`).
     """
     given = config or from_settings(arch=arch, filters=filters, **settings)
     if quantize_aware < 0:
@@ -336,7 +337,7 @@ def evaluate(
     int8: bool = False,
     training_people: int | None = None,
     progress: Callable[[JobProgress], None] | None = None,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
     **settings: Any,
 ) -> Evaluation:
     """Train and score one network for each fold of ``split``.

@@ -20,6 +20,7 @@ from plushsense.runtime.classifier import StreamClassifier
 from plushsense.workflow.api import evaluate, import_simulation, simulate, train
 from plushsense.workflow.config import resolve
 from plushsense.workflow.export import export
+from plushsense.workflow.preparation import silent
 from plushsense.workflow.reporting import write_report
 
 SIMULATION = "These scores are of a simulation (the virtual toy) and say nothing about a real toy."
@@ -64,7 +65,7 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
     dataset = _dataset(out / f"dataset-{name}", out / f"recordings-{name}", size, progress)
     config = resolve(None, training={"epochs": size.epochs, "halve_every": max(1, size.epochs // 4)})
     stage(f"2/6  train {config.model.arch} on {len(dataset.subjects)} people, some of them for validation")
-    trained = train(dataset, config, progress=lambda epoch, epochs, _: progress("training", epoch, epochs))
+    trained = train(dataset, config, progress=lambda epoch, epochs, _: progress("training", epoch, epochs), warn=silent)
     bundle = trained.save(out / "model.plush")
     stage(f"3/6  evaluate it on people left out, in {size.folds} folds")
     evaluation = out / f"evaluation-{name}"
@@ -75,6 +76,7 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
         out=evaluation,
         overwrite=True,
         progress=lambda at: progress("folds", at.done, at.total),
+        warn=silent,
     ).to_dict()
     stage(f"4/6  live: {size.live_s:.0f} s of a virtual person left out of the training")
     live = _live(bundle, size.live_s)
@@ -106,7 +108,7 @@ def _export(bundle: Path, folder: Path) -> Path:
     """Export the model, replacing the export of an earlier demo."""
     if (folder / FACTS).is_file():
         shutil.rmtree(folder)
-    return export(bundle, folder).folder
+    return export(bundle, folder, warn=silent).folder
 
 
 def _live(bundle: Path, seconds: float) -> dict[str, Any]:

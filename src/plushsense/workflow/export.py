@@ -25,7 +25,7 @@ from plushsense.models.bundle import Bundle, is_training_content
 from plushsense.runtime.image import image_check, patch_bytes
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
-from plushsense.workflow.preparation import WHOLE_PEOPLE, Warn, silent, windows_for
+from plushsense.workflow.preparation import WHOLE_PEOPLE, Warn, python_warning, silent, windows_for
 
 _TRIED = 512  # maximum of windows on which a conversion is compared with the network
 
@@ -111,7 +111,7 @@ def export(
     name: str = "",
     model_version: str = "",
     url: str = "",
-    warn: Warn = silent,
+    warn: Warn = python_warning,
 ) -> ExportResult:
     """Write the files that a toy needs to run a bundle's network: C99, the model as data, golden vectors, packages.
 
@@ -202,7 +202,7 @@ def export_patch(
     *,
     export: str | os.PathLike[str],
     dataset: Dataset | str | os.PathLike[str] | None = None,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
 ) -> PatchResult:
     """Write the dense layer of an adapted bundle as a patch for a toy that runs an export of the same network.
 

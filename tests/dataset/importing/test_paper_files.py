@@ -26,7 +26,7 @@ def imported(source: Path, dest: Path, integers: int = 15, **more: object) -> Im
 
 def kinds(done: ImportSummary) -> list[str]:
     """Warnings without those that the virtual people and the missing person codes cause."""
-    known = ("these recordings are of the virtual toy", "the folders are gestures")
+    known = ("these recordings are a simulation", "the folders are gestures")
     return [w for w in done.to_dict()["warnings"] if not w.startswith(known)]
 
 

@@ -96,7 +96,7 @@ def test_what_a_guess_leaves_out_and_refuses(tmp_path: Path) -> None:
     (src / "notes.txt").write_text("12 people\n")
     guessed = guess_pattern(src)
     found = tomllib.loads(guessed.toml)
-    assert found["paths"] == ["{subject}/all day.csv"]
+    assert found["paths"] == ["{subject}/*.csv"], "the next recording may have another name"
     assert found["exclude"] == ["people.csv"]
     assert found["layout"]["channels"] == [{"name": "force", "unit": "", "kind": "sensor", "step": 0.01}]
     assert found["layout"]["rate_hz"] == 100.0
@@ -107,6 +107,8 @@ def test_what_a_guess_leaves_out_and_refuses(tmp_path: Path) -> None:
         "the column 'time_host' is taken for a second clock, not for a channel",
     ]
     assert preview_import(src, pattern=ImportPattern(**found)).gestures == {"Hold": 12, "Tap": 12}
+    shutil.copy(src / "P01" / "all day.csv", src / "P02" / "evening.csv")
+    assert preview_import(src, pattern=ImportPattern(**found)).gestures == {"Hold": 13, "Tap": 13}
     one = tomllib.loads(guess_pattern(src / "P01" / "all day.csv").toml)
     assert (one["paths"], one["layout"]["name"]) == (["*.csv"], "all-day")
     for path in src.rglob("*.*"):
@@ -118,6 +120,18 @@ def test_what_a_guess_leaves_out_and_refuses(tmp_path: Path) -> None:
         guess_pattern(tmp_path / "empty")
     with pytest.raises(DatasetError, match="There is no"):
         guess_pattern(tmp_path / "none")
+
+
+def test_a_guess_takes_the_characters_of_patterns_in_names_for_themselves(tmp_path: Path) -> None:
+    for person in ("P01", "P02"):
+        (tmp_path / "{raw}" / person).mkdir(parents=True)
+        for take in ("1", "2"):
+            rows = [f"{10 * k},{k % 7}.25,{'AB'[k // 30]}" for k in range(60)]
+            lines = "\n".join(["time_ms,force,gesture", *rows])
+            (tmp_path / "{raw}" / person / f"take{{x}}_{take}.csv").write_text(lines)
+    found = tomllib.loads(guess_pattern(tmp_path).toml)
+    assert found["paths"][0].startswith("?raw?/{subject}/take?x?_")
+    assert preview_import(tmp_path, pattern=ImportPattern(**found)).gestures == {"A": 4, "B": 4}
 
 
 def test_one_of_two_devices_in_folders_and_lines_that_end_in_a_semicolon(tmp_path: Path) -> None:

@@ -352,6 +352,8 @@ def test_a_new_column_is_a_function_and_a_line(
     assert "convolutions" in ran.out
     saved = json.loads((tmp_path / "out" / "sweep.json").read_text())
     assert {row["depth"] for row in saved["best"]} == {1, 2}
+    assert {(row["arch"], row["receptive_field_s"]) for row in saved["best"]} == {("9", 0.09), ("5d1_5d2", 0.13)}
+    assert "reads (s)" in ran.out
     assert "depth" in (tmp_path / "out" / "trials.csv").read_text().splitlines()[0]
     assert cli("report", tmp_path / "out").status == 0
     assert "Convolutions" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")

@@ -181,7 +181,7 @@ def key_of(path: str, *, companion: bool) -> str:
 
 RECORDER = "recorder"
 SIMULATED = Sentence(
-    "these recordings are of the virtual toy: scores on them say nothing about a real toy", reason="simulated"
+    "these recordings are a simulation: scores on them say nothing about a real toy", reason="simulated"
 )
 NO_PEOPLE = Sentence(
     "the folders are gestures, so the people are not known: splits by subject are not possible; "

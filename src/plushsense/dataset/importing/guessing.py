@@ -414,12 +414,14 @@ def _paths(files: list[Path], ending: str, guess: _PatternDraft) -> None:
         guess.labels = Counter(row[at] for row in pieces)
     elif not guess.labels:
         guess.doubts.append("the label of a recording was not found: put {label} into paths, or give its column")
-    text = before
-    for k, role in enumerate(roles):
-        same = {row[k] for row in pieces}
-        text += f"{{{role}}}" if role in PARTS else role or next(iter(same))
-        text += "/" if k < depth - 1 else ""
-    guess.keys["paths"] = [(text if len(pieces) > 1 else "*") + ending]
+    # What is the same in all paths stands there as it is, but for the characters of patterns; a name of all files tells
+    # nothing apart, and the next recording may have another.
+    texts = [
+        f"{{{role}}}" if role in PARTS else role or re.sub("[{}*?]", "?", pieces[0][k]) for k, role in enumerate(roles)
+    ]
+    folders = "".join(f"{text}/" for text in texts[: depth - 1])
+    name = "*" if len({parts[-1] for parts in split}) == 1 else "".join(texts[depth - 1 :])
+    guess.keys["paths"] = [(before + folders + name if len(pieces) > 1 else "*") + ending]
 
 
 def _usual_least(numbers: Sequence[int]) -> int:

@@ -104,7 +104,7 @@ def source_files(source: Path) -> list[Path]:
 
 
 def is_simulation(source: Path, files: Iterable[Path]) -> bool:
-    """Return whether ``files`` are of the virtual toy: its mark or a simulated data set is in or above ``source``."""
+    """Return whether ``files`` are a simulation: its mark or a simulated data set is in or above ``source``."""
     if any(f.name == SIMULATION_MARK for f in files):
         return True
     for place in (source.resolve(), *source.resolve().parents):

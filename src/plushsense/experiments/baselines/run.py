@@ -43,7 +43,7 @@ from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import ANYWHERE, WindowSet
 from plushsense.windows.features import Scaler
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, silent, windows_for
+from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, python_warning, windows_for
 from plushsense.workflow.reporting import check_results, journal_of, machine
 
 SPLITS = ("leave-one-subject-out", "windows:5")
@@ -200,7 +200,7 @@ def baselines(
     overwrite: bool = False,
     cluster: str | None = None,
     progress: Callable[[JobProgress], None] | None = None,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
     **settings: Any,
 ) -> dict[str, Any]:
     """Compare classical programs, recurrent networks and our own network on the same windows, under several splits.

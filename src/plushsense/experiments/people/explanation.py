@@ -22,7 +22,7 @@ from plushsense.experiments.people.occlusion import BLOCK_S, Blocks, ExplainedGe
 from plushsense.jobs.journal import job_id
 from plushsense.models.bundle import Bundle, known_people, trained_people
 from plushsense.windows.cut import WindowSet, whole_gestures
-from plushsense.workflow.preparation import Warn, silent, windows_for
+from plushsense.workflow.preparation import Warn, python_warning, windows_for
 from plushsense.workflow.reporting import check_results
 
 TABLE, PAGE = "explain.json", "explain.html"
@@ -43,7 +43,7 @@ def explain(
     gestures: Sequence[str] | None = None,
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
 ) -> dict[str, Any]:
     """Explain a bundle's decisions on windows that it reads correctly, of people on whom it was not trained.
 

@@ -31,7 +31,7 @@ from plushsense.scoring.metrics import class_scores, column_metrics, confusion, 
 from plushsense.scoring.splits import parse_split
 from plushsense.workflow.api import evaluate
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, silent
+from plushsense.workflow.preparation import Warn, python_warning, silent
 from plushsense.workflow.reporting import check_results
 
 SPLITS = ("windows:5", "by-recording:5", "by-subject:5", "leave-one-subject-out")
@@ -47,7 +47,7 @@ def lens(
     overwrite: bool = False,
     cluster: str | None = None,
     progress: Callable[[JobProgress], None] | None = None,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
     **settings: Any,
 ) -> dict[str, Any]:
     """Evaluate one network under each split; describe people and calibration under the last split by person.

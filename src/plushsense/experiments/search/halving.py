@@ -319,7 +319,9 @@ class Space:
         kernels: lengths of kernels to draw from, in samples, each from 1.
         dilations: dilations to draw from, each from 1; they never decrease from layer to layer, as in all networks of
             the paper.
-        receptive_field: shortest and longest receptive field that is accepted, in samples (the paper's window has 250).
+        receptive_field: shortest and longest receptive field that is accepted, in samples, as those of kernels and
+            symbols: they divided by the layout's rate are seconds, which the tables of trials state (the paper's window
+            has 250 samples, 2.5 s at 100 Hz).
         networks: number of different networks to draw (from 2).
         seed: number that they are drawn from (from 0).
     """

@@ -59,7 +59,7 @@ from plushsense.trials.plan import (
 )
 from plushsense.trials.tables import SUMMARY as SWEEP
 from plushsense.trials.tables import Tables, summary_head
-from plushsense.workflow.preparation import Warn, silent
+from plushsense.workflow.preparation import Warn, python_warning, silent
 from plushsense.workflow.reporting import check_results
 
 SUMMARY, SETTINGS = "search.json", "train.toml"
@@ -199,7 +199,7 @@ def search(
     workers: int = 0,
     cluster: str | None = None,
     progress: Callable[[SearchProgress], None] | None = None,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
     **changes: Any,
 ) -> Search:
     """Find the network with the best macro-F1 within limits, for at most a share of the cost of the whole grid.
@@ -240,7 +240,7 @@ def preview_search(
     grid: GridSpec | str | os.PathLike[str] = "paper",
     *,
     measure: bool = False,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
     **changes: Any,
 ) -> dict[str, Any]:
     """Return the networks, rungs and costs of a `search` without training anything.

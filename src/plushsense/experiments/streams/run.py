@@ -71,6 +71,7 @@ from plushsense.workflow.preparation import (
     named_classes,
     network_inputs_of,
     outside_streams,
+    python_warning,
     silent,
     windows_for,
 )
@@ -262,7 +263,7 @@ def stream_eval(
     late_s: float = LATE_S,
     events: str | os.PathLike[str] | None = None,
     labels: bool = True,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
 ) -> dict[str, Any]:
     """Replay whole streams through one bundle with its own decision settings, and score its events.
 
@@ -344,7 +345,7 @@ def score_predictions(
     threshold: float = 0.0,
     late_s: float = LATE_S,
     labels: bool = True,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
 ) -> dict[str, Any]:
     """Score the predictions of any system against the true gestures of whole streams.
 
@@ -426,7 +427,7 @@ def stream_benchmark(
     labels: bool = True,
     anywhere_pool_s: float | None = None,
     progress: Callable[[JobProgress], None] | None = None,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
     **settings: Any,
 ) -> dict[str, Any]:
     """Score every system on the streams of people left out, with settings tuned on other people.

@@ -37,7 +37,7 @@ from plushsense.trials.tables import (
     networks_to_keep,
     summary_head,
 )
-from plushsense.workflow.preparation import Warn, silent
+from plushsense.workflow.preparation import Warn, python_warning
 from plushsense.workflow.reporting import check_results, journal_of
 
 
@@ -121,7 +121,7 @@ def sweep(
     keep_predictions: str = PAPER_CHOICE,
     progress: Callable[[JobProgress], None] | None = None,
     display: bool = False,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
     **changes: Any,
 ) -> Sweep:
     """Train and score every trial of a grid.
@@ -202,7 +202,7 @@ def preview(
     *,
     measure: bool = False,
     keep_predictions: str = PAPER_CHOICE,
-    warn: Warn = silent,
+    warn: Warn = python_warning,
     **changes: Any,
 ) -> dict[str, Any]:
     """Return counts of what `sweep` would train, the cost in multiply-accumulates, and all problems, without training.
