@@ -24,7 +24,15 @@ from plushsense.training.spec import TrainSpec
 from plushsense.trials.plan import PASSES, Plan, Task
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.config import RunConfig
-from plushsense.workflow.preparation import Warn, classes_for, divide, network_inputs_of, silent, windows_for
+from plushsense.workflow.preparation import (
+    Warn,
+    classes_for,
+    divide,
+    network_inputs_of,
+    refuse_hard_negatives,
+    silent,
+    windows_for,
+)
 
 _BATCHES, _EPOCHS = 3, 3
 
@@ -57,6 +65,7 @@ def preview_evaluation(
         ``epochs`` (at most), ``parameters``, ``macs`` of all trainings, ``seconds`` (estimated), and
         ``window_epoch_s``, the measured seconds to train on one window for one epoch.
     """
+    refuse_hard_negatives(config)
     dataset, config = network_inputs_of(as_dataset(dataset), config)
     gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)

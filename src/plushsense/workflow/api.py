@@ -55,6 +55,7 @@ from plushsense.workflow.preparation import (
     divide,
     network_inputs_of,
     python_warning,
+    refuse_hard_negatives,
     warn_of_files_twice,
     warn_of_single_people,
     windows_for,
@@ -195,6 +196,8 @@ def train(
     if config.scored_on != config.windows:
         scored = windows_for(dataset, network, config.scored_on, gestures)
     division = divide(windows, config, scored)
+    if config.windows.context == ANYWHERE and config.anywhere.hard_share and division.kind != WHOLE_PEOPLE:
+        warn("no hard negatives are added, as whole people must be held out for that: record three people or more")
     from plushsense.training.fit import predict
 
     trainer = NetworkTrainer(
@@ -356,6 +359,7 @@ def evaluate(
     if split is not None:
         config = replace(config, evaluation=replace(config.evaluation, split=split))
     parse_split(config.evaluation.split)
+    refuse_hard_negatives(config)
     if out is not None:
         check_place(Path(out), config, dataset, replace=overwrite)
     gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)
