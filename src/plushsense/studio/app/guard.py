@@ -419,6 +419,71 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
     return LimitedProtocol
 
 
+def limited_websocket(limits: ConnectionLimits) -> type[Any]:
+    """Return a websocket protocol class that ends connections whose client does not read, for uvicorn's ``ws``.
+
+    uvicorn's pings end such a connection too, but it stays open until the client has read everything that was sent.
+    """
+    from uvicorn.protocols.websockets.auto import AutoWebSocketsProtocol
+
+    base: Any = AutoWebSocketsProtocol
+
+    class LimitedWebSocket(base):  # type: ignore[misc]
+        """A websocket whose client reads something every ``limits.body_s``, and is gone that long after its end."""
+
+        _blocked_since: float | None = None
+        _closing = False
+        _check: Any = None
+
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            self._check = self.loop.call_later(limits.body_s / 2, self._expire)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            self._check.cancel()
+            super().connection_lost(exc)
+
+        def pause_writing(self) -> None:
+            self._blocked_since = time.monotonic()
+            super().pause_writing()
+
+        def resume_writing(self) -> None:
+            self._blocked_since = None
+            super().resume_writing()
+
+        def _expire(self) -> None:
+            blocked = self._blocked_since is not None and time.monotonic() - self._blocked_since >= limits.body_s
+            if blocked or self._closing:
+                self.transport.abort()
+                return
+            self._closing = self.transport.is_closing()
+            self._check = self.loop.call_later(limits.body_s / 2, self._expire)
+
+    return LimitedWebSocket
+
+
+UNSENT_MESSAGES, UNSENT_BYTES = 1000, 1 << 26
+"""Most messages, and most characters in them, that may wait for a client; it reads 25 a second on the page Live."""
+
+
+async def drop_slow_clients(server: Any, most: int = UNSENT_MESSAGES, most_bytes: int = UNSENT_BYTES) -> None:
+    """End the connections of an Engine.IO server for which more messages wait; a browser connects anew.
+
+    A client that reads less than it is sent, or never asks for its messages, stays connected as long as it answers
+    pings, and Engine.IO's queue of messages for it has no limit.
+    """
+    for connection in list(server.sockets.values()):
+        waiting = connection.queue
+        size = sum(len(packet.data or "") for packet in waiting._queue if packet is not None)
+        if connection.closed or (waiting.qsize() <= most and size <= most_bytes):
+            continue
+        await connection.close(wait=False, abort=True)
+        while not waiting.empty():
+            waiting.get_nowait()
+            waiting.task_done()
+        waiting.put_nowait(None)  # ends the writer
+
+
 # Downloads --------------------------------------------------------------------------------------------------------
 
 _CHUNK = 1 << 16
