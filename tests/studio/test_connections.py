@@ -25,7 +25,6 @@ from plushsense.studio.app.guard import (
     Visitors,
     drop_slow_clients,
     limited_protocol,
-    limited_websocket,
     peer_of,
 )
 from support.browsing import connected
@@ -83,7 +82,7 @@ def serving(limits: ConnectionLimits, app: Any) -> Iterator[int]:
         config = uvicorn.Config(
             Guard(app, visitors),
             http=limited_protocol(limits),
-            ws=limited_websocket(limits),
+            ws="wsproto",  # NiceGUI's choice
             lifespan="off",
             log_level="error",
             timeout_keep_alive=limits.keep_alive_s,

@@ -341,6 +341,11 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
         _blocked_since: float | None = None
         _timer: Any = None
 
+        def __init__(self, *args: Any, **options: Any) -> None:
+            super().__init__(*args, **options)
+            if self.ws_protocol_class is not None:
+                self.ws_protocol_class = limited_websocket(limits, self.ws_protocol_class)
+
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
             self._idle_since = time.monotonic()
@@ -419,14 +424,12 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
     return LimitedProtocol
 
 
-def limited_websocket(limits: ConnectionLimits) -> type[Any]:
-    """Return a websocket protocol class that ends connections whose client does not read, for uvicorn's ``ws``.
+@lru_cache(maxsize=4)
+def limited_websocket(limits: ConnectionLimits, base: Any) -> type[Any]:
+    """Return uvicorn's websocket protocol class ``base`` with an end to connections whose client does not read.
 
     uvicorn's pings end such a connection too, but it stays open until the client has read everything that was sent.
     """
-    from uvicorn.protocols.websockets.auto import AutoWebSocketsProtocol
-
-    base: Any = AutoWebSocketsProtocol
 
     class LimitedWebSocket(base):  # type: ignore[misc]
         """A websocket whose client reads something every ``limits.body_s``, and is gone that long after its end."""

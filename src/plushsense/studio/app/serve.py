@@ -30,7 +30,6 @@ from plushsense.studio.app.guard import (
     drop_slow_clients,
     is_loopback,
     limited_protocol,
-    limited_websocket,
     mark_scripts,
 )
 from plushsense.studio.app.workspace import WORK, Workspace
@@ -133,7 +132,6 @@ def run(
         reconnect_timeout=10.0,
         uvicorn_logging_level="error",
         http=limited_protocol(limits),
-        ws=limited_websocket(limits),
         timeout_keep_alive=limits.keep_alive_s,
         backlog=limits.backlog,
         h11_max_incomplete_event_size=HEAD_BYTES,
