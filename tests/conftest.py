@@ -132,6 +132,8 @@ def _peak_mb() -> float:
 def pytest_configure(config: pytest.Config) -> None:
     """Have all threads share two arenas of memory: each arena keeps what was freed in it."""
     config.stash[PEAKS] = {}
+    # Small data sets give rise to them; a test of warnings sees them all the same.
+    config.addinivalue_line("filterwarnings", "ignore::plushsense.core.errors.PlushSenseWarning")
     # M_ARENA_MAX of glibc.
     with contextlib.suppress(OSError, TypeError, AttributeError):
         ctypes.CDLL(None).mallopt(-8, 2)

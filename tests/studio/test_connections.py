@@ -19,7 +19,14 @@ import pytest
 
 from plushsense.core.recorder_csv import STREAM_NAME
 from plushsense.studio.app import guard
-from plushsense.studio.app.guard import ConnectionLimits, Guard, Visitors, limited_protocol, peer_of
+from plushsense.studio.app.guard import (
+    ConnectionLimits,
+    Guard,
+    Visitors,
+    drop_slow_clients,
+    limited_protocol,
+    peer_of,
+)
 from support.browsing import connected
 from support.recording_pages import CALM, begun, files, showing, take
 from support.waiting import until
@@ -75,7 +82,7 @@ def serving(limits: ConnectionLimits, app: Any) -> Iterator[int]:
         config = uvicorn.Config(
             Guard(app, visitors),
             http=limited_protocol(limits),
-            ws="none",
+            ws="wsproto",  # NiceGUI's choice
             lifespan="off",
             log_level="error",
             timeout_keep_alive=limits.keep_alive_s,
@@ -257,6 +264,117 @@ def test_two_hundred_clients_are_all_answered(monkeypatch: pytest.MonkeyPatch) -
         assert answered(connect(stack, port, WHOLE))
         kept = limits.total - limits.per_peer
         assert [is_open(client) for client in clients] == [False] * (200 - kept) + [True] * kept
+
+
+# Websockets --------------------------------------------------------------------------------------------------------
+
+UPGRADE = (
+    b"Host: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+
+
+def upgraded(stack: contextlib.ExitStack, port: int, path: str = "/") -> socket.socket:
+    """Return a websocket that has read the answer to its upgrade, and has little room for more."""
+    made = stack.enter_context(socket.socket())
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    made.settimeout(WAIT_S)
+    made.connect(("127.0.0.1", port))
+    made.sendall(f"GET {path} HTTP/1.1\r\n".encode() + UPGRADE)
+    answer = b""
+    while b"\r\n\r\n" not in answer:
+        answer += made.recv(1)
+    assert answer.startswith(b"HTTP/1.1 101")
+    return made
+
+
+def say(websocket: socket.socket, text: str) -> bool:
+    """Send a message of up to 125 characters; whether the connection is still there."""
+    data = text.encode()
+    try:
+        websocket.sendall(bytes([0x81, 0x80 | len(data), 0, 0, 0, 0]) + data)
+    except ConnectionError:
+        return False
+    return True
+
+
+def test_a_websocket_that_reads_nothing_is_ended_and_one_that_reads_slowly_is_not() -> None:
+    from uvicorn.protocols.utils import ClientDisconnected
+
+    sent, ends = {"/lazy": 0, "/slow": 0}, dict[str, str]()
+
+    async def stream(scope: Any, receive: Any, send: Any) -> None:
+        await receive()
+        await send({"type": "websocket.accept"})
+        try:
+            while sent[scope["path"]] < 256:
+                await send({"type": "websocket.send", "bytes": bytes(65536)})
+                sent[scope["path"]] += 1
+            ends[scope["path"]] = "sent"
+        except ClientDisconnected:
+            ends[scope["path"]] = "gone"
+
+    with serving(ConnectionLimits(body_s=1.0), stream) as port, contextlib.ExitStack() as stack:
+        lazy, slow = upgraded(stack, port, "/lazy"), upgraded(stack, port, "/slow")
+        received, begun = 0, time.monotonic()
+        while "/lazy" not in ends:
+            assert time.monotonic() - begun < WAIT_S
+            say(lazy, "3")
+            received += len(slow.recv(65536))
+        assert ends["/lazy"] == "gone" and sent["/lazy"] < 256
+        until(lambda: not say(lazy, "3"), WAIT_S)
+        while "/slow" not in ends:
+            received += len(slow.recv(1 << 20))
+        assert ends["/slow"] == "sent"
+
+
+def test_messages_do_not_pile_up_for_a_client_that_answers_pings_and_reads_too_little() -> None:
+    """Both transports: a websocket that is not read, and a client that only posts and never asks for its messages."""
+    socketio = pytest.importorskip("socketio")
+    server = socketio.AsyncServer(async_mode="asgi", cors_allowed_origins="*")
+    largest, seen = dict[str, int](), set[str]()
+    left: list[str] = []
+    server.on("disconnect", lambda sid, *_: left.append(sid))
+    stop = threading.Event()
+
+    async def send(sid: str) -> None:
+        while sid not in left and not stop.is_set():
+            await server.emit("update", "x" * 20_000, to=sid)
+            largest[sid] = max(largest.get(sid, 0), *(c.queue.qsize() for c in server.eio.sockets.values()), 0)
+            await server.sleep(0)
+
+    async def watch() -> None:
+        while not stop.is_set():
+            await drop_slow_clients(server.eio, most=300)
+            await server.sleep(0.02)
+
+    @server.on("connect")
+    async def begin(sid: str, *_: Any) -> None:
+        seen.add(sid)
+        if len(seen) == 1:
+            server.start_background_task(watch)
+        server.start_background_task(send, sid)
+
+    path = "/socket.io/?EIO=4&transport="
+    with serving(ConnectionLimits(body_s=1.0), socketio.ASGIApp(server)) as port, contextlib.ExitStack() as stack:
+        try:
+            lazy = upgraded(stack, port, f"{path}websocket")
+            say(lazy, "40")
+            until(lambda: len(left) == 1, WAIT_S)
+            until(lambda: not say(lazy, "3"), WAIT_S)
+            poller = stack.enter_context(
+                contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=WAIT_S))
+            )
+            poller.request("GET", f"{path}polling")
+            identity = re.search(r'"sid":"([^"]+)"', poller.getresponse().read().decode())
+            assert identity is not None
+            poller.request("POST", f"{path}polling&sid={identity[1]}", "40")
+            assert poller.getresponse().read() is not None
+            until(lambda: len(left) == 2, WAIT_S)
+        finally:
+            stop.set()
+    assert len(seen) == 2 and seen == set(left)
+    assert all(300 < most < 30_000 for most in largest.values())
 
 
 # Against the real server ------------------------------------------------------------------------------------------

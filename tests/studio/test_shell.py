@@ -28,8 +28,10 @@ from plushsense.studio.pages.train.result_details import confusion_table
 from plushsense.studio.pages.train.results import Confusion
 from plushsense.studio.widgets.elements import link, picture, verdict
 from plushsense.workflow.api import simulate
+from plushsense.workflow.reporting import SCORES
 from support.browsing import DESK, PHONE, TABLET, Studio, axe, connected, marked
 from support.recorded import record
+from support.study import evaluation
 
 Fixture = Callable[..., Any]
 _IN_VIEW = "e => { const r = e.getBoundingClientRect(); return r.left >= 0 && r.right <= innerWidth }"
@@ -284,6 +286,23 @@ def hostile_home(home: Path, made: Path) -> Path:
     (dataset / "recordings" / "P01").rename(dataset / "recordings" / HOSTILE)
     for index in ("recordings.csv", "index.json"):
         (dataset / index).unlink()
+    scored = {
+        **evaluation(HOSTILE, HOSTILE, HOSTILE, 0.6, people=3),
+        "model": {"symbol": HOSTILE, "filters": [HOSTILE], "padding": HOSTILE, "parameters": 9, "macs_per_step": 9},
+        "config": {"preset": HOSTILE, "training": {"epochs": HOSTILE}},
+        "dataset": {"name": HOSTILE, "hash": HOSTILE},
+        "simulated": True,
+        "over": "subjects",
+        "pooled": {"accuracy": 0.6},
+        "code_version": HOSTILE,
+    }
+    scored["confusion"]["labels"] = [f"{HOSTILE}{k}" for k in range(len(scored["confusion"]["labels"]))]
+    for one in (*scored["subjects"], *scored["per_class"]):
+        one["subject" if "subject" in one else "label"] = HOSTILE
+    for name in (HOSTILE, "a"):
+        (dataset / "evaluations" / name).mkdir(parents=True)
+        (dataset / "evaluations" / name / SCORES).write_text(json.dumps(scored), "utf-8")
+    (dataset / "evaluations" / "a" / "picture.svg").write_text(f"<svg onload='window.ran=1'>{HOSTILE}</svg>", "utf-8")
     for kind, suffix in (("bundles", ".plush"), ("protocols", ".toml"), ("packages", ".zip"), ("backups", ".zip")):
         (home / kind).mkdir(exist_ok=True)
         (home / kind / f"{HOSTILE}{suffix}").write_text("{", "utf-8")
@@ -307,6 +326,12 @@ def test_no_name_runs_as_script(studio: Fixture, look: Fixture, tmp_path: Path) 
         if path == PAGES["live"]:
             page.get_by_role("button", name=f"Open S01/live-{HOSTILE}").click()
             page.get_by_role("heading", name=HOSTILE).wait_for()
+        if path == PAGES["train"]:
+            # The tables of the details, by gesture and by affect, and the plot of both results.
+            page.locator("[data-row] button").first.click()
+            marked(page, "confusion").get_by_text(HOSTILE).first.wait_for()
+            marked(page, "people").get_by_text(HOSTILE).first.wait_for()
+            marked(page, "pareto").wait_for()
         # What runs when a picture is missing runs after the picture was asked for.
         page.wait_for_load_state("networkidle")
         assert page.locator("img[src=x]").count() == 0, path

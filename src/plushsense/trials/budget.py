@@ -31,8 +31,15 @@ from plushsense.trials.estimate import preview_evaluation
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import evaluate, train, unfinished
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.networks import FIRST_NETWORK, REFIT
-from plushsense.workflow.preparation import Warn, count_people, python_warning, refits, silent
+from plushsense.workflow.networks import REFIT
+from plushsense.workflow.preparation import (
+    Warn,
+    count_people,
+    python_warning,
+    refits,
+    refuse_hard_negatives,
+    silent,
+)
 from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, evaluation_id, journal_of, name_of, write_report
 
 TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
@@ -217,9 +224,9 @@ def make_network(
     if config is None:
         streams = any(recording.stream_row >= 0 for recording in dataset.used)
         config = from_settings(context=ANYWHERE) if streams else from_settings()
-    networks = 2 if config.anywhere.hard_share and config.windows.context == ANYWHERE else 1
+    refuse_hard_negatives(config)
     again = refits(config, count_people(dataset))
-    networks *= 1 + again
+    networks = 1 + again
     # A resumed run must not choose other folds because the computer is faster or slower than before.
     journal = journal_of(dataset, "budgets")
     key = job_id({"evaluation": evaluation_id(config, dataset), "out": out.name, "seconds": budget_s})
@@ -237,7 +244,7 @@ def make_network(
     whole = sum(_work(plan, networks))
     bundle = _saved_bundle(out.parent, stored["bundle"]) if stored is not None else None
     if bundle is None:
-        bundle, training_s = _train(dataset, config, out, whole, networks, again, progress, warn)
+        bundle, training_s = _train(dataset, config, out, whole, again, progress, warn)
         if cost is not None:
             plan = _adjusted(plan, cost, training_s, _USED * budget_s - (time.monotonic() - began))
             config, whole = _planned(config, plan), sum(_work(plan, networks))
@@ -330,20 +337,17 @@ def _train(
     config: RunConfig,
     out: Path,
     whole: float,
-    networks: int,
     again: bool,
     progress: Reporter,
     warn: Warn,
 ) -> tuple[Path, float]:
     """Train the network and save it; return its path, and the seconds that one training on everybody took."""
-    each = networks // (1 + again)
 
     def epoch_done(epoch: int, epochs: int, row: dict[str, Any]) -> None:
-        what = str(row.get("what", ""))
-        second, first_network = what.startswith(REFIT), what.endswith(FIRST_NETWORK)
-        done = epoch / epochs + each * second + (0 if first_network else each - 1)
+        second = str(row.get("what", "")).startswith(REFIT)
+        done = epoch / epochs + second
         progress(BudgetProgress(TRAINING, done / whole, row | {"epoch": epoch, "epochs": epochs}))
-        if epoch == epochs and second == again and not first_network:
+        if epoch == epochs and second == again:
             progress(BudgetProgress(DECIDING, done / whole, {}))
 
     done = train(dataset, config, journal=unfinished(dataset), progress=epoch_done, warn=warn)

@@ -29,6 +29,7 @@ from plushsense.workflow.preparation import (
     classes_for,
     network_inputs_of,
     prepare_training,
+    refuse_hard_negatives,
     silent,
     windows_for,
 )
@@ -58,6 +59,7 @@ def preview_evaluation(
         ``epochs`` (at most), ``parameters``, ``macs`` of all trainings, ``seconds`` (estimated), and
         ``window_epoch_s``, the measured seconds to train on one window for one epoch.
     """
+    refuse_hard_negatives(config)
     dataset, config = network_inputs_of(as_dataset(dataset), config)
     gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)

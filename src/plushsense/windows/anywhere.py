@@ -67,7 +67,7 @@ class AnywhereSpec:
         busy_share: share of the positions outside recordings, those with the most movement, that is left out because
             people may practise there (0 to 1).
         hard_share: idle windows that a first network takes for a gesture are added, at most this share of the windows;
-            0: none is, and no first network is trained (0 to 1).
+            0: none is, and no first network is trained. ``evaluate`` accepts only 0 (0 to 1).
     """
 
     every_s: float = 0.4

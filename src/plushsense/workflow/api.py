@@ -56,6 +56,7 @@ from plushsense.workflow.preparation import (
     network_inputs_of,
     prepare_training,
     python_warning,
+    refuse_hard_negatives,
     warn_of_files_twice,
     warn_of_single_people,
     windows_for,
@@ -359,6 +360,7 @@ def evaluate(
     if split is not None:
         config = replace(config, evaluation=replace(config.evaluation, split=split))
     parse_split(config.evaluation.split)
+    refuse_hard_negatives(config)
     if out is not None:
         check_place(Path(out), config, dataset, replace=overwrite)
     gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)

@@ -129,7 +129,7 @@ class EvaluationSpec:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Resolved settings of a run."""
+    """Resolved settings of a run; ``augment_given``: the augmentations were not left to the preset."""
 
     preset: str = "people"
     windows: WindowSpec = field(default_factory=WindowSpec)
@@ -138,6 +138,7 @@ class RunConfig:
     evaluation: EvaluationSpec = field(default_factory=EvaluationSpec)
     live: DecideSpec = field(default_factory=DecideSpec)
     anywhere: AnywhereSpec = field(default_factory=AnywhereSpec)
+    augment_given: bool = False
 
     @property
     def trained_on(self) -> WindowSpec:
@@ -173,13 +174,16 @@ class RunConfig:
         arch = self.model.arch or symbol_at_rate(default, layout.rate_hz)
         model = replace(self.model, arch=arch, filters=self.model.filters or default_filters(arch))
         training = self.training
-        if parse_symbol(arch).vector is not None and training.augment == PRESETS["people"].augment:
+        by_preset = not self.augment_given and training.augment == PRESETS["people"].augment
+        if parse_symbol(arch).vector is not None and by_preset:
             training = replace(training, augment=VECTOR_AUGMENT)
         return replace(self, model=model, training=training)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, as a bundle stores them."""
-        return asdict(self) | {"training": self.training.to_dict()}
+        values = asdict(self) | {"training": self.training.to_dict()}
+        del values["augment_given"]
+        return values
 
     def outcome(self) -> dict[str, Any]:
         """Return the settings that an evaluation's scores depend on, as plain values for JSON."""
@@ -260,7 +264,9 @@ def resolve(path: str | Path | None = None, **flags: Mapping[str, Any]) -> RunCo
     name = tables["training"].pop("preset", "people")
     make: dict[str, Callable[..., Any]] = {**TABLES, "training": preset(name).changed}
     tables["windows"].setdefault("context", CONTEXT[name])
-    return RunConfig(name, **{table: make[table](**values) for table, values in tables.items()})
+    augment_given = not {"augment", "turn_deg"}.isdisjoint(tables["training"])
+    specs = {table: make[table](**values) for table, values in tables.items()}
+    return RunConfig(name, **specs, augment_given=augment_given)
 
 
 # The table of each setting of `train`, `evaluate` and `baselines`.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import DatasetError, PlushSenseWarning, printable
+from plushsense.core.errors import ConfigError, DatasetError, PlushSenseWarning, printable
 from plushsense.core.gestures import NOBODY, GestureSet, merge_names
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.proposals import median_gesture_s
@@ -162,6 +162,15 @@ def add_hard_negatives(
     # A toy that is held between gestures may report a neutral one: that is no reaction, and often not wrong.
     reactions = [k for k, g in enumerate(gestures.gestures) if not g.idle and g.affect != "neutral"]
     return with_hard_negatives(train, candidates, idle[0], reactions, arch, training, anywhere.hard_share, progress)
+
+
+def refuse_hard_negatives(config: RunConfig) -> None:
+    """Raise ConfigError for settings with which `train` would add hard negatives, and an evaluation would not."""
+    if config.trained_on.context == ANYWHERE and config.anywhere.hard_share:
+        raise ConfigError(
+            f"hard_share is {config.anywhere.hard_share:g}, but an evaluation trains without hard negatives: set it to "
+            "0, or score networks with them on whole streams with  plushsense stream-eval --split."
+        )
 
 
 def warn_of_untrimmed(dataset: Dataset, gestures: GestureSet, warn: Warn) -> None:
@@ -342,4 +351,7 @@ def prepare_training(
     scored = windows
     if config.scored_on != config.windows:
         scored = windows_for(dataset, network, config.scored_on, gestures)
-    return PreparedTraining(dataset, config, gestures, network, windows, scored, divide(windows, config, scored))
+    division = divide(windows, config, scored)
+    if config.windows.context == ANYWHERE and config.anywhere.hard_share and division.kind != WHOLE_PEOPLE:
+        warn("no hard negatives are added, as whole people must be held out for that: record three people or more")
+    return PreparedTraining(dataset, config, gestures, network, windows, scored, division)

@@ -259,7 +259,7 @@ def load_evaluation(source: str | os.PathLike[str]) -> dict[str, Any]:
         raise BadInput(
             f"There is no evaluation at '{path}': create one with  plushsense evaluate ... --out DIR"
         ) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise BadInput(f"'{path}' is not an evaluation ({error}): give a folder written by evaluate.") from None
     return table | {"learning": _learning(path.with_name(LEARNING))}
 
@@ -268,7 +268,7 @@ def _learning(path: Path) -> dict[str, Any] | None:
     """Read the learning curve beside an evaluation (`plushsense.trials.budget`); None if there is none."""
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     return table if isinstance(table, dict) else None
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import plushsense as ps
+from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.crossval import fold_windows
@@ -18,6 +19,8 @@ from plushsense.experiments.streams.score import PeopleFold
 from plushsense.experiments.streams.systems import ANYWHERE, WINDOWS
 from plushsense.scoring.splits import parse_split
 from plushsense.training import fit as fitting
+from plushsense.trials.budget import make_network
+from plushsense.trials.estimate import preview_evaluation
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.config import from_settings
 from plushsense.workflow.preparation import outside_streams, windows_for
@@ -100,3 +103,22 @@ def test_what_lies_in_no_stream_of_theirs(dataset: Dataset) -> None:
     windows = windows_for(dataset, arch, config.windows, dataset.gestures)
     assert (outside_streams(windows, dataset, {"P1", "P3"}) == ~np.isin(windows.subject, ["P1", "P3"])).all()
     assert outside_streams(windows, dataset, set()).all()
+
+
+def test_an_evaluation_that_would_leave_out_hard_negatives_is_refused(rested: Dataset, tmp_path: Path) -> None:
+    asked = from_settings(filters=(4, 4, 4), epochs=2, classes="all", context="anywhere", hard_share=0.15)
+    later = from_settings(filters=(4, 4, 4), epochs=2, classes="all", train_context="anywhere", hard_share=0.15)
+    for config in (asked, later):
+        with pytest.raises(ConfigError, match=r"^hard_share is 0.15, but an evaluation trains without hard negatives:"):
+            ps.evaluate(rested, config, split="by-subject:2")
+        with pytest.raises(ConfigError, match=r"^hard_share is 0.15"):
+            preview_evaluation(rested, config)
+    with pytest.raises(ConfigError, match=r"^hard_share is 0.15"):
+        make_network(rested, tmp_path / "model.plush", budget_s=60.0, config=asked)
+    assert not (tmp_path / "model.plush").exists()
+    said: list[str] = []
+    streams = [s for s in rested.streams if s.subject in ("P1", "P2")]
+    recordings = [r for r in rested.recordings if r.stream in {s.id for s in streams}]
+    two = Dataset(rested.path, rested.head, recordings, streams)
+    ps.train(two, asked, fit_decisions=False, warn=said.append)
+    assert sum(sentence.startswith("no hard negatives are added") for sentence in said) == 1

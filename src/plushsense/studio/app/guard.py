@@ -341,6 +341,11 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
         _blocked_since: float | None = None
         _timer: Any = None
 
+        def __init__(self, *args: Any, **options: Any) -> None:
+            super().__init__(*args, **options)
+            if self.ws_protocol_class is not None:
+                self.ws_protocol_class = limited_websocket(limits, self.ws_protocol_class)
+
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
             self._idle_since = time.monotonic()
@@ -417,6 +422,69 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
                 self._timer = self.loop.call_later(min(left, limits.head_s), self._expire)
 
     return LimitedProtocol
+
+
+@lru_cache(maxsize=4)
+def limited_websocket(limits: ConnectionLimits, base: Any) -> type[Any]:
+    """Return uvicorn's websocket protocol class ``base`` with an end to connections whose client does not read.
+
+    uvicorn's pings end such a connection too, but it stays open until the client has read everything that was sent.
+    """
+
+    class LimitedWebSocket(base):  # type: ignore[misc]
+        """A websocket whose client reads something every ``limits.body_s``, and is gone that long after its end."""
+
+        _blocked_since: float | None = None
+        _closing = False
+        _check: Any = None
+
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            self._check = self.loop.call_later(limits.body_s / 2, self._expire)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            self._check.cancel()
+            super().connection_lost(exc)
+
+        def pause_writing(self) -> None:
+            self._blocked_since = time.monotonic()
+            super().pause_writing()
+
+        def resume_writing(self) -> None:
+            self._blocked_since = None
+            super().resume_writing()
+
+        def _expire(self) -> None:
+            blocked = self._blocked_since is not None and time.monotonic() - self._blocked_since >= limits.body_s
+            if blocked or self._closing:
+                self.transport.abort()
+                return
+            self._closing = self.transport.is_closing()
+            self._check = self.loop.call_later(limits.body_s / 2, self._expire)
+
+    return LimitedWebSocket
+
+
+UNSENT_MESSAGES, UNSENT_BYTES = 1000, 1 << 26
+"""Most messages, and most characters in them, that may wait for a client; it reads 25 a second on the page Live."""
+
+
+async def drop_slow_clients(server: Any, most: int = UNSENT_MESSAGES, most_bytes: int = UNSENT_BYTES) -> None:
+    """End the connections of an Engine.IO server for which more messages wait; a browser connects anew.
+
+    A client that reads less than it is sent, or never asks for its messages, stays connected as long as it answers
+    pings, and Engine.IO's queue of messages for it has no limit.
+    """
+    for connection in list(server.sockets.values()):
+        waiting = connection.queue
+        size = sum(len(packet.data or "") for packet in waiting._queue if packet is not None)
+        if connection.closed or (waiting.qsize() <= most and size <= most_bytes):
+            continue
+        await connection.close(wait=False, abort=True)
+        while not waiting.empty():
+            waiting.get_nowait()
+            waiting.task_done()
+        waiting.put_nowait(None)  # ends the writer
 
 
 # Downloads --------------------------------------------------------------------------------------------------------

@@ -27,6 +27,7 @@ from plushsense.studio.app.guard import (
     ConnectionLimits,
     Guard,
     Visitors,
+    drop_slow_clients,
     is_loopback,
     limited_protocol,
     mark_scripts,
@@ -36,6 +37,7 @@ from plushsense.studio.app.workspace import WORK, Workspace
 PORT = 8137
 _OPENING_S = 30.0
 _COLLECT_S = 10.0
+_LOOK_S = 1.0
 _ICONS = Path(__file__).with_name("icons.js")
 # Announce a lost connection to screen readers.
 _ALERTS = "document.querySelectorAll('.nicegui-error-popup').forEach(box => box.setAttribute('role', 'alert'));\n"
@@ -115,6 +117,7 @@ def run(
     app.config.quasar_config["loadingBar"] = {"skipHijack": True}
     app.config.vue_config_script = _ALERTS + _ICONS.read_text(encoding="utf-8") + app.config.vue_config_script
     app.on_startup(lambda: threading.Thread(target=announce, daemon=True).start())
+    app.on_startup(_watch_clients)
     app.on_delete(_release_memory())
     app.on_shutdown(workspace.close)
     ui.run(
@@ -180,6 +183,15 @@ def _release_memory() -> Callable[[], None]:
                 scheduled = True
 
     return release
+
+
+async def _watch_clients() -> None:
+    """Every `_LOOK_S`, drop the clients for which too many messages wait."""
+    from nicegui import core
+
+    while True:
+        await asyncio.sleep(_LOOK_S)
+        await drop_slow_clients(core.sio.eio)
 
 
 def _lock_folder(workspace: Workspace) -> FileLock | None:

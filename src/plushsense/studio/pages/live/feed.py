@@ -80,7 +80,8 @@ class Feed:
         if self._watched is not None and number >= self._watched[0]:
             self._round_ms = 1000.0 * (time.perf_counter() - self._watched[1])
             self._watched = None
-        self._seen = max(self._seen, number)
+        # A page cannot have drawn what was not sent.
+        self._seen = max(self._seen, min(number, self._sent))
 
     def again(self) -> None:
         """Make the next message contain the whole state, after the page was hidden or disconnected."""

@@ -9,8 +9,7 @@ from typing import Any
 from markupsafe import Markup
 from nicegui import run, ui
 
-from plushsense.core.gestures import NOBODY
-from plushsense.dataset.store import UNKNOWN_SUBJECT
+from plushsense.models.bundle import known_people
 from plushsense.studio.app.shell import (
     AFFECT_SIGNS,
     Page,
@@ -115,11 +114,11 @@ class ResultDetailsView:
 
     def _training(self, d: ResultDetails) -> None:
         w, facts = self._words, d.facts
-        checked = sorted(set(facts.get("validation_subjects", [])) - {NOBODY, UNKNOWN_SUBJECT})
+        checked = sorted(known_people(facts, ["validation_subjects"]))
         held_back = "train.facts_refit" if facts.get("refit") else "train.facts_training"
         text = w(
             held_back if d.row.spread == HELD_BACK else "train.facts_same",
-            trained=counted(w, "with_people", len(set(facts.get("subjects", [])) - {NOBODY, UNKNOWN_SUBJECT})),
+            trained=counted(w, "with_people", len(known_people(facts, ["subjects"]))),
             checked=counted(w, "with_people", len(checked)),
             names=", ".join(checked) or "–",
         )

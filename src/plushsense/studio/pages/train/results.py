@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -19,6 +20,7 @@ from plushsense.dataset.store import HEAD
 from plushsense.evaluation.scores import Predictions, read_predictions
 from plushsense.models.bundle import Bundle, known_people
 from plushsense.scoring import metrics
+from plushsense.studio.app.shell import AFFECT_SIGNS
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace, file_stamps
 from plushsense.trials.tables import SUMMARY as SWEEP
@@ -74,8 +76,9 @@ def averaged_over(words: Words, kind: str, units: int) -> str:
 def split_text(words: Words, split: str) -> str:
     """Describe in a few words how people, recordings or windows were left out."""
     kind, _, k = split.partition(":")
-    text = words.get(f"train.split_short.{split}") or words.get(f"train.split_short.{kind}", split)
-    return text.format(k=k)
+    text = words.get(f"train.split_short.{split}") or words.get(f"train.split_short.{kind}", "")
+    # The split is text of a file, which must not be taken for a format.
+    return text.format(k=k) if text else split
 
 
 def context_text(words: Words, context: str) -> str:
@@ -87,6 +90,11 @@ EVALUATION, TRIAL, TRAINING = "evaluation", "trial", "training"
 SUBJECTS, FOLDS, TRAININGS, HELD_BACK = "subjects", "folds", "trainings", "held_back"
 _UNITS = {SUBJECTS: "people", FOLDS: "folds", TRAININGS: "trainings", HELD_BACK: "people"}
 _HASH = 6
+# Limits of results that are read: a folder of results may come from elsewhere.
+_MOST_BYTES, _MOST_LABELS, _LONGEST_TEXT, _LAST_S = 1 << 26, 256, 1000, 1e11
+_WRONG = (
+    OSError, KeyError, ValueError, TypeError, AttributeError, IndexError, RecursionError, OverflowError, csv.Error,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -140,6 +148,29 @@ class ResultRow:
     learning: dict[str, Any] | None = None
 
 
+def sound(row: ResultRow) -> ResultRow:
+    """Return the row; raise ValueError if a value that was read from a file has another type or range."""
+    people = dict(row.people)
+    texts = (row.data, row.network, row.schedule, row.split, row.context, row.seeds, *row.apart, *people)
+    shares = (row.accuracy, row.accuracy_sd, row.macro_f1, row.macro_f1_sd, row.rest, *people.values())
+    counts = (row.units, row.macs, row.classes, row.parameters - 1)
+    right = all(isinstance(text, str) and len(text) <= _LONGEST_TEXT for text in texts)
+    right &= all(value is None or (_is_number(value) and 0.0 <= value <= 1.0) for value in shares)
+    right &= all(isinstance(n, int) and 0 <= n < 1 << 53 for n in counts)
+    right &= 0.0 <= row.when_s < _LAST_S
+    right &= row.interval is None or (len(row.interval) == 2 and all(map(_is_number, row.interval)))
+    if row.learning is not None and row.learning.get("ci95") is not None:
+        low, high = row.learning["ci95"]
+        right &= all(map(_is_number, (low, high, row.learning["gain"]))) and isinstance(row.learning["more"], int)
+    if not right:
+        raise ValueError("a value of another type or range")
+    return replace(row, leaky=bool(row.leaky), simulated=bool(row.simulated))
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
 def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
     """Read the result in the scores file ``path`` of an evaluation, as a list of one row."""
     table = load_evaluation(path)
@@ -150,35 +181,37 @@ def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
         context = f"{table['train_context']} → {context}"
     units = len(table[table["over"]])
     return [
-        ResultRow(
-            str(path.parent),
-            EVALUATION,
-            path.parent,
-            "",
-            str(dataset),
-            table["dataset"]["name"],
-            f"{model['symbol']} {'/'.join(map(str, model['filters']))} {model['padding']}",
-            f"{config['preset']}, {training['epochs']}",
-            table["split"],
-            context,
-            table["leaky"],
-            table["simulated"],
-            ", ".join(map(str, table["seeds"])),
-            SUBJECTS if table["over"] == SUBJECTS else FOLDS,
-            units,
-            table["accuracy"]["mean"],
-            table["accuracy"]["sd"],
-            table["macro_f1"]["mean"],
-            table["macro_f1"]["sd"],
-            model["parameters"],
-            model["macs_per_step"],
-            path.stat().st_mtime,
-            (str(table["dataset"]["hash"])[:_HASH], *(str(one["label"]) for one in table["per_class"])),
-            len(table["per_class"]),
-            None if table["accuracy"]["ci95"] is None else tuple(table["accuracy"]["ci95"]),
-            tuple((one["subject"], one["accuracy"]) for one in table["subjects"]),
-            _rest(table["nobody"], table["over"] == SUBJECTS),
-            table["learning"],
+        sound(
+            ResultRow(
+                str(path.parent),
+                EVALUATION,
+                path.parent,
+                "",
+                str(dataset),
+                table["dataset"]["name"],
+                f"{model['symbol']} {'/'.join(map(str, model['filters']))} {model['padding']}",
+                f"{config['preset']}, {training['epochs']}",
+                table["split"],
+                context,
+                table["leaky"],
+                table["simulated"],
+                ", ".join(map(str, table["seeds"])),
+                SUBJECTS if table["over"] == SUBJECTS else FOLDS,
+                units,
+                table["accuracy"]["mean"],
+                table["accuracy"]["sd"],
+                table["macro_f1"]["mean"],
+                table["macro_f1"]["sd"],
+                model["parameters"],
+                model["macs_per_step"],
+                path.stat().st_mtime,
+                (str(table["dataset"]["hash"])[:_HASH], *(str(one["label"]) for one in table["per_class"])),
+                len(table["per_class"]),
+                None if table["accuracy"]["ci95"] is None else tuple(table["accuracy"]["ci95"]),
+                tuple((one["subject"], one["accuracy"]) for one in table["subjects"]),
+                _rest(table["nobody"], table["over"] == SUBJECTS),
+                table["learning"],
+            )
         )
     ]
 
@@ -196,30 +229,32 @@ def of_trials(path: Path, dataset: Any) -> list[ResultRow]:
             if trial["status"] != "done" or not trial["accuracy"]:
                 continue
             rows.append(
-                ResultRow(
-                    f"{folder}#{trial['trial']}",
-                    TRIAL,
-                    folder,
-                    trial["trial"],
-                    str(dataset),
-                    table["dataset"],
-                    f"{trial['arch']} {trial['filters']} {trial['padding']}",
-                    f"{table['preset']}, {trial['epochs']} ({trial['batch_asked']})",
-                    trial["split"],
-                    table["context"],
-                    trial["leaky"] == "true",
-                    trial["simulated"] == "true",
-                    seeds,
-                    *over_trainings(trial),
-                    float(trial["accuracy"]),
-                    _number(trial["accuracy_sd"]),
-                    _number(trial["macro_f1"]),
-                    _number(trial["macro_f1_sd"]),
-                    int(trial["parameters"]),
-                    int(trial["macs_per_step"]),
-                    when,
-                    apart,
-                    len(table["labels"]),
+                sound(
+                    ResultRow(
+                        f"{folder}#{trial['trial']}",
+                        TRIAL,
+                        folder,
+                        trial["trial"],
+                        str(dataset),
+                        table["dataset"],
+                        f"{trial['arch']} {trial['filters']} {trial['padding']}",
+                        f"{table['preset']}, {trial['epochs']} ({trial['batch_asked']})",
+                        trial["split"],
+                        table["context"],
+                        trial["leaky"] == "true",
+                        trial["simulated"] == "true",
+                        seeds,
+                        *over_trainings(trial),
+                        float(trial["accuracy"]),
+                        _number(trial["accuracy_sd"]),
+                        _number(trial["macro_f1"]),
+                        _number(trial["macro_f1_sd"]),
+                        int(trial["parameters"]),
+                        int(trial["macs_per_step"]),
+                        when,
+                        apart,
+                        len(table["labels"]),
+                    )
                 )
             )
     return rows
@@ -239,32 +274,34 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
         context = f"{ANYWHERE} → stream"
     held_back = sorted(known_people(origin, ["validation_subjects"]))
     return [
-        ResultRow(
-            str(path),
-            TRAINING,
-            path,
-            "",
-            known.get(name, ""),
-            name,
-            f"{arch.symbol} {'/'.join(map(str, arch.filters))} {arch.padding}",
-            f"{origin.get('preset', '?')}, {training.get('epochs', '?')}",
-            split,
-            str(context),
-            bool(scores.get("leaky")),
-            bool(origin.get("simulated")),
-            str(training.get("seed", "?")),
-            # Unless whole people were held back, the network was trained on the people it was scored on.
-            *((HELD_BACK, len(held_back)) if split == WHOLE_PEOPLE else (TRAININGS, 1)),
-            scores.get("accuracy"),
-            None,
-            scores.get("macro_f1"),
-            None,
-            arch.parameters,
-            arch.macs_per_step,
-            path.stat().st_mtime,
-            (str(origin.get("dataset_hash", ""))[:_HASH], *bundle.gestures.labels, *held_back),
-            len(bundle.gestures),
-            rest=_rest(scores.get("nobody"), split == WHOLE_PEOPLE),
+        sound(
+            ResultRow(
+                str(path),
+                TRAINING,
+                path,
+                "",
+                known.get(name, ""),
+                name,
+                f"{arch.symbol} {'/'.join(map(str, arch.filters))} {arch.padding}",
+                f"{origin.get('preset', '?')}, {training.get('epochs', '?')}",
+                split,
+                str(context),
+                bool(scores.get("leaky")),
+                bool(origin.get("simulated")),
+                str(training.get("seed", "?")),
+                # Unless whole people were held back, the network was trained on the people it was scored on.
+                *((HELD_BACK, len(held_back)) if split == WHOLE_PEOPLE else (TRAININGS, 1)),
+                scores.get("accuracy"),
+                None,
+                scores.get("macro_f1"),
+                None,
+                arch.parameters,
+                arch.macs_per_step,
+                path.stat().st_mtime,
+                (str(origin.get("dataset_hash", ""))[:_HASH], *bundle.gestures.labels, *held_back),
+                len(bundle.gestures),
+                rest=_rest(scores.get("nobody"), split == WHOLE_PEOPLE),
+            )
         )
     ]
 
@@ -283,9 +320,13 @@ def read_json(path: Path) -> Any:
     """Read a JSON file; raise BadInput if it cannot be read."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as cause:
-        message = f"'{path}' cannot be read ({cause}): compute this result again."
-        raise BadInput(message, reason="result_unreadable", name=path.parent.name) from None
+    except (OSError, ValueError, RecursionError) as cause:
+        raise _unreadable(path, cause) from None
+
+
+def _unreadable(path: Path, cause: Exception) -> BadInput:
+    message = f"'{path}' cannot be read ({cause}): compute this result again."
+    return BadInput(message, reason="result_unreadable", name=path.parent.name)
 
 
 def _number(text: str) -> float | None:
@@ -380,23 +421,31 @@ class StoredResults:
 
     def details(self, row: ResultRow) -> ResultDetails:
         """Read the details of a result; raise PlushSenseError if its files cannot be read."""
+        try:
+            return self._details(row)
+        except _WRONG as cause:
+            raise _unreadable(row.path / SCORES, cause) from None
+
+    def _details(self, row: ResultRow) -> ResultDetails:
         if row.kind == EVALUATION:
-            table = read_json(row.path / SCORES)
-            affects = {one["label"]: one["affect"] for one in table["per_class"]}
+            table = read_json(self._inside(row.path / SCORES))
+            affects = _affects((one["label"], one["affect"]) for one in table["per_class"])
+            by_affect = _confusion(table["confusion_affect"])
+            _affects((label, label) for label in by_affect.labels)
             return ResultDetails(
                 row,
                 _confusion(table["confusion"]),
-                _confusion(table["confusion_affect"]),
+                by_affect,
                 affects,
-                tuple(table["subjects"]),
+                tuple(map(_scores_of_person, table["subjects"])),
                 (row.path / PREDICTIONS).is_file(),
                 facts={"code_version": table["code_version"], "hash": table["dataset"]["hash"]},
-                pooled=table["pooled"]["accuracy"],
+                pooled=sound(replace(row, accuracy=table["pooled"]["accuracy"])).accuracy,
             )
         if row.kind == TRIAL:
-            table = read_json(row.path / SWEEP)
+            table = read_json(self._inside(row.path / SWEEP))
             counts = table.get("confusions", {}).get(row.trial)
-            affects = dict(zip(table["labels"], table["affects"], strict=True))
+            affects = _affects(zip(table["labels"], table["affects"], strict=True))
             if counts is None:
                 return ResultDetails(row, affects=affects)
             by_gesture = _confusion({"labels": table["labels"], "counts": counts})
@@ -432,9 +481,9 @@ class StoredResults:
                 cached = self._read[key] = (stamp, validation_predictions(Bundle.load(row.path), dataset))
             predictions: Predictions = cached[1]
             return predictions
-        files = prediction_files(read_json(row.path / SWEEP)) if row.kind == TRIAL else {}
-        file = files.get(row.trial, PREDICTIONS)
-        stored = self._once(row.path / file, lambda path, _: read_predictions(path), None, refuse=True)
+        files = prediction_files(read_json(self._inside(row.path / SWEEP))) if row.kind == TRIAL else {}
+        file = self._inside(row.path / files.get(row.trial, PREDICTIONS))
+        stored = self._once(file, lambda path, _: read_predictions(path), None, refuse=True)
         assert stored is not None
         return stored
 
@@ -469,6 +518,13 @@ class StoredResults:
         counts: DatasetCounts = self._read[key][1]
         return counts
 
+    def _inside(self, path: Path) -> Path:
+        """Return the path of a file; raise PlushSenseError if it leads out of the workspace, or is too large."""
+        self._workspace.inside(path)
+        if path.is_file() and path.stat().st_size > _MOST_BYTES:
+            raise _unreadable(path, ValueError(f"over {_MOST_BYTES >> 20} MB"))
+        return path
+
     def _once(self, path: Path, read: Callable[[Path, Any], T], more: Any, refuse: bool = False) -> T | None:
         """Return ``read(path, more)``, cached until the file changes; return None on errors unless ``refuse``."""
         # A learning curve is written after its evaluation.
@@ -476,10 +532,10 @@ class StoredResults:
         cached = self._read.get(key)
         if cached is None or cached[0] != stamp:
             try:
-                cached = (stamp, read(path, more))
-            except (PlushSenseError, OSError, KeyError, ValueError, TypeError):
+                cached = (stamp, read(self._inside(path), more))
+            except (PlushSenseError, *_WRONG) as cause:
                 if refuse:
-                    raise
+                    raise cause if isinstance(cause, PlushSenseError) else _unreadable(path, cause) from None
                 cached = (stamp, None)
             self._read[key] = cached
         result: T | None = cached[1]
@@ -520,6 +576,25 @@ def sum_by_affect(confusion: Confusion, affects: Mapping[str, str | None]) -> Co
 
 
 def _confusion(table: Mapping[str, Any]) -> Confusion:
-    return Confusion(
-        tuple(label or "none" for label in table["labels"]), tuple(tuple(map(int, row)) for row in table["counts"])
-    )
+    labels = tuple(str(label or "none") for label in table["labels"])
+    counts = tuple(tuple(map(int, row)) for row in table["counts"])
+    square = len(labels) <= _MOST_LABELS and {len(counts), *map(len, counts)} <= {len(labels)}
+    if not square or any(n < 0 for row in counts for n in row):
+        raise ValueError("a confusion matrix of another size, or with negative counts")
+    return Confusion(labels, counts)
+
+
+def _affects(pairs: Iterable[tuple[Any, Any]]) -> dict[str, str | None]:
+    """Return affects by gesture; raise ValueError for one that does not exist."""
+    affects = {str(label): affect for label, affect in pairs}
+    if not {affect or "none" for affect in affects.values()} <= AFFECT_SIGNS.keys():
+        raise ValueError("an affect that does not exist")
+    return affects
+
+
+def _scores_of_person(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scores of a person that are displayed; raise ValueError for one of another type."""
+    scores = {key: given[key] for key in ("accuracy", "macro_f1", "by_recording_accuracy")}
+    if not all(value is None or _is_number(value) for value in scores.values()):
+        raise ValueError("a score that is no number")
+    return scores | {"subject": str(given["subject"]), **{key: int(given[key]) for key in ("recordings", "windows")}}
