@@ -17,7 +17,6 @@ from plushsense.deploy.emit import emit
 from plushsense.deploy.package import package
 from plushsense.deploy.quantize import integer_model
 from plushsense.runtime.image import IntegerModel
-from plushsense.windows.features import Scaler
 from support.c_toy import C_FOLDER, TOY_C, compiled
 from support.exports import LAYOUTS, bundle_of, exported
 from support.kept_objects import keeping_answers, keeping_objects
