@@ -1,8 +1,8 @@
 """Test files in a process of their own beside a worker: what they load and keep is gone when it ends.
 
 A worker collects all tests (400 MB with PyTorch) and keeps what one of them has loaded: scikit-learn 120 MB, MLflow
-190 MB. A file of `FILES` runs in a process that collects this file only and runs the tests that the worker asks for. It
-is replaced by another one after a test that leaves more than `ENOUGH_MB` behind.
+190 MB. The files of a line of `GROUPS` run in a process that collects these only and runs the tests that the worker
+asks for. It is replaced by another one after a test that leaves more than `ENOUGH_MB` behind.
 
 Without workers (``pytest tests/...``, coverage) all tests run in the one process.
 """
@@ -24,29 +24,26 @@ from _pytest.runner import runtestprotocol
 
 from support.memory import memory_mb
 
-FILES = {
-    "bench/test_peers.py",
-    "cli/test_baselines.py",
-    "cli/test_publish.py",
-    "dataset/publishing/test_checking.py",
-    "dataset/publishing/test_contents.py",
-    "dataset/publishing/test_package.py",
-    "dataset/test_relabel.py",
-    "deploy/test_convert.py",
-    "evaluation/test_reidentification.py",
-    "experiments/baselines/test_models.py",
-    "experiments/baselines/test_report.py",
-    "experiments/baselines/test_score.py",
-    "experiments/sweep/test_cluster.py",
-    "experiments/sweep/test_mlflow.py",
-    "jobs/test_cluster.py",
-    "tuning/test_gate.py",
-    "test_pages.py",
-    "test_questions.py",
-    "workflow/test_demo.py",
-    "workflow/test_estimator.py",
-    "workflow/test_exchange.py",
-}
+TESTS = Path(__file__).parents[1]
+# Each line is one process, for files that load the same.
+GROUPS = tuple(
+    tuple(files.split())
+    for files in (
+        "bench/test_peers.py",
+        "cli/test_baselines.py cli/test_publish.py",
+        "dataset/publishing/test_checking.py dataset/publishing/test_contents.py dataset/publishing/test_package.py",
+        "dataset/test_relabel.py",
+        "deploy/test_convert.py",
+        "evaluation/test_reidentification.py",
+        "experiments/baselines/test_models.py experiments/baselines/test_report.py experiments/baselines/test_score.py",
+        "experiments/sweep/test_cluster.py experiments/sweep/test_mlflow.py experiments/sweep/test_report.py",
+        "jobs/test_cluster.py",
+        "test_pages.py test_questions.py",
+        "tuning/test_gate.py",
+        "workflow/test_demo.py workflow/test_estimator.py workflow/test_exchange.py",
+    )
+)
+_GROUP_OF = {file: group for group in GROUPS for file in group}
 ENOUGH_MB = 400
 _CHANNEL = "TESTS_APART"
 SHARED = "TESTS_SHARED"
@@ -57,14 +54,15 @@ Answer = tuple[list[dict[str, Any]], float, float]  # reports; memory now, and t
 
 
 class Apart:
-    """The process of a test file, as its worker sees it."""
+    """The process of a group of files, as its worker sees it."""
 
-    def __init__(self, file: Path, config: pytest.Config, base: Path) -> None:
-        self.file, self.config = file, config
+    def __init__(self, group: tuple[str, ...], config: pytest.Config, base: Path) -> None:
+        self.group, self.config = group, config
         self.peak_mb = self.now_mb = 0.0
         ours, theirs = socket.socketpair()
         with theirs:
-            words = [sys.executable, "-m", "pytest", str(file), "-p", "no:xdist", "-p", "no:cacheprovider"]
+            files = [str(TESTS / file) for file in group]
+            words = [sys.executable, "-m", "pytest", *files, "-p", "no:xdist", "-p", "no:cacheprovider"]
             # A worker's folder lies in that of the run.
             environment = {**os.environ, _CHANNEL: str(theirs.fileno()), SHARED: str(base.parent)}
             number = len(list(base.glob("apart-*")))
@@ -99,7 +97,7 @@ class Apart:
 
 
 class Worker:
-    """Plugin of a worker: has the files run in processes of their own."""
+    """Plugin of a worker: runs the files in processes of their own."""
 
     def __init__(self) -> None:
         self.apart: Apart | None = None
@@ -107,14 +105,15 @@ class Worker:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_protocol(self, item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-        """Run a test of these files in the process of its file."""
+        """Run a test of these files in the process of its group."""
         place = _place(item)
-        if place not in FILES:
+        group = _GROUP_OF.get(place)
+        if group is None:
             return None
         if self.apart is None:
             base = item.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
-            self.apart = Apart(item.path, item.config, base)
-        following = nextitem.nodeid if nextitem is not None and nextitem.path == item.path else None
+            self.apart = Apart(group, item.config, base)
+        following = nextitem.nodeid if nextitem is not None and _GROUP_OF.get(_place(nextitem)) is group else None
         item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
         for report in self.apart.run(item, following):
             item.ihook.pytest_runtest_logreport(report=report)
@@ -133,7 +132,7 @@ class Worker:
 
 
 class Served:
-    """Plugin of the process of a file: runs the tests that the worker asks for."""
+    """Plugin of such a process: runs the tests that the worker asks for."""
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
@@ -156,8 +155,7 @@ def _requests(channel: Connection) -> Iterator[Asked]:
 
 
 def _place(item: pytest.Item) -> str:
-    folder = Path(__file__).parents[1]
-    return item.path.relative_to(folder).as_posix() if item.path.is_relative_to(folder) else ""
+    return item.path.relative_to(TESTS).as_posix() if item.path.is_relative_to(TESTS) else ""
 
 
 def plugin() -> Worker | Served | None:
