@@ -16,6 +16,8 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+from support import apart
+from support.memory import LIMIT_MB, memory_mb
 from support.requirements import missing
 
 pytest_plugins = ["support.small_dataset", "support.small_windows", "support.study"]
@@ -118,46 +120,57 @@ def _dealt(items: list[pytest.Item], workers: int) -> list[pytest.Item]:
     return [item for part in parts for item in part] + rest
 
 
-# The largest memory of the process of each worker, in MB.
+# What each worker says of its memory: the most, and a line for each file that raised it beyond the limit, in MB.
 PEAKS = pytest.StashKey[dict[str, float]]()
-
-
-def _peak_mb() -> float:
-    """Return the largest resident memory of this process so far, in MB; 0 where the system does not say it."""
-    with contextlib.suppress(OSError, IndexError):
-        return int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 1000
-    return 0.0
+BEYOND = pytest.StashKey[list[str]]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Have all threads share two arenas of memory: each arena keeps what was freed in it."""
-    config.stash[PEAKS] = {}
+    """Have all threads share two arenas of memory (each keeps what was freed in it), and some files a process each."""
+    config.stash[PEAKS], config.stash[BEYOND] = {}, []
     # Small data sets give rise to them; a test of warnings sees them all the same.
     config.addinivalue_line("filterwarnings", "ignore::plushsense.core.errors.PlushSenseWarning")
     # M_ARENA_MAX of glibc.
     with contextlib.suppress(OSError, TypeError, AttributeError):
         ctypes.CDLL(None).mallopt(-8, 2)
+    if (plugin := apart.plugin()) is not None:
+        config.pluginmanager.register(plugin, "apart")
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Hand the largest memory of this worker to the process that writes the summary."""
+    """Hand what this worker knows of memory to the process that writes the summary."""
     output = getattr(session.config, "workeroutput", None)
     if output is not None:
-        output["peak_mb"] = _peak_mb()
+        plugin = session.config.pluginmanager.get_plugin("apart")
+        output["peak_mb"], output["beyond"] = memory_mb()[1], session.config.stash[BEYOND]
+        output["apart"] = plugin.peaks if isinstance(plugin, apart.Worker) else {}
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node: Any) -> None:
     """Keep what a worker said of its memory."""
-    node.config.stash[PEAKS][node.gateway.id] = getattr(node, "workeroutput", {}).get("peak_mb", 0.0)
+    output = getattr(node, "workeroutput", {})
+    peaks, beyond = node.config.stash[PEAKS], node.config.stash[BEYOND]
+    peaks[node.gateway.id] = output.get("peak_mb", 0.0)
+    beyond += [f"{node.gateway.id}: {line}" for line in output.get("beyond", [])]
+    for place, mb in output.get("apart", {}).items():
+        peaks[place] = max(mb, peaks.get(place, 0.0))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Print the largest memory of each process that ran tests; the aim is less than 600 MB."""
-    peaks = config.stash[PEAKS] or {"pytest": _peak_mb()}
+    """Print the largest memory of the processes that ran tests, and the files in which one passed the limit.
+
+    No failure: which tests share a worker is chance.
+    """
+    peaks = config.stash[PEAKS] or {"pytest": memory_mb()[1]}
     if any(peaks.values()):
-        text = ", ".join(f"{name} {mb:.0f} MB" for name, mb in sorted(peaks.items()))
-        terminalreporter.write_line(f"largest memory of the test processes: {text}")
+        of_workers = ", ".join(f"{name} {mb:.0f} MB" for name, mb in sorted(peaks.items()) if not name.endswith(".py"))
+        terminalreporter.write_line(f"largest memory of the test processes: {of_workers}")
+        for name, mb in sorted(peaks.items(), key=lambda item: -item[1]):
+            if name.endswith(".py") and mb > 0.75 * LIMIT_MB:
+                terminalreporter.write_line(f"  in a process of its own: {name} {mb:.0f} MB")
+        for line in config.stash[BEYOND]:
+            terminalreporter.write_line(f"  beyond {LIMIT_MB} MB: {line}")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -169,9 +182,17 @@ def one_processor() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def memory_returned() -> Iterator[None]:
-    """Give freed memory back to the system after each module: after trainings it is more than 100 MB."""
+def memory_returned(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Give freed memory back to the system after each module: after trainings it is more than 100 MB.
+
+    A module that raised the most of this process beyond the limit is named in the summary.
+    """
+    before = memory_mb()[1]
     yield
+    after = memory_mb()[1]
+    if after > max(before, LIMIT_MB):
+        line = f"{request.path.relative_to(REPO).as_posix()} {before:.0f} -> {after:.0f} MB"
+        request.config.stash[BEYOND].append(line)
     # Only glibc has it.
     with contextlib.suppress(OSError, TypeError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

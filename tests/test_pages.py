@@ -33,6 +33,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.recording.simulate import simulate
 from plushsense.studio.app import serve
 from plushsense.workflow.api import import_simulation
+from support.kept_objects import keeping_answers, keeping_objects
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -217,6 +218,7 @@ SMALL = {
     "simulate": {"--people": "!3", "--repetitions": "1"},
     "train": {"--filters": "4,4,4", "--force": ""},
     "evaluate": {"--filters": "4,4,4"},
+    "explain": {"--gestures": "Tail pull"},
     "lens": {"--filters": "4,4,4"},
     "abstain": {"--filters": "4,4,4"},
     "baselines": {"--models": "!tree", "--pca": "!no", "--split": "by-subject:2"},
@@ -225,6 +227,7 @@ SMALL = {
     "stream-eval --split": {"--systems": "hysteresis"},
     "adapt": {"--force": ""},
     "verify": {"--target": "host"},
+    "verify --dataset": {"--samples": "500"},
     "profile": {"--target": "host"},
     "search": {"--rungs": "1,2", "--share": "1", "--architectures": "14d1_39d2_41d4", "--filters": "4/6/8/8"},
     "sweep": {
@@ -262,6 +265,13 @@ STAND_INS = {
     r"P26": "P02",
 }
 GESTURES = ("Hold strong", "Tail pull", "Tail scratch 1", "Tail tap 1", "Tail tap 2")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Share object files and answers with the tests of the C: many pages export and verify the same network."""
+    with keeping_objects(tmp_path_factory), keeping_answers(tmp_path_factory):
+        yield
 
 
 @pytest.fixture(scope="module")

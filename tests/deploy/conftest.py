@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-import pickle
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from filelock import FileLock
-from numpy.typing import NDArray
 
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.deploy.emit import emit
-from plushsense.deploy.golden import answers_of
 from plushsense.deploy.package import package
-from plushsense.deploy.proof.scenarios import Scenario, scenarios_of
 from plushsense.deploy.quantize import integer_model
 from plushsense.runtime.image import IntegerModel
-from plushsense.windows.features import Scaler
 from support.c_toy import C_FOLDER, TOY_C, compiled
 from support.exports import LAYOUTS, bundle_of, exported
-from support.kept_objects import keeping_objects
+from support.kept_objects import keeping_answers, keeping_objects
 from support.requirements import missing
 from support.sharing import built_once
 
@@ -190,33 +183,5 @@ def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Make the scenarios of a model, and its answers to frames, once for all tests: they follow from these alone."""
-    folder = built_once(tmp_path_factory, "answers", lambda draft: None)
-    known: dict[str, Any] = {}
-
-    def once(make: Callable[[], Any], *inputs: object) -> Any:
-        key = sha256(pickle.dumps(inputs)).hexdigest()
-        if key not in known:
-            file = folder / key
-            with FileLock(f"{file}.lock"):
-                if not file.exists():
-                    draft = file.with_suffix(".draft")
-                    draft.write_bytes(pickle.dumps(make()))
-                    draft.replace(file)
-            known[key] = pickle.loads(file.read_bytes())
-        return known[key]
-
-    def answers_once(model: IntegerModel, frames: NDArray[np.int64]) -> NDArray[np.int32]:
-        inputs = model.to_bytes(), repr(model.gestures), frames.tobytes()
-        answers: NDArray[np.int32] = once(lambda: answers_of(model, frames), *inputs)
-        return answers.copy()
-
-    def scenarios_once(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[Scenario]:
-        inputs = model.to_bytes(), repr(model.gestures), scaler.offset.tobytes(), scaler.scale.tobytes(), repeat
-        scenarios: list[Scenario] = once(lambda: scenarios_of(model, scaler, repeat), *inputs)
-        return scenarios
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("plushsense.deploy.proof.vectors.scenarios_of", scenarios_once)
-        for module in ("golden", "proof.vectors"):
-            patch.setattr(f"plushsense.deploy.{module}.answers_of", answers_once)
+    with keeping_answers(tmp_path_factory):
         yield

@@ -14,10 +14,12 @@ import pytest
 
 from plushsense.core.errors import DatasetError
 from plushsense.dataset.files import sha256_of
+from plushsense.dataset.publishing import checking
 from plushsense.dataset.publishing.checking import VALIDATORS, PackageView, check_folder, validate_package
 from plushsense.dataset.publishing.metadata import CRATE_FILE
 from plushsense.dataset.publishing.package import PublishResult
 from plushsense.dataset.publishing.tables import write_checksums, write_zip
+from support.requirements import LONG
 
 Damage = Callable[[Path], None]
 
@@ -276,7 +278,9 @@ def test_what_plushsense_leaves_in_an_opened_folder_is_no_part_of_a_zip(package:
         (a_true_time_in_a_name, {"times", "data"}),
     ],
 )
-def test_planted_damage_is_caught(package: PublishResult, tmp_path: Path, damage: Damage, by: set[str]) -> None:
+def test_planted_damage_is_caught(
+    package: PublishResult, tmp_path: Path, damage: Damage, by: set[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     root = tmp_path / "package"
     shutil.copytree(package.folder, root)
     damage(root)
@@ -285,6 +289,9 @@ def test_planted_damage_is_caught(package: PublishResult, tmp_path: Path, damage
     assert careless.problems, "not even a careless damage may pass"
     # Whoever makes the checksums anew is still caught, by what they cannot know.
     write_checksums(root)
+    if not LONG:
+        # The others read a package for a second; each of them is here for some damage.
+        monkeypatch.setattr(checking, "VALIDATORS", {name: VALIDATORS[name] for name in VALIDATORS if name in by})
     found = check_folder(root)
     caught = {p.validator for p in found.problems}
     assert by <= caught, found.problems

@@ -1,0 +1,166 @@
+"""Test files in a process of their own beside a worker: what they load and keep is gone when it ends.
+
+A worker collects all tests (400 MB with PyTorch) and keeps what one of them has loaded: scikit-learn 120 MB, MLflow
+190 MB. The files of a line of `GROUPS` run in a process that collects these only and runs the tests that the worker
+asks for. It is replaced by another one after a test that leaves more than `ENOUGH_MB` behind.
+
+Without workers (``pytest tests/...``, coverage) all tests run in the one process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import pytest
+from _pytest.runner import runtestprotocol
+
+from support.memory import memory_mb
+
+TESTS = Path(__file__).parents[1]
+# Each line is one process, for files that load the same.
+GROUPS = tuple(
+    tuple(files.split())
+    for files in (
+        "bench/test_peers.py",
+        "cli/test_baselines.py cli/test_publish.py",
+        "dataset/publishing/test_checking.py dataset/publishing/test_contents.py dataset/publishing/test_package.py",
+        "dataset/test_relabel.py",
+        "deploy/test_convert.py",
+        "evaluation/test_reidentification.py",
+        "experiments/baselines/test_models.py experiments/baselines/test_report.py experiments/baselines/test_score.py",
+        "experiments/sweep/test_cluster.py experiments/sweep/test_mlflow.py experiments/sweep/test_report.py",
+        "jobs/test_cluster.py",
+        "test_pages.py test_questions.py",
+        "tuning/test_gate.py",
+        "workflow/test_demo.py workflow/test_estimator.py workflow/test_exchange.py",
+    )
+)
+_GROUP_OF = {file: group for group in GROUPS for file in group}
+ENOUGH_MB = 400
+_CHANNEL = "TESTS_APART"
+SHARED = "TESTS_SHARED"
+"""Environment variables: the socket on which a worker asks a process for tests; the folder that all workers share."""
+
+Asked = tuple[str, str | None]  # the test, and the next one of the file, which may use the same fixtures
+Answer = tuple[list[dict[str, Any]], float, float]  # reports; memory now, and the most so far, in MB
+
+
+class Apart:
+    """The process of a group of files, as its worker sees it."""
+
+    def __init__(self, group: tuple[str, ...], config: pytest.Config, base: Path) -> None:
+        self.group, self.config = group, config
+        self.peak_mb = self.now_mb = 0.0
+        ours, theirs = socket.socketpair()
+        with theirs:
+            files = [str(TESTS / file) for file in group]
+            words = [sys.executable, "-m", "pytest", *files, "-p", "no:xdist", "-p", "no:cacheprovider"]
+            # A worker's folder lies in that of the run.
+            environment = {**os.environ, _CHANNEL: str(theirs.fileno()), SHARED: str(base.parent)}
+            number = len(list(base.glob("apart-*")))
+            self.process = subprocess.Popen(
+                [*words, "--rootdir", str(config.rootpath), f"--basetemp={base / f'apart-{number}'}"],
+                cwd=config.invocation_params.dir,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+            )
+        self.channel = Connection(ours.detach())
+
+    def run(self, item: pytest.Item, following: str | None) -> list[pytest.TestReport]:
+        """Run a test there and return its reports; one of a failure if the process ended."""
+        try:
+            self.channel.send((item.nodeid, following))
+            data, self.now_mb, self.peak_mb = self.channel.recv()
+        except (EOFError, OSError):
+            said = (
+                f"The process of {self.file.name} ended with status {self.process.wait()} (see tests/support/apart.py)."
+            )
+            words: dict[str, Any] = dict.fromkeys(item.keywords, 1)
+            return [pytest.TestReport(item.nodeid, item.location, words, "failed", said, "call")]
+        make = self.config.hook.pytest_report_from_serializable
+        return [make(config=self.config, data=report) for report in data]
+
+    def close(self) -> None:
+        """End the process: its fixtures are torn down."""
+        self.channel.close()
+        self.process.wait()
+
+
+class Worker:
+    """Plugin of a worker: runs the files in processes of their own."""
+
+    def __init__(self) -> None:
+        self.apart: Apart | None = None
+        self.peaks: dict[str, float] = {}
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtest_protocol(self, item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
+        """Run a test of these files in the process of its group."""
+        place = _place(item)
+        group = _GROUP_OF.get(place)
+        if group is None:
+            return None
+        if self.apart is None:
+            base = item.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
+            self.apart = Apart(group, item.config, base)
+        following = nextitem.nodeid if nextitem is not None and _GROUP_OF.get(_place(nextitem)) is group else None
+        item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+        for report in self.apart.run(item, following):
+            item.ihook.pytest_runtest_logreport(report=report)
+        item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+        self.peaks[place] = max(self.peaks.get(place, 0.0), self.apart.peak_mb)
+        if following is None or self.apart.now_mb > ENOUGH_MB or self.apart.process.poll() is not None:
+            self.apart.close()
+            self.apart = None
+        # What an earlier test left for others of its folder is not known to what runs in this process after it.
+        item.session._setupstate.teardown_exact(nextitem)
+        return True
+
+    def pytest_sessionfinish(self) -> None:
+        if self.apart is not None:
+            self.apart.close()
+
+
+class Served:
+    """Plugin of such a process: runs the tests that the worker asks for."""
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """Run what is asked for until the worker closes the channel."""
+        items = {item.nodeid: item for item in session.items}
+        channel = Connection(int(os.environ.pop(_CHANNEL)))
+        for name, following in _requests(channel):
+            reports = runtestprotocol(items[name], log=False, nextitem=items.get(following or ""))
+            to_data = session.config.hook.pytest_report_to_serializable
+            data = [to_data(config=session.config, report=report) for report in reports]
+            channel.send((data, *memory_mb()))
+        session._setupstate.teardown_exact(None)
+        return True
+
+
+def _requests(channel: Connection) -> Iterator[Asked]:
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            yield channel.recv()
+
+
+def _place(item: pytest.Item) -> str:
+    return item.path.relative_to(TESTS).as_posix() if item.path.is_relative_to(TESTS) else ""
+
+
+def plugin() -> Worker | Served | None:
+    """Return the plugin that this process of pytest needs."""
+    if _CHANNEL in os.environ:
+        return Served()
+    # Sockets are handed to another process as on POSIX.
+    return Worker() if "PYTEST_XDIST_WORKER" in os.environ and os.name == "posix" else None
