@@ -343,8 +343,8 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
 
         def __init__(self, *args: Any, **options: Any) -> None:
             super().__init__(*args, **options)
-            if self.ws_protocol_class is not None:
-                self.ws_protocol_class = limited_websocket(limits, self.ws_protocol_class)
+            base: Any = self.ws_protocol_class
+            self.ws_protocol_class = base and limited_websocket(limits, base)
 
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)

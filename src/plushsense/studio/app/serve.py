@@ -186,7 +186,7 @@ def _release_memory() -> Callable[[], None]:
 
 
 async def _watch_clients() -> None:
-    """Every `_LOOK_S`, drop the clients for which too many messages wait."""
+    """Drop the clients for which too many messages wait, every `_LOOK_S`."""
     from nicegui import core
 
     while True:
