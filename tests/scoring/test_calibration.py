@@ -16,7 +16,8 @@ def test_calibration_error_by_hand() -> None:
     assert found["ece"] == pytest.approx(0.5 * 0.45 + 0.5 * 0.35)
     assert found["accuracy"] == 0.75 and found["confidence"] == pytest.approx(0.8)
     assert [b["n"] for b in found["bins"]] == [0, 0, 0, 0, 0, 0, 2, 0, 0, 2]
-    assert found["bins"][0]["accuracy"] is None
+    assert found["bins"][0] == {"low": 0.0, "high": 0.1, "n": 0, "confidence": None, "accuracy": None}
+    assert [(b["low"], b["high"]) for b in found["bins"]] == [(k / 10, (k + 1) / 10) for k in range(10)]
     with pytest.raises(BadInput, match="at least one prediction"):
         reliability(np.zeros((0, 3)), np.zeros(0, np.int64))
 

@@ -60,3 +60,8 @@ def test_pairs_and_cliques() -> None:
     assert cliques(("A", "B", "C"), pairs) == [("A", "B")]
     with pytest.raises(BadInput, match="at least 2 models on 2 people"):
         compare_pairs(("A",), scores[:, :1])
+
+
+def test_people_without_a_difference_are_neither_better_nor_worse() -> None:
+    (row,) = compare_pairs(["a", "b"], np.array([[0.5, 0.5], [0.7, 0.6], [0.8, 0.6], [0.1, 0.4]]))
+    assert (row["better"], row["worse"]) == (2, 1)
