@@ -245,10 +245,12 @@ def test_a_feed_sends_everything_once_and_anew_when_it_missed_some(workspace: Wo
         what, message = feed.message() or ("", {})
         assert what == "update"
         assert message["n"] > 0
-        assert len(message["y"]) == 13
-        assert {len(column) for column in message["y"]} == {len(message["x"])}
-        seconds += message["x"]
         feed.seen(message["n"])
+        # The signals are sent less often than the decision.
+        if "x" in message:
+            assert len(message["y"]) == 13
+            assert {len(column) for column in message["y"]} == {len(message["x"])}
+            seconds += message["x"]
     assert message["round"] > 0.0
     assert seconds == sorted(set(seconds)), "each sample once, none left out"
     assert max(b - a for a, b in pairwise(seconds)) < 0.1

@@ -219,14 +219,15 @@ def is_own(url: str) -> bool:
 def axe(page: Page) -> list[str]:
     """Serious and critical findings of axe-core, a line each, that are still there after a moment.
 
-    A field that is just being enabled, or a label that is moving, may be found in between.
+    A field that is just being enabled, or a label that is moving, may be found in between. Nothing is preloaded: only a
+    rule on films and sounds, of moderate impact, needs that, and it takes as long as all the rules.
     """
     # Evaluated, not added as a script: the page's own policy stands. Once a page, as that takes as long as looking.
     if not page.evaluate("() => 'axe' in window"):
         page.evaluate(AXE.read_text(encoding="utf-8"))
     findings: list[str] = []
     for _ in range(_LOOKS):
-        found: dict[str, Any] = page.evaluate("() => axe.run(document, {resultTypes: ['violations']})")
+        found: dict[str, Any] = page.evaluate("() => axe.run(document, {resultTypes: ['violations'], preload: false})")
         findings = [
             f"{v['id']} ({v['impact']}): {v['help']}: {node['html'][:160]}"
             for v in found["violations"]

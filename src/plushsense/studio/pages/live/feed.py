@@ -28,6 +28,8 @@ PACE_S = 0.04
 """Minimum time between two messages to a page; less than the 50 ms between two decisions in real time."""
 RATES_HZ = (1, 2, 5, 10, 20)
 """Rates to choose from: how often a page displays the decision, and how often it draws the signals."""
+PLOT_HZ = 10
+"""How often a page draws the signals unless another rate is chosen; their lines are most of what a browser draws."""
 _CLOCK_S = 0.001
 """Tolerance of timers, in seconds."""
 _MAX_BEHIND = 60
@@ -51,7 +53,7 @@ class Feed:
 
     def __init__(self, reader: LiveReader, explain: Callable[[PlushSenseError], str] = str) -> None:
         self._reader, self._explain = reader, explain
-        self.plot_s = self.decision_s = PACE_S
+        self.plot_s, self.decision_s = 1.0 / PLOT_HZ, PACE_S
         self.hidden = self.away = False
         self._generation = -1
         self._place = 0
@@ -115,8 +117,9 @@ class Feed:
         if self.holds:
             return None
         now, host = self._reader.now, time.perf_counter() + _CLOCK_S
-        plot = host >= self._plotted_at + self.plot_s
         decision = host >= self._decided_at + self.decision_s or now.situation.kind in UNREAD
+        # Signals that are nearly due go with a decision, and need no message of their own.
+        plot = host >= self._plotted_at + self.plot_s - (PACE_S / 2.0 if decision else 0.0)
         if now.generation != self._generation:
             plot = decision = True
         if plot:

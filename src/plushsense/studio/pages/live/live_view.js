@@ -332,8 +332,10 @@ export default {
       const { width, height } = this.signalsAt, c = this.n.signals.getContext("2d"), k = this.ink;
       c.clearRect(0, 0, width, height);
       const left = Math.min(150, width * 0.3), right = width - 4, lane = this.lane, bottom = this.channels.length * lane;
-      const end = this.xs.length ? this.xs[this.xs.length - 1] : 0, begin = end - this.windowS;
-      const x = (s) => left + ((s - begin) / this.windowS) * (right - left);
+      // Kept in constants: reading a property of the component costs more than a line of the drawing.
+      const xs = this.xs, windowS = this.windowS;
+      const end = xs.length ? xs[xs.length - 1] : 0, begin = end - windowS;
+      const x = (s) => left + ((s - begin) / windowS) * (right - left);
       c.font = "12px sans-serif";
       c.lineJoin = "bevel";
       c.strokeStyle = k.line;
@@ -348,7 +350,8 @@ export default {
         if (s % 2 === 0 && x(s) < right - 12) c.fillText(`${s} s`, x(s), bottom + 16);
       }
       let from = 0;
-      while (from < this.xs.length && this.xs[from] < begin) from++;
+      while (from < xs.length && xs[from] < begin) from++;
+      const across = xs.map(x);
       this.channels.forEach((channel, i) => {
         const ys = this.ys[i], top = i * lane, mid = top + lane / 2;
         let low = Infinity, high = -Infinity;
@@ -377,8 +380,8 @@ export default {
         c.beginPath();
         for (let j = from; j < ys.length; j++) {
           // A gap in the clock of the toy is a gap in the line.
-          if (j === from || this.xs[j] - this.xs[j - 1] > 0.3) c.moveTo(x(this.xs[j]), y(ys[j]));
-          else c.lineTo(x(this.xs[j]), y(ys[j]));
+          if (j === from || xs[j] - xs[j - 1] > 0.3) c.moveTo(across[j], y(ys[j]));
+          else c.lineTo(across[j], y(ys[j]));
         }
         c.stroke();
         c.lineWidth = 1;
@@ -387,7 +390,7 @@ export default {
     drawStrip() {
       const { width, height } = this.stripAt, c = this.n.strip.getContext("2d"), k = this.ink, shift = height - STRIP;
       c.clearRect(0, 0, width, height);
-      const begin = this.t - this.stripS, x = (s) => ((s - begin) / this.stripS) * width;
+      const stripS = this.stripS, begin = this.t - stripS, x = (s) => ((s - begin) / stripS) * width;
       c.font = "12px sans-serif";
       c.textAlign = "center";
       for (let s = Math.ceil(Math.max(0, begin) / 10) * 10; s <= this.t; s += 10) {

@@ -18,7 +18,7 @@ from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.workspace import VIRTUAL, Workspace
 from plushsense.studio.pages.live import clips_page, feedback_page, validation_page
 from plushsense.studio.pages.live.clips import Clips
-from plushsense.studio.pages.live.feed import PACE_S, RATES_HZ, Feed, LiveView, follow
+from plushsense.studio.pages.live.feed import PACE_S, PLOT_HZ, RATES_HZ, Feed, LiveView, follow
 from plushsense.studio.pages.live.log import LogButtons
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.state import LiveChoice
@@ -125,8 +125,8 @@ class _Controls:
                 tag(self._reactions, "reactions")
                 engines = {"float": words("live.engine_float"), "int8": words("live.engine_int8")}
                 self._engine = tag(ui.select(engines, value=choice.engine, label=words("live.engine")), "engine")
-                self._add_rate("decision", lambda pace_s: setattr(feed, "decision_s", pace_s))
-                self._add_rate("plot", lambda pace_s: setattr(feed, "plot_s", pace_s))
+                self._add_rate("decision", RATES_HZ[-1], lambda pace_s: setattr(feed, "decision_s", pace_s))
+                self._add_rate("plot", PLOT_HZ, lambda pace_s: setattr(feed, "plot_s", pace_s))
             self._rates = ui.label("").classes("ps-dim ps-note")
             with ui.row().classes("w-full items-center ps-small-gap"):
                 self._look = button("look", words("live.look"), self._toys.search, "flat", icon="search")
@@ -147,12 +147,12 @@ class _Controls:
         self._toy = ui.select(options, value=first, label=label, with_input=True, new_value_mode="add-unique")
         tag(self._toy.props(f'hint="{self._page.words("live.toy_hint")}"'), "toy")
 
-    def _add_rate(self, name: str, choose: Callable[[float], None]) -> None:
-        """Add the choice of a rate at which this page displays something."""
+    def _add_rate(self, name: str, usual: int, choose: Callable[[float], None]) -> None:
+        """Add the choice of a rate at which this page displays something; ``usual`` is chosen at first."""
         words = self._page.words
         most = RATES_HZ[-1]
         rates = {n: words("live.rate", n=n) if n > 1 else words("live.rate_one") for n in RATES_HZ[::-1]}
-        field = ui.select(rates, value=most, label=words(f"live.rate_{name}"))
+        field = ui.select(rates, value=usual, label=words(f"live.rate_{name}"))
         tag(field, f"rate-{name}").on_value_change(lambda e: choose(PACE_S if e.value == most else 1.0 / e.value))
 
     async def _run(self, command: Callable[..., None], *args: Any) -> bool:

@@ -18,6 +18,8 @@ from plushsense.studio.widgets.elements import Plot, summary
 _WINDOW_S = 10.0
 # Figures that change faster cannot be read.
 _FIGURES_S = 0.5
+# The plots are drawn in every second tick of the page: their lines are most of what the browser draws in a session.
+_PLOTS_S = 0.15
 # Approximate maximum number of points to send to a plot at once.
 _MAX_POINTS = 12
 _SIGNAL_STYLES = {
@@ -55,7 +57,7 @@ class SignalPanel:
         rate = self._device.layout.rate_hz * max(1.0, session.request.speed)
         self._place = max(0, self._device.buffer.count - int(_WINDOW_S * rate))
         self._drawn_signal = ""
-        self._figures_s = -math.inf
+        self._figures_s = self._plotted_s = -math.inf
 
     def _build(self, speed: float) -> list[tuple[Plot, list[int]]]:
         words, kinds = self._page.words, dict[str, list[int]]()
@@ -104,7 +106,11 @@ class SignalPanel:
         self._counters.text = words("record.signal_more", **counts)
 
     def push(self) -> None:
-        """Append new samples to the plots."""
+        """Append new samples to the plots, at most every `_PLOTS_S`."""
+        now_s = time.monotonic()
+        if now_s - self._plotted_s < _PLOTS_S:
+            return
+        self._plotted_s = now_s
         samples = self._device.buffer.since(self._place)
         self._place = samples.end
         if not len(samples.seconds):
