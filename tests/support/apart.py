@@ -42,11 +42,11 @@ GROUPS = tuple(
         "tuning/test_gate.py",
         "workflow/test_demo.py workflow/test_estimator.py workflow/test_exchange.py",
         # Trainings in the process of the tests, 100 MB each time one is under way and afterwards.
-        "cli/test_adapt.py cli/test_main.py cli/test_stream_eval.py faults/test_interrupted.py"
-        " experiments/people/test_explanation.py experiments/people/test_merging.py experiments/people/test_people.py experiments/search/test_run.py"
-        " experiments/streams/test_training.py experiments/test_abstention_run.py training/fast/test_net.py"
-        " training/test_fit.py workflow/test_api.py workflow/test_calibration.py workflow/test_forget_beside.py"
-        " workflow/test_paper.py workflow/test_reporting.py workflow/test_resuming.py",
+        "cli/test_adapt.py cli/test_main.py cli/test_stream_eval.py experiments/people/test_explanation.py"
+        " experiments/people/test_merging.py experiments/people/test_people.py experiments/search/test_run.py"
+        " experiments/streams/test_training.py experiments/test_abstention_run.py faults/test_interrupted.py"
+        " training/fast/test_net.py training/test_fit.py workflow/test_api.py workflow/test_calibration.py"
+        " workflow/test_forget_beside.py workflow/test_paper.py workflow/test_reporting.py workflow/test_resuming.py",
     )
 )
 _GROUP_OF = {file: group for group in GROUPS for file in group}
