@@ -47,9 +47,9 @@ GROUPS = tuple(
         "cli/test_adapt.py cli/test_main.py cli/test_stream_eval.py experiments/people/test_explanation.py"
         " experiments/people/test_merging.py experiments/people/test_people.py experiments/search/test_run.py"
         " experiments/streams/test_training.py experiments/test_abstention_run.py faults/test_interrupted.py"
-        " models/test_net.py training/fast/test_net.py training/test_fit.py trials/test_budget.py trials/test_estimate.py"
-        " workflow/test_api.py workflow/test_calibration.py"
-        " workflow/test_forget_beside.py workflow/test_paper.py workflow/test_reporting.py workflow/test_resuming.py",
+        " models/test_net.py training/fast/test_net.py training/test_fit.py trials/test_budget.py"
+        " trials/test_estimate.py workflow/test_api.py workflow/test_calibration.py workflow/test_forget_beside.py"
+        " workflow/test_paper.py workflow/test_reporting.py workflow/test_resuming.py",
     )
 )
 _GROUP_OF = {file: group for group in GROUPS for file in group}
