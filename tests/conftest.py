@@ -111,7 +111,9 @@ def _dealt(items: list[pytest.Item], workers: int) -> list[pytest.Item]:
     parts: list[list[pytest.Item]] = [[] for _ in range(workers)]
     for at, name in enumerate([*longest, *waiting]):
         parts[at % workers] += files.pop(name)
-    rest = [item for tests in files.values() for item in tests]
+    # What runs in one process beside a worker is asked for by one worker, if it can be.
+    together = [name for group in apart.GROUPS for name in group if name in files]
+    rest = [item for name in dict.fromkeys([*together, *files]) for item in files[name]]
     for at, part in enumerate(parts):
         size = (len(items) - sum(map(len, parts[:at]))) // (workers - at)
         room = max(0, size - len(part))

@@ -18,6 +18,8 @@ from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.store import Dataset
+from support.sharing import built_once
+from support.trainings import train_apart
 
 ACCEL = load_layout("accel-3")
 GESTURES = {"Rest": 0.0, "Slow": 1.0, "Fast": 4.0}
@@ -103,9 +105,13 @@ def dataset(imported: Path, tmp_path: Path) -> Dataset:
 
 @pytest.fixture(scope="session")
 def bundle(imported: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    import plushsense as ps
+    """A bundle trained on ``imported``, by a process of its own and for all workers; never to be changed."""
 
-    folder = tmp_path_factory.mktemp("bundle")
-    made = shutil.copytree(imported, folder / "DS")
-    # With a patience there is no second training, on everybody, which takes time.
-    return ps.train(made, epochs=10, patience=10, filters=(4, 4, 4)).save(folder / "model.plush")
+    def train(draft: Path) -> None:
+        made = shutil.copytree(imported, draft / "DS")
+        # With a patience there is no second training, on everybody, which takes time.
+        (draft / "settings.toml").write_text("[training]\nepochs = 10\npatience = 10\n")
+        settings = ("--config", str(draft / "settings.toml"), "--filters", "4,4,4", "--force")
+        train_apart(made, draft / "model.plush", *settings)
+
+    return built_once(tmp_path_factory, "small-bundle", train) / "model.plush"
