@@ -92,7 +92,7 @@ class Apart:
             data, self.now_mb, self.peak_mb = self.channel.recv()
         except (EOFError, OSError):
             said = (
-                f"The process of {self.file.name} ended with status {self.process.wait()} (see tests/support/apart.py)."
+                f"The process of {item.path.name} ended with status {self.process.wait()} (see tests/support/apart.py)."
             )
             words: dict[str, Any] = dict.fromkeys(item.keywords, 1)
             return [pytest.TestReport(item.nodeid, item.location, words, "failed", said, "call")]
