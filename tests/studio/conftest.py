@@ -118,19 +118,18 @@ def look(chromium: Browser, profiles: dict[tuple[str, bool], list[BrowserContext
                 color_scheme="dark" if dark else "light",
             )
         )
-        one = Look(context, size, dark)
+        one = Look(context, size, dark, empty=list(context.pages))
         context.on("request", one.ask)
         made.append((one, None if own else (language, touch)))
         return one
 
     yield new
     for one, shared in made:
-        one.context.remove_listener("request", one.ask)
-        for page in one.context.pages:
-            page.close()
         if shared is None:
+            one.context.remove_listener("request", one.ask)
             one.context.close()
         else:
+            one.close()
             one.context.clear_cookies()
             profiles[shared].append(one.context)
         foreign = [u for u in one.asked if not is_own(u)]

@@ -143,7 +143,7 @@ def test_what_the_toy_feels_is_seen(studio: Fixture, look: Fixture, shots: Fixtu
         assert no_sideways(second)
         shots(second, f"live-{language}-{'dark' if dark else 'light'}")
         assert other.complaints == []
-        second.close()
+        other.leave(second)
     assert browser.complaints == []
 
 

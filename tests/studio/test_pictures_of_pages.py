@@ -16,7 +16,6 @@ from typing import Any
 
 import pytest
 
-import plushsense as ps
 from plushsense.studio.app.shell import PAGES
 from plushsense.studio.app.workspace import Workspace
 from support.browsing import DESK, LONG_MS, PHONE, TABLET, Look, Studio, axe, connected, english, marked
@@ -24,6 +23,7 @@ from support.recorded import record
 from support.recording_pages import begun, sat, showing
 from support.requirements import missing
 from support.sharing import built_once
+from support.trainings import evaluate_apart
 
 Fixture = Callable[..., Any]
 KEPT = os.environ.get("PLUSHSENSE_SHOTS", "")
@@ -174,7 +174,7 @@ def furnished(furniture: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
         record(Workspace(home), "S01")
         data = home / "datasets" / "virtual"
         out = data / "evaluations" / "by-subject-3"
-        ps.evaluate(data, split="by-subject:3", preset="loso", epochs=8 if KEPT else 1, workers=1, out=out)
+        evaluate_apart(data, out, "--split", "by-subject:3", "--preset", "loso", "--epochs", "8" if KEPT else "1")
 
     home = built_once(tmp_path_factory, "pictures", build) / "home"
     one = Studio(Path(shutil.copytree(home, tmp_path_factory.mktemp("pictures") / "home")), ("--speed", "4")).start()

@@ -56,7 +56,7 @@ def test_pages_open_without_complaint(empty: str, look: Fixture, shots: Fixture)
             assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{name} scrolls sideways"
             assert page.locator(".ps-bar [aria-current]").evaluate(_IN_VIEW), name
             shots(page, f"{name}-{language}-{'dark' if dark else 'light'}")
-            page.close()
+            browser.leave(page)
         assert browser.complaints == []
         # The icons are drawn, see `icons.js`: their font would be a third of a page.
         fonts = [url for url in browser.asked if url.endswith(".woff2")]
@@ -336,7 +336,7 @@ def test_no_name_runs_as_script(studio: Fixture, look: Fixture, tmp_path: Path) 
         page.wait_for_load_state("networkidle")
         assert page.locator("img[src=x]").count() == 0, path
         assert page.evaluate("window.ran") is None, path
-        page.close()
+        browser.leave(page)
     assert browser.complaints == []
     # Even where a name became HTML, the policy would keep it from running.
     page = browser.open(url)

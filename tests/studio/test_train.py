@@ -19,6 +19,7 @@ import pytest
 
 from support.browsing import LONG_MS, TABLET, axe, marked
 from support.sharing import built_once
+from support.trainings import evaluate_apart
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -168,10 +169,9 @@ def light(lighter: Path, furniture: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def leaky(light: Path) -> Path:
     """A light home that also holds an evaluation over windows."""
-    import plushsense as ps
-
     folder = light / "datasets" / "virtual"
-    ps.evaluate(folder, split="windows:2", preset="search", epochs=1, workers=1, out=folder / "evaluations" / "leaky")
+    out = folder / "evaluations" / "leaky"
+    evaluate_apart(folder, out, "--split", "windows:2", "--preset", "search", "--epochs", "1")
     return light
 
 

@@ -25,7 +25,8 @@ from urllib.parse import urlsplit
 from plushsense.studio.app.shell import PAGES
 
 if TYPE_CHECKING:
-    from playwright.sync_api import BrowserContext, Page, Request
+    from playwright.sync_api import BrowserContext, ConsoleMessage, Page, Request
+    from playwright.sync_api import Error as PageError
 
 T = TypeVar("T")
 TESTS = Path(__file__).parents[1]
@@ -166,26 +167,55 @@ class Look:
     dark: bool = False
     asked: list[str] = field(default_factory=list)
     complaints: list[str] = field(default_factory=list)
+    empty: list[Page] = field(default_factory=list)
+    """Tabs to open pages in; in a new tab, a new process of the browser takes almost twice as long to load a page."""
 
     def ask(self, request: Request) -> None:
         """Note what is asked for."""
         self.asked.append(request.url)
 
+    def _log(self, message: ConsoleMessage) -> None:
+        if message.type == "error" and message.text != _CLOSED:
+            self.complaints.append(message.text)
+
+    def _fail(self, error: PageError) -> None:
+        self.complaints.append(str(error))
+
     def open(self, url: str) -> Page:
-        """A new tab at this address, its connection to the studio standing."""
-        page = self.context.new_page()
+        """A tab at this address, its connection to the studio standing."""
+        page = self.empty.pop() if self.empty else self.context.new_page()
         page.set_viewport_size({"width": self.size[0], "height": self.size[1]})
-        page.emulate_media(color_scheme="dark" if self.dark else "light", reduced_motion="reduce")
+        page.emulate_media(color_scheme="dark" if self.dark else "light", reduced_motion="reduce", media="null")
         page.set_default_timeout(_WAIT_MS)
         # By default a wait looks at every frame, which keeps the browser drawing frames.
         setattr(page, "wait_for_function", functools.partial(page.wait_for_function, polling=_POLL_MS))  # noqa: B010
-        page.on(
-            "console", lambda m: self.complaints.append(m.text) if m.type == "error" and m.text != _CLOSED else None
-        )
-        page.on("pageerror", lambda e: self.complaints.append(str(e)))
+        page.on("console", self._log)
+        page.on("pageerror", self._fail)
         page.goto(url)
         connected(page)
         return page
+
+    def leave(self, page: Page) -> None:
+        """Empty a tab, as if it were closed; the next page is opened in it."""
+        page.remove_listener("console", self._log)
+        page.remove_listener("pageerror", self._fail)
+        page.evaluate("() => sessionStorage.clear()")
+        page.goto("about:blank")
+        self.empty.append(page)
+
+    def close(self) -> None:
+        """Leave one tab, and close the others."""
+        from playwright.sync_api import Error
+
+        self.context.remove_listener("request", self.ask)
+        pages = [page for page in self.context.pages if page not in self.empty]
+        for page in pages[1:] if not self.empty else pages:
+            page.close()
+        for page in pages[:1] if not self.empty else ():
+            try:
+                self.leave(page)
+            except Error:
+                page.close()
 
 
 def find_chromium() -> str | None:
