@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -37,15 +38,20 @@ def fill(page: Page, name: str, text: str) -> None:
 
 
 def choose(page: Page, name: str, text: str) -> None:
+    from playwright.sync_api import TimeoutError as TooSlow
+
     option = page.get_by_role("option", name=text).first
     for _ in range(100):
-        # A list closes when the form is drawn again meanwhile.
+        # A list closes when the form is drawn again meanwhile, also between a look at it and the click.
         if not page.get_by_role("listbox").count():
             page.locator(f'[data-test="{name}"]').locator("xpath=ancestor-or-self::label").click()
         if option.is_visible():
-            break
+            with contextlib.suppress(TooSlow):
+                option.click(timeout=2000)
+                break
         page.wait_for_timeout(100)
-    option.click()
+    else:
+        raise AssertionError(f"{text} cannot be chosen")
     page.locator(".q-menu").wait_for(state="detached")
 
 
