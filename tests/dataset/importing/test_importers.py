@@ -224,6 +224,6 @@ def test_a_simulation_stays_marked(tmp_path: Path) -> None:
     whole = import_recordings(tmp_path / "virtual", tmp_path / "DS", layout="plush-15")
     assert whole.dataset.head.simulated
     assert whole.rejected == []
-    assert "virtual toy" in whole.to_dict()["warnings"][0]
+    assert "are a simulation" in whole.to_dict()["warnings"][0]
     assert import_recordings(tmp_path / "virtual" / "P01", tmp_path / "DS1", layout="plush-15").dataset.head.simulated
     assert open_dataset(tmp_path / "DS").head.simulated
