@@ -7,6 +7,7 @@ of the process that also records.
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import io
 import ipaddress
@@ -319,6 +320,20 @@ def peer_of(client: str, server: str) -> str:
     return str(ipaddress.ip_network((address, 64), strict=False) if address.version == 6 else address)
 
 
+class _WriteWatch(asyncio.Protocol):
+    """Part of uvicorn's protocol classes: notes since when a client has not read what was sent."""
+
+    _blocked_since: float | None = None
+
+    def pause_writing(self) -> None:
+        self._blocked_since = time.monotonic()
+        super().pause_writing()
+
+    def resume_writing(self) -> None:
+        self._blocked_since = None
+        super().resume_writing()
+
+
 def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
     """Return a protocol class that enforces ``limits``, to pass to uvicorn as ``http``.
 
@@ -333,12 +348,11 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
         client, server = connection.client, connection.server
         return peer_of(client[0] if client else "?", server[0] if server else "")
 
-    class LimitedProtocol(H11Protocol):
+    class LimitedProtocol(_WriteWatch, H11Protocol):
         """An HTTP connection, until it is closed or upgraded to a websocket."""
 
         # By time.monotonic, because the clock of uvloop counts whole milliseconds.
         _idle_since = _data_at = 0.0
-        _blocked_since: float | None = None
         _timer: Any = None
 
         def __init__(self, *args: Any, **options: Any) -> None:
@@ -362,14 +376,6 @@ def limited_protocol(limits: ConnectionLimits) -> type[Any]:  # noqa: C901
         def data_received(self, data: bytes) -> None:
             self._data_at = time.monotonic()
             super().data_received(data)
-
-        def pause_writing(self) -> None:
-            self._blocked_since = time.monotonic()
-            super().pause_writing()
-
-        def resume_writing(self) -> None:
-            self._blocked_since = None
-            super().resume_writing()
 
         def on_response_complete(self) -> None:
             self._idle_since = time.monotonic()
@@ -431,10 +437,9 @@ def limited_websocket(limits: ConnectionLimits, base: Any) -> type[Any]:
     uvicorn's pings end such a connection too, but it stays open until the client has read everything that was sent.
     """
 
-    class LimitedWebSocket(base):  # type: ignore[misc]
-        """A websocket whose client reads something every ``limits.body_s``, and is gone that long after its end."""
+    class LimitedWebSocket(_WriteWatch, base):  # type: ignore[misc]
+        """A websocket that is aborted if its client reads nothing, or does not close it, for ``limits.body_s``."""
 
-        _blocked_since: float | None = None
         _closing = False
         _check: Any = None
 
@@ -445,14 +450,6 @@ def limited_websocket(limits: ConnectionLimits, base: Any) -> type[Any]:
         def connection_lost(self, exc: Exception | None) -> None:
             self._check.cancel()
             super().connection_lost(exc)
-
-        def pause_writing(self) -> None:
-            self._blocked_since = time.monotonic()
-            super().pause_writing()
-
-        def resume_writing(self) -> None:
-            self._blocked_since = None
-            super().resume_writing()
 
         def _expire(self) -> None:
             blocked = self._blocked_since is not None and time.monotonic() - self._blocked_since >= limits.body_s

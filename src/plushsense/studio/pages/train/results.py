@@ -92,7 +92,7 @@ _UNITS = {SUBJECTS: "people", FOLDS: "folds", TRAININGS: "trainings", HELD_BACK:
 _HASH = 6
 # Limits of results that are read: a folder of results may come from elsewhere.
 _MOST_BYTES, _MOST_LABELS, _LONGEST_TEXT, _LAST_S = 1 << 26, 256, 1000, 1e11
-_WRONG = (
+_READ_ERRORS = (
     OSError, KeyError, ValueError, TypeError, AttributeError, IndexError, RecursionError, OverflowError, csv.Error,
 )  # fmt: skip
 
@@ -147,24 +147,22 @@ class ResultRow:
     rest: float | None = None
     learning: dict[str, Any] | None = None
 
-
-def sound(row: ResultRow) -> ResultRow:
-    """Return the row; raise ValueError if a value that was read from a file has another type or range."""
-    people = dict(row.people)
-    texts = (row.data, row.network, row.schedule, row.split, row.context, row.seeds, *row.apart, *people)
-    shares = (row.accuracy, row.accuracy_sd, row.macro_f1, row.macro_f1_sd, row.rest, *people.values())
-    counts = (row.units, row.macs, row.classes, row.parameters - 1)
-    right = all(isinstance(text, str) and len(text) <= _LONGEST_TEXT for text in texts)
-    right &= all(value is None or (_is_number(value) and 0.0 <= value <= 1.0) for value in shares)
-    right &= all(isinstance(n, int) and 0 <= n < 1 << 53 for n in counts)
-    right &= 0.0 <= row.when_s < _LAST_S
-    right &= row.interval is None or (len(row.interval) == 2 and all(map(_is_number, row.interval)))
-    if row.learning is not None and row.learning.get("ci95") is not None:
-        low, high = row.learning["ci95"]
-        right &= all(map(_is_number, (low, high, row.learning["gain"]))) and isinstance(row.learning["more"], int)
-    if not right:
-        raise ValueError("a value of another type or range")
-    return replace(row, leaky=bool(row.leaky), simulated=bool(row.simulated))
+    def __post_init__(self) -> None:
+        """Raise ValueError if a value, which a file may have given, has another type or range."""
+        people = dict(self.people)
+        texts = (self.data, self.network, self.schedule, self.split, self.context, self.seeds, *self.apart, *people)
+        shares = (self.accuracy, self.accuracy_sd, self.macro_f1, self.macro_f1_sd, self.rest, *people.values())
+        counts = (self.units, self.macs, self.classes, self.parameters - 1)
+        right = all(isinstance(text, str) and len(text) <= _LONGEST_TEXT for text in texts)
+        right &= all(value is None or (_is_number(value) and 0.0 <= value <= 1.0) for value in shares)
+        right &= all(isinstance(n, int) and 0 <= n < 1 << 53 for n in counts)
+        right &= 0.0 <= self.when_s < _LAST_S
+        right &= self.interval is None or (len(self.interval) == 2 and all(map(_is_number, self.interval)))
+        if self.learning is not None and self.learning.get("ci95") is not None:
+            low, high = self.learning["ci95"]
+            right &= all(map(_is_number, (low, high, self.learning["gain"]))) and isinstance(self.learning["more"], int)
+        if not right:
+            raise ValueError("a value of another type or range")
 
 
 def _is_number(value: object) -> bool:
@@ -181,37 +179,35 @@ def of_evaluation(path: Path, dataset: Any) -> list[ResultRow]:
         context = f"{table['train_context']} → {context}"
     units = len(table[table["over"]])
     return [
-        sound(
-            ResultRow(
-                str(path.parent),
-                EVALUATION,
-                path.parent,
-                "",
-                str(dataset),
-                table["dataset"]["name"],
-                f"{model['symbol']} {'/'.join(map(str, model['filters']))} {model['padding']}",
-                f"{config['preset']}, {training['epochs']}",
-                table["split"],
-                context,
-                table["leaky"],
-                table["simulated"],
-                ", ".join(map(str, table["seeds"])),
-                SUBJECTS if table["over"] == SUBJECTS else FOLDS,
-                units,
-                table["accuracy"]["mean"],
-                table["accuracy"]["sd"],
-                table["macro_f1"]["mean"],
-                table["macro_f1"]["sd"],
-                model["parameters"],
-                model["macs_per_step"],
-                path.stat().st_mtime,
-                (str(table["dataset"]["hash"])[:_HASH], *(str(one["label"]) for one in table["per_class"])),
-                len(table["per_class"]),
-                None if table["accuracy"]["ci95"] is None else tuple(table["accuracy"]["ci95"]),
-                tuple((one["subject"], one["accuracy"]) for one in table["subjects"]),
-                _rest(table["nobody"], table["over"] == SUBJECTS),
-                table["learning"],
-            )
+        ResultRow(
+            str(path.parent),
+            EVALUATION,
+            path.parent,
+            "",
+            str(dataset),
+            table["dataset"]["name"],
+            f"{model['symbol']} {'/'.join(map(str, model['filters']))} {model['padding']}",
+            f"{config['preset']}, {training['epochs']}",
+            table["split"],
+            context,
+            bool(table["leaky"]),
+            bool(table["simulated"]),
+            ", ".join(map(str, table["seeds"])),
+            SUBJECTS if table["over"] == SUBJECTS else FOLDS,
+            units,
+            table["accuracy"]["mean"],
+            table["accuracy"]["sd"],
+            table["macro_f1"]["mean"],
+            table["macro_f1"]["sd"],
+            model["parameters"],
+            model["macs_per_step"],
+            path.stat().st_mtime,
+            (str(table["dataset"]["hash"])[:_HASH], *(str(one["label"]) for one in table["per_class"])),
+            len(table["per_class"]),
+            None if table["accuracy"]["ci95"] is None else tuple(table["accuracy"]["ci95"]),
+            tuple((one["subject"], one["accuracy"]) for one in table["subjects"]),
+            _rest(table["nobody"], table["over"] == SUBJECTS),
+            table["learning"],
         )
     ]
 
@@ -229,32 +225,30 @@ def of_trials(path: Path, dataset: Any) -> list[ResultRow]:
             if trial["status"] != "done" or not trial["accuracy"]:
                 continue
             rows.append(
-                sound(
-                    ResultRow(
-                        f"{folder}#{trial['trial']}",
-                        TRIAL,
-                        folder,
-                        trial["trial"],
-                        str(dataset),
-                        table["dataset"],
-                        f"{trial['arch']} {trial['filters']} {trial['padding']}",
-                        f"{table['preset']}, {trial['epochs']} ({trial['batch_asked']})",
-                        trial["split"],
-                        table["context"],
-                        trial["leaky"] == "true",
-                        trial["simulated"] == "true",
-                        seeds,
-                        *over_trainings(trial),
-                        float(trial["accuracy"]),
-                        _number(trial["accuracy_sd"]),
-                        _number(trial["macro_f1"]),
-                        _number(trial["macro_f1_sd"]),
-                        int(trial["parameters"]),
-                        int(trial["macs_per_step"]),
-                        when,
-                        apart,
-                        len(table["labels"]),
-                    )
+                ResultRow(
+                    f"{folder}#{trial['trial']}",
+                    TRIAL,
+                    folder,
+                    trial["trial"],
+                    str(dataset),
+                    table["dataset"],
+                    f"{trial['arch']} {trial['filters']} {trial['padding']}",
+                    f"{table['preset']}, {trial['epochs']} ({trial['batch_asked']})",
+                    trial["split"],
+                    table["context"],
+                    trial["leaky"] == "true",
+                    trial["simulated"] == "true",
+                    seeds,
+                    *over_trainings(trial),
+                    float(trial["accuracy"]),
+                    _number(trial["accuracy_sd"]),
+                    _number(trial["macro_f1"]),
+                    _number(trial["macro_f1_sd"]),
+                    int(trial["parameters"]),
+                    int(trial["macs_per_step"]),
+                    when,
+                    apart,
+                    len(table["labels"]),
                 )
             )
     return rows
@@ -274,34 +268,32 @@ def of_bundle(path: Path, known: Any) -> list[ResultRow]:
         context = f"{ANYWHERE} → stream"
     held_back = sorted(known_people(origin, ["validation_subjects"]))
     return [
-        sound(
-            ResultRow(
-                str(path),
-                TRAINING,
-                path,
-                "",
-                known.get(name, ""),
-                name,
-                f"{arch.symbol} {'/'.join(map(str, arch.filters))} {arch.padding}",
-                f"{origin.get('preset', '?')}, {training.get('epochs', '?')}",
-                split,
-                str(context),
-                bool(scores.get("leaky")),
-                bool(origin.get("simulated")),
-                str(training.get("seed", "?")),
-                # Unless whole people were held back, the network was trained on the people it was scored on.
-                *((HELD_BACK, len(held_back)) if split == WHOLE_PEOPLE else (TRAININGS, 1)),
-                scores.get("accuracy"),
-                None,
-                scores.get("macro_f1"),
-                None,
-                arch.parameters,
-                arch.macs_per_step,
-                path.stat().st_mtime,
-                (str(origin.get("dataset_hash", ""))[:_HASH], *bundle.gestures.labels, *held_back),
-                len(bundle.gestures),
-                rest=_rest(scores.get("nobody"), split == WHOLE_PEOPLE),
-            )
+        ResultRow(
+            str(path),
+            TRAINING,
+            path,
+            "",
+            known.get(name, ""),
+            name,
+            f"{arch.symbol} {'/'.join(map(str, arch.filters))} {arch.padding}",
+            f"{origin.get('preset', '?')}, {training.get('epochs', '?')}",
+            split,
+            str(context),
+            bool(scores.get("leaky")),
+            bool(origin.get("simulated")),
+            str(training.get("seed", "?")),
+            # Unless whole people were held back, the network was trained on the people it was scored on.
+            *((HELD_BACK, len(held_back)) if split == WHOLE_PEOPLE else (TRAININGS, 1)),
+            scores.get("accuracy"),
+            None,
+            scores.get("macro_f1"),
+            None,
+            arch.parameters,
+            arch.macs_per_step,
+            path.stat().st_mtime,
+            (str(origin.get("dataset_hash", ""))[:_HASH], *bundle.gestures.labels, *held_back),
+            len(bundle.gestures),
+            rest=_rest(scores.get("nobody"), split == WHOLE_PEOPLE),
         )
     ]
 
@@ -423,7 +415,7 @@ class StoredResults:
         """Read the details of a result; raise PlushSenseError if its files cannot be read."""
         try:
             return self._details(row)
-        except _WRONG as cause:
+        except _READ_ERRORS as cause:
             raise _unreadable(row.path / SCORES, cause) from None
 
     def _details(self, row: ResultRow) -> ResultDetails:
@@ -440,7 +432,7 @@ class StoredResults:
                 tuple(map(_scores_of_person, table["subjects"])),
                 (row.path / PREDICTIONS).is_file(),
                 facts={"code_version": table["code_version"], "hash": table["dataset"]["hash"]},
-                pooled=sound(replace(row, accuracy=table["pooled"]["accuracy"])).accuracy,
+                pooled=replace(row, accuracy=table["pooled"]["accuracy"]).accuracy,
             )
         if row.kind == TRIAL:
             table = read_json(self._inside(row.path / SWEEP))
@@ -533,7 +525,7 @@ class StoredResults:
         if cached is None or cached[0] != stamp:
             try:
                 cached = (stamp, read(self._inside(path), more))
-            except (PlushSenseError, *_WRONG) as cause:
+            except (PlushSenseError, *_READ_ERRORS) as cause:
                 if refuse:
                     raise cause if isinstance(cause, PlushSenseError) else _unreadable(path, cause) from None
                 cached = (stamp, None)
