@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.cli.output import emit, figure, say, spread, table, warn
-from plushsense.cli.settings import listed, marks, report_jobs, settings
+from plushsense.cli.settings import SIMULATION, listed, marks, report_jobs, settings
 from plushsense.core.errors import ConfigError
 from plushsense.workflow.reporting import name_of
 
@@ -159,7 +159,6 @@ def _baseline_lines(result: dict[str, Any]) -> list[str]:
     from plushsense.experiments.baselines.report import (
         COUNTS,
         LEAKY,
-        SIMULATION,
         describe_costs,
         describe_data,
         program_table,

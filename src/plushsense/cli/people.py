@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.cli.output import emit, figure, say, table, warn
-from plushsense.cli.settings import listed, marks, report_jobs, settings
+from plushsense.cli.settings import SIMULATION, listed, marks, report_jobs, settings
 
 
 def run_lens(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
     from plushsense.experiments.people.lens import PAGE, lens, lens_id
     from plushsense.experiments.people.report import (
-        SIMULATION,
         calibration_sentence,
         people_table,
         split_table,
@@ -48,7 +47,7 @@ def run_lens(args: argparse.Namespace) -> int:
 
 def run_compare(args: argparse.Namespace) -> int:
     from plushsense.experiments.people.comparison import PAGE, compare
-    from plushsense.experiments.people.report import SIMULATION, model_table, pair_table
+    from plushsense.experiments.people.report import model_table, pair_table
 
     result = compare(args.evaluations, out=args.out, overwrite=args.force)
     if args.out:
@@ -124,7 +123,7 @@ def _grouping_lines(result: dict[str, Any]) -> list[str]:
 def run_explain(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
     from plushsense.experiments.people.explanation import PAGE, explain, explain_id
-    from plushsense.experiments.people.explanation_report import SIMULATION, TRAINED_ON, gesture_table
+    from plushsense.experiments.people.explanation_report import SIMULATED_PEOPLE, TRAINED_ON, gesture_table
     from plushsense.models.bundle import Bundle
 
     bundle, dataset = Bundle.load(args.bundle), open_dataset(args.dataset)
@@ -134,7 +133,7 @@ def run_explain(args: argparse.Namespace) -> int:
     result = explain(bundle, dataset, gestures=gestures, out=out, overwrite=args.force, warn=warn)
     result |= {"out": str(out), "report": str(out / PAGE)}
     say(f"written: {out}")
-    lines = [SIMULATION, ""] if result["simulated"] else []
+    lines = [SIMULATED_PEOPLE, ""] if result["simulated"] else []
     lines += [TRAINED_ON, ""] if result["trained_on"] else []
     lines += [
         gesture_table(result).text(),

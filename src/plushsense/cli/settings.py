@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from plushsense.jobs.progress import JobProgress
     from plushsense.workflow.config import RunConfig
 
+SIMULATION = "SIMULATION: these scores say nothing about a real toy."
+
 
 def listed(*values: str) -> list[str]:
     """Split the values of an option that accepts lists such as ``A,B`` and may be given several times."""
@@ -37,7 +39,7 @@ def marks(result: Mapping[str, Any]) -> list[str]:
     """Return the notices to print above scores if they come from simulated data or a leaky split."""
     notices = []
     if result["simulated"]:
-        notices.append("SIMULATION: these scores say nothing about a real toy.")
+        notices.append(SIMULATION)
     if result["leaky"]:
         notices.append("LEAKY: windows of one recording are on both sides of this split; the scores are too high.")
     return notices

@@ -15,7 +15,6 @@ from plushsense.scoring.metrics import column_metrics
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SIMULATION = "SIMULATION: these scores say nothing about a real toy."
 COUNTS = (
     "Only the number by person counts: in the leaky split overlapping windows of one recording, and recordings of one "
     "person, stand on both sides, so that a program is paid for recognising what it has already seen, while whoever "

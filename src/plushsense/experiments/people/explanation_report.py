@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SIMULATION = "SIMULATION: the people are virtual; what decided for them says nothing about a real toy."
+SIMULATED_PEOPLE = "SIMULATION: the people are virtual; what decided for them says nothing about a real toy."
 TRAINED_ON = "TRAINED ON: the bundle was trained on everybody in this data set."
 # Okabe and Ito's colours; line styles differ as well.
 _AXES = (("#0072b2", "-"), ("#d55e00", "-"), ("#009e73", "-"))

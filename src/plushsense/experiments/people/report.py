@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SIMULATION = "SIMULATION: these scores say nothing about a real toy."
 # Okabe and Ito's blue and vermillion; markers show the same difference without colour.
 _HONEST, _LEAKY = "#0072b2", "#d55e00"
 _GREY = "#999999"
