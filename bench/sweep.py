@@ -308,6 +308,8 @@ def gpu(args: argparse.Namespace) -> None:
     say = partial(print, file=sys.stderr if args.json else sys.stdout, flush=True)
     archs = sorted(networks(filters), key=lambda arch: arch.macs_per_window, reverse=True)
     card, rows, until = OnGpu(), list[dict[str, Any]](), time.monotonic() + args.seconds
+    name = torch.cuda.get_device_name()
+    say(f"{name}, {platform.machine()}, torch {torch.__version__}; ms for an epoch of {WINDOWS} windows")
     for arch in archs:
         for batch in batches:
             row: dict[str, Any] = {"network": named(arch), "batch": batch, "gpu_s": None}
@@ -317,31 +319,34 @@ def gpu(args: argparse.Namespace) -> None:
                     row["gpu_s"] = card.epoch_s(arch, batch)
                 except RuntimeError as cause:
                     row["failed"] = str(cause).splitlines()[0]
-                    say(f"{named(arch)}, batch {batch}: {row['failed']}")
-    name, cores = torch.cuda.get_device_name(), sorted({2, args.cores}, reverse=True)
-    for count in cores:
-        found = on_processor(archs, count, say)
+                took = row.get("failed") or f"{1e3 * row['gpu_s']:9.1f}"
+                say(f"{named(arch):38s} {batch:5d} {took}")
+    sums = epoch_sums(rows, ["gpu_s"], say)
+    for cores in sorted({2, args.cores}, reverse=True):
+        found = on_processor(archs, cores, say)
         for row in rows:
-            row[f"cores_{count}_s"] = found.get((row["network"], row["batch"]))
-    say(f"{name}, {platform.machine()}, torch {torch.__version__}; ms for an epoch of {WINDOWS} windows")
-    say(f"{'network':38s} {'batch':>5s} {'card':>9s} " + " ".join(f"{f'{count} cores':>9s}" for count in cores))
-    keys = ["gpu_s", *(f"cores_{count}_s" for count in cores)]
-    timed = [row for row in rows if all(row[key] is not None for key in keys)]
-    for row in timed:
-        say(f"{row['network']:38s} {row['batch']:5d} " + " ".join(f"{1e3 * row[key]:9.1f}" for key in keys))
-    hours = {key.removesuffix("_s"): sum(row[key] for row in timed) * NESTED / 3600 for key in keys}
-    of_batch = {
-        batch: {key.removesuffix("_s"): sum(row[key] for row in timed if row["batch"] == batch) for key in keys}
-        for batch in batches
-    }
-    for batch, sums in of_batch.items():
-        say(f"an epoch of all with a batch of {batch}: " + ", ".join(f"{key} {s:.2f} s" for key, s in sums.items()))
-    say(
-        f"hours for {3 * len(timed)} of {3 * len(rows)} trials, nested: "
-        + ", ".join(f"{key} {h:.2f}" for key, h in hours.items())
-    )
+            row[f"cores_{cores}_s"] = found.get((row["network"], row["batch"]))
+        sums = epoch_sums(rows, ["gpu_s", f"cores_{cores}_s"], say) | sums
     if args.json:
-        print(json.dumps({"card": name, "rows": rows, "timed": len(timed), "hours": hours, "epoch_s": of_batch}))
+        print(json.dumps({"card": name, "rows": rows, "sums": sums}))
+
+
+def epoch_sums(rows: list[dict[str, Any]], keys: list[str], say: Callable[[str], None]) -> dict[str, Any]:
+    """Sum up the epochs of the networks that were timed on the card, by batch, and the hours of the nested grid."""
+    timed = [row for row in rows if row["gpu_s"] is not None and row.get(keys[-1]) is not None]
+    sums: dict[str, Any] = {}
+    for key in keys:
+        by_batch = dict.fromkeys((row["batch"] for row in rows), 0.0)
+        for row in timed:
+            by_batch[row["batch"]] += row[key]
+        whole = sum(by_batch.values())
+        sums[key] = {"timed": len(timed), "of": len(rows), "epoch_s": by_batch, "hours": whole * NESTED / 3600}
+        parts = ", ".join(f"{s:.2f} s with {batch}" for batch, s in by_batch.items())
+        say(
+            f"{key}: an epoch of {len(timed)} of {len(rows)} trainings takes {whole:.2f} s ({parts}); "
+            f"{NESTED} epochs {whole * NESTED / 3600:.2f} h"
+        )
+    return sums
 
 
 def data(path: str) -> tuple[Tensor, Tensor, Any]:
