@@ -6,7 +6,12 @@ The settings are chosen on the people P01 to P14 alone: by-subject:5, the shared
 the other people are not read, except with --everybody, for the rows of the self-calibration. Each seed trains five
 networks. OUT holds the data set of these people and the finished folds, so that a stopped run can be continued, and
 networks that several rows share. A row of three seeds takes about three minutes on two cores, all of them about two
-hours. The row "ceiling" needs the extra "rocket".
+hours. The row "ceiling" needs the extra "rocket". To measure on many cores, import the recordings once and run one
+process for each row and seed, each with a folder OUT of its own (examples of rows and seeds):
+
+    plushsense import ../shared/data/makeability-gestures DS --layout accel-3
+    echo "kept 0 kept 1 both-states 0 both-states 1" | xargs -n 2 -P 4 sh -c 'python bench/people.py DS "OUT/$0-$1" \
+        --everybody --rows "$0" --seeds "$1" --workers 1 --json > "$0-$1.json"'
 """
 
 from __future__ import annotations
@@ -16,7 +21,7 @@ import json
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -47,8 +52,12 @@ from plushsense.training.augment import Channels, augmentations
 from plushsense.training.engine import Adam, slices, torch_threads
 from plushsense.training.fit import fit, predict
 from plushsense.training.spec import TrainSpec
+from plushsense.windows import cut
+from plushsense.windows.calibration import SelfCalibration
+from plushsense.windows.clock import Segment
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler
+from plushsense.windows.sessions import SessionReader
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.preparation import classes_for, network_inputs_of, windows_for
 
@@ -288,7 +297,8 @@ class Row:
 
     ``seeds``: the most that are measured; ``parameters``: where they are not those of the one network;
     ``calibrated``: whether the accelerometer calibrates itself; ``regained``: whether each person's readings have
-    another gain and offset (`Regained`).
+    another gain and offset (`Regained`); ``both_states``: whether each training window is read twice, in the causal
+    state of the self-calibration and in that of `WholeSessions`.
     """
 
     title: str
@@ -299,6 +309,7 @@ class Row:
     parameters: int | None = None
     calibrated: bool = False
     regained: bool = False
+    both_states: bool = False
 
 
 GAIN, TILT, SPEED = "random-gain:0.3", "random-tilt:8", "random-speed:0.2"
@@ -347,6 +358,10 @@ ROWS: dict[str, Row] = {
     "calibrated": Row("self-calibration", calibrated=True),
     "regained": Row("  each person's readings with another gain and offset", calibrated=True, regained=True),
     "uncalibrated": Row("  the same without self-calibration", regained=True),
+    "both-states": Row("self-calibration, training windows in two states", calibrated=True, both_states=True),
+    "both-regained": Row(
+        "  each person's readings with another gain and offset", calibrated=True, regained=True, both_states=True
+    ),
 }
 
 
@@ -378,6 +393,27 @@ class Regained(Dataset):
         return Regained(self.path, replace(self.head, layout=layout), self.recordings, self.streams)
 
 
+class WholeSessions(SessionReader):
+    """Reads a session in the state that it gives as a whole: from its beginning, once more after it was read once."""
+
+    def initial_state(self, session: Iterable[Segment]) -> SelfCalibration:
+        state = super().initial_state(())
+        for segment in session:
+            state.apply(segment.data)
+        return state
+
+
+@contextmanager
+def whole_sessions() -> Iterator[None]:
+    """Cut windows with `WholeSessions`, which is not causal: windows to train on only."""
+    before = cut.SessionReader
+    cut.SessionReader = WholeSessions  # type: ignore[misc]
+    try:
+        yield
+    finally:
+        cut.SessionReader = before  # type: ignore[misc]
+
+
 @dataclass(frozen=True)
 class FoldWork:
     """The work of one fold, with one of `VARIANTS`."""
@@ -405,7 +441,7 @@ def gravity_over(seconds: float) -> Iterator[None]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("source", type=Path, help="folder of makeability-gestures")
+    parser.add_argument("source", type=Path, help="folder of makeability-gestures, or with --everybody its data set")
     parser.add_argument("out", type=Path, help="folder for the data set and the finished folds")
     parser.add_argument("--rows", default=",".join(ROWS), help="rows to measure (all)")
     parser.add_argument("--seeds", default="0,1,2")
@@ -430,7 +466,9 @@ def main() -> None:
 
 
 def chosen_people(source: Path, out: Path, everybody: bool = False) -> Dataset:
-    """Import the recordings of `PEOPLE` alone, or of all people, once."""
+    """Import the recordings of `PEOPLE` alone, or of all people, once; a data set of all people is opened."""
+    if everybody and (source / HEAD).is_file():
+        return ps.open_dataset(source)
     folder = out / ("everybody" if everybody else "dataset")
     if everybody and not (folder / HEAD).is_file():
         ps.import_recordings(source, folder, layout="accel-3")
@@ -443,7 +481,7 @@ def chosen_people(source: Path, out: Path, everybody: bool = False) -> Dataset:
 
 
 def measured(row: Row, dataset: Dataset, seeds: list[int], args: argparse.Namespace) -> dict[str, Any]:
-    """Return mean and spread over the seeds, of the means over the people."""
+    """Return mean and spread over the seeds, of the means over the people, and the accuracies of each person."""
     with gravity_over(row.gravity_s):
         runs = [evaluated(row, dataset, seed, args) for seed in seeds[: row.seeds]]
     scores: dict[str, Any] = {"parameters": runs[0][1], "seeds": seeds[: row.seeds]}
@@ -451,7 +489,11 @@ def measured(row: Row, dataset: Dataset, seeds: list[int], args: argparse.Namesp
         means = [table[key]["mean"] for table, _ in runs]
         scores[key] = {"mean": fmean(means), "sd": stdev(means) if len(means) > 1 else None, "runs": means}
     by_recording = [table["by_recording"]["accuracy"] for table, _ in runs]
-    return scores | {"by_recording": fmean(by_recording)}
+    people: dict[str, list[float]] = {one["subject"]: [] for one in runs[0][0]["subjects"]}
+    for table, _ in runs:
+        for one in table["subjects"]:
+            people[one["subject"]].append(one["accuracy"])
+    return scores | {"by_recording": fmean(by_recording), "people": people}
 
 
 def evaluated(row: Row, dataset: Dataset, seed: int, args: argparse.Namespace) -> tuple[dict[str, Any], int]:
@@ -466,8 +508,12 @@ def evaluated(row: Row, dataset: Dataset, seed: int, args: argparse.Namespace) -
     gestures = classes_for(read, config.evaluation.classes, config.windows.context)
     arch = config.model.build(read.layout, len(gestures), config.windows.window_s, config.padding)
     windows = windows_for(read, arch, config.windows, gestures)
+    train = windows
+    if row.both_states:
+        with whole_sessions():
+            train = windows.joined(windows_for(read, arch, config.windows, gestures))
     done = evaluate(
-        windows,
+        train,
         windows,
         SPLIT,
         FoldWork(arch, config.training, row.variant, Journal(args.out / "networks")),

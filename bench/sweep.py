@@ -3,6 +3,7 @@
     python bench/sweep.py steps [--cores 1] [--filters 0,1,2,3] [--batches 64,256,3936] [--repeats 5] [--json]
     python bench/sweep.py losses DATASET        first 50 steps of all 52 networks, from the same weights and batches
     python bench/sweep.py trials DATASET        20 paired trainings: are the final accuracies different?
+    python bench/sweep.py gpu [--cores 1] [--seconds 60] [--json]
 
 The plain loop is a careful standard implementation: nn.Conv1d, nn.ReLU, nn.BatchNorm1d, F.pad with reflection, the data
 in memory as one tensor, fused Adam, no value read out within an epoch, one training at a time. Both are timed in turn,
@@ -11,6 +12,11 @@ taken. On several cores, the plain loop runs one training with that many threads
 by side, as a sweep does, and the wall clock is taken. The fastest step of each is used, because other programs on the
 machine can only slow it down. The grid has 52 networks ×
 batch 64, 256, full × 100, 250 and 1000 epochs; trained separately these are 1350 epochs, nested 1000.
+
+``gpu`` times the same networks and batches on a graphics card with CUDA, one training alone, as `fit` trains there, and
+beside it ours on ``--cores`` and on two cores. The card gets ``--seconds``, the largest networks first; networks for
+which no time is left are missing in both sums. On the processor, only batches of 64 and 256 are timed for all networks:
+a full batch is computed in chunks and taken as so many times one of 256, which is checked with every ninth network.
 """
 
 import argparse
@@ -21,9 +27,12 @@ import multiprocessing
 import platform
 import sys
 import time
+from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -34,8 +43,10 @@ from torch.nn import functional as F
 import plushsense as ps
 from plushsense.models.arch import PAPER_ARCHITECTURES, PAPER_FILTERS, Arch
 from plushsense.models.net import Net
-from plushsense.training.engine import Adam
+from plushsense.training import fit as training
+from plushsense.training.engine import Adam, Windows, engine, repeatable
 from plushsense.training.fast.net import FastNet
+from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSpec
 
 WINDOWS, CHANNELS, CLASSES, SAMPLES = 3936, 11, 18, 250
@@ -186,6 +197,10 @@ class Beside:
         self.all(steps)
         return (time.perf_counter() - began) / (steps * len(self.pipes))
 
+    def close(self) -> None:
+        for pipe in self.pipes:
+            pipe.send(None)
+
 
 def steps(args: argparse.Namespace) -> None:
     filters, batches = [int(i) for i in args.filters.split(",")], [int(b) for b in args.batches.split(",")]
@@ -233,8 +248,7 @@ def steps(args: argparse.Namespace) -> None:
                 f"{loops.fast.plan.bytes / 1e6:6.0f}",
             )
     if beside is not None:
-        for pipe in beside.pipes:
-            pipe.send(None)
+        beside.close()
     hours = {"plain": plain_s * APART / 3600, "ours": ours_s * NESTED / 3600}
     if args.json:
         print(json.dumps({"rows": rows, "step_ratio": plain_s / ours_s, "hours": hours}))
@@ -244,6 +258,95 @@ def steps(args: argparse.Namespace) -> None:
     print(f"nested epochs (1350 → 1000):         {APART / NESTED:.2f} times less")
     print(f"the whole grid:                      {hours['plain'] / hours['ours']:.2f} times less")
     print(f"in hours: plain {hours['plain']:.1f}, ours {hours['ours']:.1f}")
+
+
+class OnGpu:
+    """Trains networks on random windows on the graphics card, one after the other."""
+
+    def __init__(self) -> None:
+        if not torch.cuda.is_available():
+            raise SystemExit("There is no graphics card with CUDA.")
+        self._device = torch.device("cuda")
+        x, y = noise()
+        any_network = Arch.parse("1", "1", channels=CHANNELS, classes=CLASSES, padding="mirror")
+        self._x, self._y = Windows(x.numpy(), any_network, self._device), y.to(self._device)
+
+    def epoch_s(self, arch: Arch, batch: int, most_s: float = 0.5) -> float:
+        """Return the median time of an epoch, without the first; two to five epochs are trained."""
+        torch.manual_seed(0)
+        net, order = engine(arch, Net(arch), self._device, batch, 1), torch.Generator().manual_seed(2)
+        adam, spec, took = Adam(net.parameters, fused=True), TrainSpec(batch=batch, device="cuda"), list[float]()
+        with closing(net), repeatable():
+            while len(took) < 2 or (len(took) < 5 and sum(took) < most_s):
+                began = time.perf_counter()
+                # It ends with reading the loss, so it waits for the card.
+                training._train(net, adam, RATE, self._x, self._y, spec, order, None, None)
+                took.append(time.perf_counter() - began)
+        return median(took[1:])
+
+
+def on_processor(archs: list[Arch], cores: int, say: Callable[[str], None]) -> dict[tuple[str, int], float]:
+    """Return the time of an epoch by network and batch: of one of ``cores`` trainings side by side, over ``cores``."""
+    beside, took, checked = Beside(cores), dict[tuple[str, int], float](), list[float]()
+    for n, arch in enumerate(archs):
+        for batch in (64, 256, *([] if n % 9 else [WINDOWS])):
+            beside.all((arch, batch))
+            if batch < WINDOWS:
+                beside.all(1)
+            took[named(arch), batch] = beside.step_s(1 + (batch == 64)) * WINDOWS / batch
+        full, parts = took.get((named(arch), WINDOWS)), took[named(arch), 256]
+        if full is not None:
+            checked.append(full / parts)
+        took[named(arch), WINDOWS] = parts if full is None else full
+    beside.close()
+    say(f"{cores} cores: a full batch takes {min(checked):.2f} to {max(checked):.2f} times 15.4 batches of 256")
+    return took
+
+
+def gpu(args: argparse.Namespace) -> None:
+    filters, batches = [int(i) for i in args.filters.split(",")], [int(b) for b in args.batches.split(",")]
+    say = partial(print, file=sys.stderr if args.json else sys.stdout, flush=True)
+    archs = sorted(networks(filters), key=lambda arch: arch.macs_per_window, reverse=True)
+    card, rows, until = OnGpu(), list[dict[str, Any]](), time.monotonic() + args.seconds
+    name = torch.cuda.get_device_name()
+    say(f"{name}, {platform.machine()}, torch {torch.__version__}; ms for an epoch of {WINDOWS} windows")
+    for arch in archs:
+        for batch in batches:
+            row: dict[str, Any] = {"network": named(arch), "batch": batch, "gpu_s": None}
+            rows.append(row)
+            if time.monotonic() < until:
+                try:
+                    row["gpu_s"] = card.epoch_s(arch, batch)
+                except RuntimeError as cause:
+                    row["failed"] = str(cause).splitlines()[0]
+                took = row.get("failed") or f"{1e3 * row['gpu_s']:9.1f}"
+                say(f"{named(arch):38s} {batch:5d} {took}")
+    sums = epoch_sums(rows, ["gpu_s"], say)
+    for cores in sorted({2, args.cores}, reverse=True):
+        found = on_processor(archs, cores, say)
+        for row in rows:
+            row[f"cores_{cores}_s"] = found.get((row["network"], row["batch"]))
+        sums = epoch_sums(rows, ["gpu_s", f"cores_{cores}_s"], say) | sums
+    if args.json:
+        print(json.dumps({"card": name, "rows": rows, "sums": sums}))
+
+
+def epoch_sums(rows: list[dict[str, Any]], keys: list[str], say: Callable[[str], None]) -> dict[str, Any]:
+    """Sum up the epochs of the networks that were timed on the card, by batch, and the hours of the nested grid."""
+    timed = [row for row in rows if row["gpu_s"] is not None and row.get(keys[-1]) is not None]
+    sums: dict[str, Any] = {}
+    for key in keys:
+        by_batch = dict.fromkeys((row["batch"] for row in rows), 0.0)
+        for row in timed:
+            by_batch[row["batch"]] += row[key]
+        whole = sum(by_batch.values())
+        sums[key] = {"timed": len(timed), "of": len(rows), "epoch_s": by_batch, "hours": whole * NESTED / 3600}
+        parts = ", ".join(f"{s:.2f} s with {batch}" for batch, s in by_batch.items())
+        say(
+            f"{key}: an epoch of {len(timed)} of {len(rows)} trainings takes {whole:.2f} s ({parts}); "
+            f"{NESTED} epochs {whole * NESTED / 3600:.2f} h"
+        )
+    return sums
 
 
 def data(path: str) -> tuple[Tensor, Tensor, Any]:
@@ -333,18 +436,19 @@ def trials(args: argparse.Namespace) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("steps", "losses", "trials"))
+    parser.add_argument("what", choices=("steps", "losses", "trials", "gpu"))
     parser.add_argument("dataset", nargs="?", help="for losses and trials")
-    parser.add_argument("--cores", type=int, default=1, help="for steps: see above")
+    parser.add_argument("--cores", type=int, default=1, help="for steps and gpu: see above")
+    parser.add_argument("--seconds", type=float, default=60.0, help="for gpu: time of the card")
     parser.add_argument("--filters", default="0,1,2,3", help="the paper's filter sets to include: 0 (smallest) to 3")
     parser.add_argument("--batches", default="64,256,3936")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--epochs", type=int, default=30)
-    parser.add_argument("--json", action="store_true", help="for steps: one JSON object")
+    parser.add_argument("--json", action="store_true", help="for steps and gpu: one JSON object")
     args = parser.parse_args()
-    if args.what != "steps" and not args.dataset:
+    if args.what in ("losses", "trials") and not args.dataset:
         parser.error(f"{args.what} needs a data set")
-    {"steps": steps, "losses": losses, "trials": trials}[args.what](args)
+    {"steps": steps, "losses": losses, "trials": trials, "gpu": gpu}[args.what](args)
     return 0
 
 

@@ -4,7 +4,8 @@ Training starts from the weights of such a network. Architectures that ``trainin
 ``training/engine``) are also trained with it.
 
 Activations are (N, C, 1, T) with the channels last in memory: on a CPU, a training step then takes 0.5 to 0.75 of the
-time that it takes with Conv1d on (N, C, T), measured with kernels of 14 to 126 taps.
+time that it takes with Conv1d on (N, C, T), measured with kernels of 14 to 126 taps. On a GPU, it lets PyTorch use
+cuDNN for dilated convolutions that must be repeatable; with other orders it computes them window by window.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 MOMENTUM = 0.1  # of running means and variances
+FORMAT = torch.channels_last
 
 
 def _mirrored(x: Tensor, left: int) -> Tensor:
@@ -37,7 +39,7 @@ def _mirrored(x: Tensor, left: int) -> Tensor:
         some = min(left, x.shape[3] - 1)
         x = torch.cat([x[..., 1 : some + 1].flip(3), x], dim=3)
         left -= some
-    return x.contiguous(memory_format=torch.channels_last)
+    return x.contiguous(memory_format=FORMAT)
 
 
 class _Block(nn.Module):
@@ -139,7 +141,7 @@ class Net(nn.Module):
         z = x[:, :, x.shape[2] - self.arch.span :]
         if self.vectors is not None:
             z = self.vectors(z)
-        z = z.unsqueeze(2).contiguous(memory_format=torch.channels_last)
+        z = z.unsqueeze(2).contiguous(memory_format=FORMAT)
         for block in self.blocks:
             z = block(z)
         return cast(Tensor, self.dense(z.mean(dim=(2, 3))))

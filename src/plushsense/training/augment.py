@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 # Returns changed copies of scaled windows (N, C, T), drawing its random numbers from the generator. The generator is on
-# the CPU, the windows are on `Channels.device`.
+# the CPU, the windows are on `Channels.device`; random numbers are copied there without waiting (non_blocking).
 Transform = Callable[["Tensor", "torch.Generator"], "Tensor"]
 
 
@@ -36,6 +36,12 @@ class Channels:
     scaler: Scaler
     device: torch.device
     has_gravity: bool = False
+
+    def index(self, channels: Sequence[int]) -> Tensor:
+        """Return channels as an index on the device; with a list, the CPU would wait for a GPU in every batch."""
+        import torch
+
+        return torch.tensor(channels, device=self.device)
 
     def scaling(self, channels: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Return offset and scale (n, 1) of some channels: scaled = (raw - offset) * scale."""
@@ -59,14 +65,12 @@ def random_rotation(degrees: float, channels: Channels) -> Transform | None:
     Args:
         degrees: standard deviation of the angle, which is normally distributed.
     """
-    import torch
-
     if not channels.vectors:
         return None
-    vectors = [(torch.tensor(axes, device=channels.device), *channels.scaling(axes)) for axes in channels.vectors]
+    vectors = [(channels.index(axes), *channels.scaling(axes)) for axes in channels.vectors]
 
     def rotate(x: Tensor, random: torch.Generator) -> Tensor:
-        matrices = rotations(len(x), degrees, random).to(x.device)
+        matrices = rotations(len(x), degrees, random).to(x.device, non_blocking=True)
         out = x.clone()
         for axes, offset, scale in vectors:
             raw = x[:, axes] / scale + offset
@@ -84,12 +88,12 @@ def random_gain(share: float, channels: Channels) -> Transform | None:
     """
     if not channels.has_gravity:
         return None
-    acceleration, *others, gravity = (list(axes) for axes in channels.vectors)
-    offset, scale = channels.scaling(acceleration)
-    gravity_offset, gravity_scale = channels.scaling(gravity)
+    offset, scale = channels.scaling(channels.vectors[0])
+    gravity_offset, gravity_scale = channels.scaling(channels.vectors[-1])
+    acceleration, *others, gravity = map(channels.index, channels.vectors)
 
     def strengthen(x: Tensor, random: torch.Generator) -> Tensor:
-        factor = _factors(len(x), share, random).to(x.device)[:, None, None]
+        factor = _factors(len(x), share, random).to(x.device, non_blocking=True)[:, None, None]
         out = x.clone()
         rest = (x[:, gravity] / gravity_scale + gravity_offset) / (1 << GRAVITY_FRACTION_BITS)
         raw = x[:, acceleration] / scale + offset
@@ -111,11 +115,11 @@ def random_tilt(degrees: float, channels: Channels) -> Transform | None:
     """
     if not channels.has_gravity:
         return None
-    axes = list(channels.vectors[-1])
+    axes = channels.index(channels.vectors[-1])
 
     def tilt(x: Tensor, random: torch.Generator) -> Tensor:
         out = x.clone()
-        out[:, axes] = rotations(len(x), degrees, random).to(x.device) @ x[:, axes]
+        out[:, axes] = rotations(len(x), degrees, random).to(x.device, non_blocking=True) @ x[:, axes]
         return out
 
     return tilt
@@ -131,7 +135,7 @@ def random_speed(share: float, channels: Channels) -> Transform | None:
 
     def warp(x: Tensor, random: torch.Generator) -> Tensor:
         last = x.shape[2] - 1
-        speed = _factors(len(x), share, random).to(x.device)
+        speed = _factors(len(x), share, random).to(x.device, non_blocking=True)
         back = torch.arange(last, -1, -1, device=x.device)
         at = (last - back * speed[:, None]).abs().clamp_max(last)
         before = at.floor().long().clamp_max(max(last - 1, 0))

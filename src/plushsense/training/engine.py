@@ -8,7 +8,8 @@ PyTorch's layers and gradients for everything else: layer normalisation, ``causa
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -123,11 +124,46 @@ def step_bytes(arch: Arch, spec: TrainSpec) -> int | None:
     return plan_net(arch.trunk, spec.batch).bytes + vectors
 
 
-class Plain:
-    """Training with PyTorch's layers and autograd."""
+# Batches on a GPU up to this size are captured: for larger ones, launching kernels costs little, and memory is kept.
+_CAPTURED_BATCH = 512
+# Steps before one is captured, in which libraries choose their kernels and allocate their memory.
+_WARM_STEPS = 3
 
-    def __init__(self, net: Net, device: torch.device) -> None:
+
+class CapturedStep:
+    """A step on a GPU, captured as a CUDA graph for one batch size: all its kernels are launched at once."""
+
+    def __init__(
+        self, compute: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], net: Net, windows: Tensor, y: Tensor
+    ) -> None:
+        self._windows, self._y, self._parameters = windows.clone(), y.clone(), list(net.parameters())
+        self._graph = torch.cuda.CUDAGraph()
+        net.zero_grad(set_to_none=True)
+        with torch.cuda.graph(self._graph):
+            self._result = compute(self._windows, self._y)
+        self._gradients = [p.grad for p in self._parameters]
+
+    def __call__(self, windows: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the gradients; return mean loss and logits, which the next call overwrites."""
+        self._windows.copy_(windows)
+        self._y.copy_(y)
+        self._graph.replay()
+        for p, gradient in zip(self._parameters, self._gradients, strict=True):
+            p.grad = gradient
+        return self._result
+
+
+class Plain:
+    """Training with PyTorch's layers and autograd.
+
+    On a GPU with ``capture``, steps of small batches are replayed (`CapturedStep`); they compute the same.
+    """
+
+    def __init__(self, net: Net, device: torch.device, capture: bool = True) -> None:
         self._net = net.to(device)
+        self._captures = capture and device.type == "cuda"
+        self._steps: Counter[int] = Counter()
+        self._captured: dict[int, CapturedStep] = {}
 
     @property
     def parameters(self) -> Sequence[Tensor]:
@@ -140,7 +176,27 @@ class Plain:
         """Compute the gradients for the windows ``batch`` with classes ``y``; return mean loss and logits (n, K)."""
         self._net.train()
         windows = x.whole[batch]
-        logits = self._net(windows if augment is None else augment(windows, random))
+        if augment is not None:
+            windows = augment(windows, random)
+        n = len(batch)
+        if not self._captures or n > _CAPTURED_BATCH:
+            return self._computed(windows, y)
+        if n not in self._captured:
+            self._steps[n] += 1
+            if self._steps[n] <= _WARM_STEPS:
+                # On a stream of its own, as PyTorch asks for before a capture.
+                own, now = torch.cuda.Stream(), torch.cuda.current_stream()  # type: ignore[no-untyped-call]
+                own.wait_stream(now)
+                with torch.cuda.stream(own):
+                    result = self._computed(windows, y)
+                now.wait_stream(own)
+                return result
+            self._captured[n] = CapturedStep(self._computed, self._net, windows, y)
+        return self._captured[n](windows, y)
+
+    def _computed(self, windows: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute the gradients for windows (n, C, T) with classes ``y``; return mean loss and logits (n, K)."""
+        logits = self._net(windows)
         loss = F.cross_entropy(logits, y)
         self._net.zero_grad(set_to_none=True)
         torch.autograd.backward(loss)
@@ -158,7 +214,8 @@ class Plain:
         return self._net.export_weights()
 
     def close(self) -> None:
-        """Do nothing: there are no threads."""
+        """Free the memory of captured steps."""
+        self._captured.clear()
 
 
 class Fast:
@@ -285,6 +342,13 @@ class Adam:
             eps=1e-8,
             maximize=False,
         )
+
+
+@contextmanager
+def repeatable() -> Iterator[None]:
+    """Let a GPU compute the same bits again within the block, in float32: TensorFloat-32 keeps 10 bits only."""
+    with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):
+        yield
 
 
 @contextmanager

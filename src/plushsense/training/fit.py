@@ -16,7 +16,17 @@ from plushsense.models.arch import Arch
 from plushsense.models.net import Net
 from plushsense.scoring.metrics import accuracy_over_people
 from plushsense.training.augment import Channels, Transform, augmentations
-from plushsense.training.engine import Adam, Engine, FitState, Windows, engine, is_fast, slices, torch_threads
+from plushsense.training.engine import (
+    Adam,
+    Engine,
+    FitState,
+    Windows,
+    engine,
+    is_fast,
+    repeatable,
+    slices,
+    torch_threads,
+)
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.windows.features import Scaler
@@ -104,8 +114,7 @@ def fit(
         )
     # The fast engine starts its own threads, in each of which PyTorch uses one.
     threads = 1 if is_fast(arch, device) else spec.threads
-    repeatable = torch.backends.cudnn.flags(enabled=True, deterministic=True)
-    with torch.random.fork_rng(devices=[]), repeatable, torch_threads(threads):
+    with torch.random.fork_rng(devices=[]), repeatable(), torch_threads(threads):
         torch.manual_seed(spec.seed)
         initial = Net(arch)
         if start is not None:
@@ -203,7 +212,7 @@ def predict(
     net = Net(arch)
     net.import_weights(weights)
     x, _ = _tensors(windows, scaler, arch, place)
-    with torch_threads(1):
+    with repeatable(), torch_threads(1):
         reader = engine(arch, net, place, 1, 1)
         return np.asarray(F.softmax(reader.logits(x), dim=1).cpu().numpy())
 

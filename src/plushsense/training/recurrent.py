@@ -111,7 +111,7 @@ def fit_recurrent(
         net = Recurrent(x.shape[1], len(train.labels), both_ways, units, layers, dropout).to(device)
         order = torch.Generator().manual_seed(spec.seed)
         augment = augmentations(spec.augment, Channels(train.vectors, scaler, device))
-        adam = Adam(net.parameters())
+        adam = Adam(net.parameters(), fused=True if device.type == "cuda" else None)
         for epoch in range(1, spec.epochs + 1):
             _epoch(net, adam, spec.learning_rate_at(epoch), x, y, spec.batch, order, augment, epoch)
     return RecurrentReader(net.eval(), scaler, samples, time.perf_counter() - began)
