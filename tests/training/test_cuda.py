@@ -51,7 +51,7 @@ def test_the_first_losses_are_those_of_the_cpu(made: Make, padding: str) -> None
         for device in ("cpu", "cuda")
     ]
     for one, other in zip(*histories, strict=True):
-        assert one["train_loss"] == pytest.approx(other["train_loss"], rel=1e-3)
+        assert one["train_loss"] == pytest.approx(other["train_loss"], rel=1e-2)
 
 
 @pytest.mark.parametrize("symbol", ["5_5d2", "v5_5d2"])

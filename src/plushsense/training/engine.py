@@ -345,9 +345,14 @@ class Adam:
 
 
 @contextmanager
-def repeatable() -> Iterator[None]:
-    """Let a GPU compute the same bits again within the block, in float32: TensorFloat-32 keeps 10 bits only."""
-    with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):
+def repeatable(allow_tf32: bool = False) -> Iterator[None]:
+    """Let a GPU compute the same bits again within the block.
+
+    Args:
+        allow_tf32: whether convolutions may round their inputs to TensorFloat-32, which has 10 bits of mantissa. A step
+            that must be repeatable is then up to 20 times faster (H200).
+    """
+    with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=allow_tf32):
         yield
 
 

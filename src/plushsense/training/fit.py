@@ -114,7 +114,7 @@ def fit(
         )
     # The fast engine starts its own threads, in each of which PyTorch uses one.
     threads = 1 if is_fast(arch, device) else spec.threads
-    with torch.random.fork_rng(devices=[]), repeatable(), torch_threads(threads):
+    with torch.random.fork_rng(devices=[]), repeatable(allow_tf32=True), torch_threads(threads):
         torch.manual_seed(spec.seed)
         initial = Net(arch)
         if start is not None:
