@@ -1,7 +1,8 @@
 # Everything from a bare checkout, with only Python 3.11+ and make.
 #   make install PlushSense and PyTorch into .venv, for the tutorial
 #   make demo    install, then the whole path on a virtual toy (a simulation)
-#   make test    install, then all tests
+#   make test    install, then all tests but the exhaustive ones
+#   make test-exhaustive   these: more pages, languages, chips, compilers, kills and trainings than in `make test`
 #   make test-quick   install, then the tests that need no browser, compiler, emulator or cluster
 #   make bench   measure the headline figures again, into docs/numbers.md: hours (ROWS=import,live: some rows)
 #   make fuzz    hostile bundles, layouts, lines and models for the C, for some hours (FUZZ=10: some minutes)
@@ -25,7 +26,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(PIP_FL
 # Tests start hundreds of processes, each of which would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-quick fuzz check docs dist setup collect soak coverage mutants install bench clean
+.PHONY: demo test test-exhaustive test-quick fuzz check docs dist setup collect soak coverage mutants install bench clean
 
 $(VENV)/.python:
 	@$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'PlushSense needs Python 3.11 or newer, this is ' + sys.version.split()[0] + ': run  make PYTHON=/path/to/python3.11 ...')"
@@ -53,7 +54,10 @@ demo: $(VENV)/.train
 	$(BIN)/plushsense demo --out $(DEMO_OUT) $(DEMO_FLAGS)
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -n auto --dist worksteal $(PYTEST_FLAGS)
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not exhaustive" $(PYTEST_FLAGS)
+
+test-exhaustive: $(VENV)/.dev
+	$(BIN)/python -m pytest -n auto --dist worksteal -m exhaustive $(PYTEST_FLAGS)
 
 test-quick: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --dist worksteal -m "not slow" $(PYTEST_FLAGS)

@@ -17,6 +17,7 @@ import pytest
 from hypothesis import settings
 
 from support import apart
+from support.exhaustive import EXHAUSTIVE
 from support.memory import LIMIT_MB, memory_mb
 from support.requirements import missing
 
@@ -51,19 +52,20 @@ SLOW_FILES = {
 }
 # Files that take longest, the longest first. The workers begin with them: one of them begun late would end alone.
 LONGEST = (
-    "deploy/proof/test_verify.py",
     "studio/test_train.py",
-    "test_pages.py",
-    "cli/test_paper_page.py",
-    "studio/test_therapist.py",
-    "studio/test_live_long.py",
-    "workflow/test_demo.py",
-    "studio/test_export_page.py",
-    "studio/test_review.py",
-    "studio/test_live_page.py",
     "studio/test_record.py",
-    "studio/test_record_whole.py",
+    "studio/test_therapist.py",
+    "deploy/proof/test_verify.py",
     "studio/test_pictures_of_pages.py",
+    "studio/test_shell.py",
+    "studio/test_review.py",
+    "test_pages.py",
+    "studio/test_home.py",
+    "studio/test_record_refusals.py",
+    "studio/test_live_page.py",
+    "cli/test_paper_page.py",
+    "studio/test_live_long.py",
+    "studio/test_record_whole.py",
 )
 SLOW_FIXTURES = {"real_data", "c_compiler", "target_here", "two_nodes", "lsl_possible", "publish_tools", "pty_possible"}
 
@@ -91,8 +93,11 @@ def _place(item: pytest.Item) -> str:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that `make test-quick` leaves out, and put the longest first."""
+    """Mark the tests that `make test-quick` and `make test` leave out, and put the longest first."""
     for item in items:
+        named = f"{_place(item)}::{item.name}"
+        if {named, named.partition("[")[0]} & EXHAUSTIVE:
+            item.add_marker(pytest.mark.exhaustive)
         if _in_slow_place(item.path) or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
     items[:] = _dealt(items, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))

@@ -9,6 +9,8 @@ from collections import Counter, defaultdict
 from functools import cache
 from pathlib import Path
 
+from support.exhaustive import EXHAUSTIVE
+
 ROOT = Path(__file__).resolve().parents[1]
 SRC = ROOT / "src" / "plushsense"
 MODULES = sorted(SRC.rglob("*.py"))
@@ -44,6 +46,14 @@ def definitions() -> list[tuple[Path, Definition]]:
 def test_no_module_is_longer_than_600_lines() -> None:
     lines = {name(module): len(module.read_text(encoding="utf-8").splitlines()) for module in MODULES}
     assert {module: n for module, n in lines.items() if n > LONGEST} == {}
+
+
+def test_every_exhaustive_test_exists() -> None:
+    wanted = {tuple(test.partition("[")[0].split("::")) for test in EXHAUSTIVE}
+    found = {
+        (file, name) for file, name in wanted if f"def {name}(" in (ROOT / "tests" / file).read_text(encoding="utf-8")
+    }
+    assert wanted - found == set()
 
 
 def test_three_modules_with_one_prefix_are_a_package() -> None:

@@ -88,6 +88,15 @@ def item_menu(words: Words, about: str, actions: Mapping[str, Callable[[], Any]]
     return opener
 
 
+def on_enter(field: Element, call: Callable[[], Any]) -> None:
+    """Call ``call`` when Enter goes down in a field.
+
+    The key's coming up is dropped: if ``call`` closes a dialog, it would press the item that has the focus afterwards.
+    """
+    drop = "(up) => up.stopImmediatePropagation(), { capture: true, once: true }"
+    field.on("keydown.enter", call, js_handler=f'() => {{ window.addEventListener("keyup", {drop}); emit(); }}')
+
+
 def ask(words: Words, title: str, go: str, answer: Callable[[str], Any], label: str = "", value: str = "") -> None:
     """Ask a question in a dialog; if the button with the text ``go`` is clicked, call ``answer``, which may be async.
 
@@ -107,7 +116,7 @@ def ask(words: Words, title: str, go: str, answer: Callable[[str], Any], label: 
             ui.label(title).classes("text-lg text-bold ps-break")
             if label:
                 field = tag(ui.input(label, value=value).props("autofocus").classes("w-full"), "ask-text")
-                field.on("keydown.enter", done)
+                on_enter(field, done)
             with ui.row().classes("w-full justify-end"):
                 button("", words("shell.cancel"), dialog.close, "flat" if label else "flat autofocus")
                 button("ask-go", go, done, "unelevated" if label else "outline")

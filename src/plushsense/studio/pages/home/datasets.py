@@ -22,7 +22,7 @@ from plushsense.studio.pages.home.sections import (
     simulation_badge,
     titled_card,
 )
-from plushsense.studio.widgets.elements import summary
+from plushsense.studio.widgets.elements import on_enter, summary
 from plushsense.workflow.datasets import Forgotten, forget
 
 _MAX_PATHS = 5
@@ -223,5 +223,5 @@ class ForgetDialog:
         with self._box:
             ui.label(words("home.forget_sure", person=self._person)).classes("text-bold ps-break")
             code = tag(ui.input(words("home.forget_code")).props("autofocus").classes("w-full"), "forget-code")
-            code.on("keydown.enter", on_page(remove))
+            on_enter(code, on_page(remove))
             button("forget-go", words("home.forget_go"), on_page(remove), "unelevated color=negative")

@@ -13,6 +13,7 @@ from plushsense.studio.app.shell import AFFECT_SIGNS, button, icon_button, scrol
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.review.controller import SORTS, ReviewController
 from plushsense.studio.pages.review.review import ReviewedRecording
+from plushsense.studio.widgets.elements import on_enter
 
 
 class ReviewTable(Element, component="review_table.js"):
@@ -124,7 +125,7 @@ def ask_reason(
                     look = "outline autofocus" if number == 0 else "outline"
                     button("", reason, lambda reason=reason: answer(reason), look)
             field = ui.input(words("review.own_reason")).classes("w-full")
-            tag(field, "own-reason").on("keydown.enter", lambda: answer(field.value or ""))
+            on_enter(tag(field, "own-reason"), lambda: answer(field.value or ""))
             with ui.row().classes("w-full justify-end"):
                 button("", words("review.cancel"), dialog.close, "flat")
                 go = words("review.exclude_go") if finding is None else words("review.accept_finding")
