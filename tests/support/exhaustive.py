@@ -8,13 +8,16 @@ EXHAUSTIVE = {
     "deploy/proof/test_verify.py::test_every_way_to_compile_on_the_host",
     "deploy/proof/test_verify.py::test_the_same_on_every_chip[one-layer-8]",
     "deploy/proof/test_verify.py::test_the_same_on_every_chip[paper-11]",
+    "deploy/proof/test_verify.py::test_without_smoothing_no_mutant_is_applied_that_cannot_show",
     "deploy/test_c_source.py::test_clang_tidy",
     "experiments/search/test_run.py::test_killed_in_every_rung_and_gone_on_with",
     "experiments/sweep/test_cluster.py::test_a_node_lost_in_a_sweep_changes_nothing",
     "experiments/sweep/test_run.py::test_killed_three_times_and_gone_on_with",
+    "recording/test_whole_session.py::test_killed_three_times",
     "studio/test_export_page.py::test_export_verify_and_break",
     "studio/test_live_long.py::test_every_gesture_is_seen_with_its_affect_and_nothing_grows",
     "studio/test_live_page.py::test_a_hard_case_is_kept_labelled_and_in_the_data_set",
+    "studio/test_live_page.py::test_a_new_person_is_led_through_the_validation",
     "studio/test_live_page.py::test_an_event_is_marked_as_wrong_and_the_network_improved",
     "studio/test_publish_page.py::test_publish_check_and_break",
     "studio/test_record.py::test_it_speaks_latvian_and_fits_a_phone",
@@ -22,6 +25,8 @@ EXHAUSTIVE = {
     "studio/test_train.py::test_a_proof_its_table_and_the_recordings_of_a_cell",
     "studio/test_train.py::test_a_sweep_shows_its_cost_first_and_its_front_in_the_end",
     "studio/test_train.py::test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle",
+    "test_questions.py::test_every_program_runs",
+    "workflow/test_demo.py::test_demo_twice",
     *(
         f"studio/test_pictures_of_pages.py::test_a_page_reads_well[{page}-{view}]"
         for page in ("home", "record", "review", "train", "live", "export", "publish")
@@ -29,6 +34,17 @@ EXHAUSTIVE = {
     ),
     *(
         f"test_pages.py::test_every_command_of_the_page_runs[docs/{page}.md]"
-        for page in ("baselines", "checks", "commands", "firmware", "people", "results", "streams")
+        for page in (
+            "baselines",
+            "checks",
+            "commands",
+            "firmware",
+            "importing",
+            "pairing",
+            "people",
+            "results",
+            "streams",
+            "trim",
+        )
     ),
 }
