@@ -124,7 +124,9 @@ def record(work: Path, hours: float, model: Path) -> dict[str, Any]:
         request = SessionRequest(toy.url, subject="S01", protocol=str(work / "day.toml"), speed=0.0)
         head = session_head(request, folder, True, layout, "soak")
         with Recorder.open(folder, toy, head, speed=0.0, auto=AutoRecording(5.0, 20.0)) as recorder:
-            while not recorder.wait(timeout_s=0.2):
+            ended = False
+            while not ended:  # sampled at least once: a short day may end within the first wait
+                ended = recorder.wait(timeout_s=0.2)
                 memory.at(recorder.toy_s)
             status = recorder.status()
     return {
