@@ -223,7 +223,8 @@ def test_ctrl_c_ends_the_workers_and_keeps_what_is_done(tmp_path: Path) -> None:
         time.sleep(0.02)
     os.killpg(run.pid, signal.SIGINT)
     _, told = run.communicate(timeout=90)
-    assert "KeyboardInterrupt" in told and told.count("Traceback") == 1
+    # Of one process only; the signal may come while it handles another exception.
+    assert told.count("\nKeyboardInterrupt") == 1
     assert journal.has("job0") and not journal.has("job199")
 
 

@@ -9,6 +9,7 @@ on everything that needs room fails with ENOSPC.
 from __future__ import annotations
 
 import errno
+import faulthandler
 import hashlib
 import importlib
 import json
@@ -31,6 +32,7 @@ REPETITIONS = int(os.environ.get("PLUSHSENSE_DRILLS", "1"))
 """Drills of each command; ``make soak`` sets more."""
 
 Fault = Literal["", "kill", "full"]
+# Not Polars, which starts threads: a process forked beside them may wait for a lock that one of them held.
 _PRELOADED = (
     *(
         "plushsense.cli.main",
@@ -38,9 +40,11 @@ _PRELOADED = (
         "plushsense.experiments.sweep.run",
         "plushsense.deploy.package",
     ),
-    *("plushsense.dataset.publishing.package", "pytest", "polars", "torch"),
+    *("plushsense.dataset.publishing.package", "pytest", "torch"),
     *("mlcroissant", "frictionless", "rocrate.rocrate", "datacite"),
 )
+# A command that hangs ends, with the stacks of its threads as its error output.
+_LONGEST_S = 500
 _NEEDS_ROOM = ("open", "os.mkdir", "fsync")
 _OTHER = ("os.rename", "os.remove", "os.rmdir", "os.truncate")
 _WRITING = os.O_WRONLY | os.O_RDWR
@@ -100,6 +104,7 @@ def _run(words: list[str], place: Path, said: Path, fault: Fault, at: int) -> No
         descriptor = os.open(said / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(descriptor, number)
     sys.stdout, sys.stderr = (os.fdopen(os.dup(n), "w", buffering=1) for n in (1, 2))
+    faulthandler.dump_traceback_later(_LONGEST_S, exit=True)
     (place / "tmp").mkdir(exist_ok=True)
     tempfile.tempdir = str(place / "tmp")
     os.environ["TMPDIR"] = str(place / "tmp")
