@@ -1,7 +1,8 @@
 # Everything from a bare checkout, with only Python 3.11+ and make.
 #   make install PlushSense and PyTorch into .venv, for the tutorial
 #   make demo    install, then the whole path on a virtual toy (a simulation)
-#   make test    install, then all tests but the exhaustive ones
+#   make test    install, then all tests but the exhaustive ones, in four parts; one of them: make test-studio,
+#                make test-deploy, make test-training, make test-other
 #   make test-exhaustive   these: more pages, languages, chips, compilers, kills and trainings than in `make test`
 #   make test-quick   install, then the tests that need no browser, compiler, emulator or cluster
 #   make bench   measure the headline figures again, into docs/numbers.md: hours (ROWS=import,live: some rows)
@@ -23,10 +24,12 @@ BIN := $(VENV)/bin
 endif
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(PIP_FLAGS) -c constraints.txt
 
+PARTS := studio deploy training other
+
 # Tests start hundreds of processes, each of which would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-exhaustive test-quick fuzz check docs dist setup collect soak coverage mutants install bench clean
+.PHONY: demo test $(PARTS:%=test-%) test-exhaustive test-quick fuzz check docs dist setup collect soak coverage mutants install bench clean
 
 $(VENV)/.python:
 	@$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'PlushSense needs Python 3.11 or newer, this is ' + sys.version.split()[0] + ': run  make PYTHON=/path/to/python3.11 ...')"
@@ -53,8 +56,19 @@ setup: $(VENV)/.dev
 demo: $(VENV)/.train
 	$(BIN)/plushsense demo --out $(DEMO_OUT) $(DEMO_FLAGS)
 
-test: $(VENV)/.dev
-	$(BIN)/python -m pytest -n auto --dist worksteal -m "not exhaustive" $(PYTEST_FLAGS)
+# The tests run in parts, because a worker loads and keeps what all tests of its run import.
+TESTS_studio := tests/studio
+TESTS_deploy := tests/deploy tests/bench
+TESTS_training := $(addprefix tests/,cli evaluation experiments faults jobs models scoring training trials tuning workflow \
+  test_pages.py test_questions.py)
+TESTS_other := $(filter-out $(TESTS_studio) $(TESTS_deploy) $(TESTS_training), \
+  $(patsubst %/,%,$(wildcard tests/*/)) $(wildcard tests/test_*.py))
+
+test: $(PARTS:%=test-%)
+
+# Status 5: none of a part's tests was selected, as by PYTEST_FLAGS="-k NAME".
+$(PARTS:%=test-%): test-%: $(VENV)/.dev
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not exhaustive" $(TESTS_$*) $(PYTEST_FLAGS) || [ $$? -eq 5 ]
 
 test-exhaustive: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --dist worksteal -m exhaustive $(PYTEST_FLAGS)

@@ -29,13 +29,7 @@ TESTS = Path(__file__).parents[1]
 GROUPS = tuple(
     tuple(files.split())
     for files in (
-        "bench/test_peers.py",
         "cli/test_baselines.py cli/test_publish.py",
-        "dataset/publishing/test_checking.py dataset/publishing/test_contents.py dataset/publishing/test_package.py",
-        "dataset/importing/test_importers_fuzz.py",
-        "dataset/test_relabel.py",
-        "deploy/test_c.py deploy/test_c_image.py",
-        "deploy/test_convert.py",
         "evaluation/test_reidentification.py scoring/test_metrics.py",
         "experiments/baselines/test_models.py experiments/baselines/test_report.py experiments/baselines/test_score.py"
         " experiments/streams/test_predictions.py",

@@ -4,6 +4,7 @@ They repeat what shorter ones test with more pages, languages, chips, compilers,
 """
 
 EXHAUSTIVE = {
+    "cli/test_kill.py::test_kill_9_in_the_middle",
     "cli/test_paper_page.py::test_every_command_runs",
     "deploy/proof/test_verify.py::test_every_way_to_compile_on_the_host",
     "deploy/proof/test_verify.py::test_the_same_on_every_chip[one-layer-8]",
@@ -18,10 +19,14 @@ EXHAUSTIVE = {
     "studio/test_live_long.py::test_every_gesture_is_seen_with_its_affect_and_nothing_grows",
     "studio/test_live_page.py::test_a_hard_case_is_kept_labelled_and_in_the_data_set",
     "studio/test_live_page.py::test_a_new_person_is_led_through_the_validation",
+    "studio/test_live_page.py::test_a_toy_that_goes_away_and_comes_back",
     "studio/test_live_page.py::test_an_event_is_marked_as_wrong_and_the_network_improved",
+    "studio/test_live_page.py::test_another_bundle_while_it_runs_and_one_that_does_not_fit",
     "studio/test_publish_page.py::test_publish_check_and_break",
     "studio/test_record.py::test_it_speaks_latvian_and_fits_a_phone",
     "studio/test_record.py::test_two_tabs_show_and_press_the_same_once",
+    "studio/test_review.py::test_one_recording_has_no_violation_in_any_light",
+    "studio/test_review.py::test_real_recordings_one_after_the_other",
     "studio/test_train.py::test_a_proof_its_table_and_the_recordings_of_a_cell",
     "studio/test_train.py::test_a_sweep_shows_its_cost_first_and_its_front_in_the_end",
     "studio/test_train.py::test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle",
@@ -33,6 +38,10 @@ EXHAUSTIVE = {
         for view in ("wide-dark-en", "tablet-light-lv")
     ),
     *(
+        f"studio/test_pictures_of_pages.py::test_a_page_reads_well[{page}-phone-dark-lv]"
+        for page in ("review", "train", "live", "export", "publish")
+    ),
+    *(
         f"test_pages.py::test_every_command_of_the_page_runs[docs/{page}.md]"
         for page in (
             "baselines",
@@ -40,11 +49,14 @@ EXHAUSTIVE = {
             "commands",
             "firmware",
             "importing",
+            "live",
             "pairing",
             "people",
+            "questions",
             "results",
             "streams",
             "trim",
+            "virtual-toy",
         )
     ),
 }
