@@ -374,7 +374,8 @@ def test_messages_do_not_pile_up_for_a_client_that_answers_pings_and_reads_too_l
         finally:
             stop.set()
     assert len(seen) == 2 and seen == set(left)
-    assert all(300 < most < 30_000 for most in largest.values())
+    # The client may be dropped before the message that was one too many is counted here.
+    assert all(300 <= most < 30_000 for most in largest.values())
 
 
 # Against the real server ------------------------------------------------------------------------------------------
