@@ -29,7 +29,7 @@ PARTS := studio deploy training other
 # Tests start hundreds of processes, each of which would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test $(PARTS:%=test-%) test-exhaustive test-quick fuzz check docs dist setup collect soak coverage mutants install bench clean
+.PHONY: demo test test-studio test-deploy test-training test-other test-exhaustive test-quick fuzz check docs dist setup collect soak coverage mutants install bench clean
 
 $(VENV)/.python:
 	@$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'PlushSense needs Python 3.11 or newer, this is ' + sys.version.split()[0] + ': run  make PYTHON=/path/to/python3.11 ...')"

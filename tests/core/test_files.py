@@ -13,6 +13,25 @@ from plushsense.core.errors import DatasetError
 from plushsense.core.files import PART, new_folder, replacing_file, temporary_folder, work_folder, write_file
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such locks")
+def test_a_part_file_that_was_created_again_is_not_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two programs delete an abandoned part at once; its writer creates it again between the two."""
+    import fcntl
+
+    part, lock = tmp_path / f".index.csv.12ab34cd{PART}", fcntl.flock
+
+    def lock_later(descriptor: int, how: int) -> None:
+        monkeypatch.undo()
+        part.unlink()
+        part.write_text("new")
+        lock(descriptor, how)
+
+    part.write_text("abandoned")
+    monkeypatch.setattr(fcntl, "flock", lock_later)
+    write_file(tmp_path / "index.csv", "text")
+    assert part.read_text() == "new"
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows refuses to replace a file that is being replaced")
 def test_threads_that_write_one_file_at_once_leave_one_of_their_texts(tmp_path: Path) -> None:
     path = tmp_path / "index.csv"

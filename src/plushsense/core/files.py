@@ -187,7 +187,9 @@ def _delete_abandoned_parts(place: Path, name: str) -> None:
             descriptor = os.open(part, os.O_RDONLY)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                part.unlink()
+                # Otherwise another program deleted it, and a file of this name is one that its writer created again.
+                if os.fstat(descriptor).st_nlink:
+                    part.unlink()
             finally:
                 os.close(descriptor)
 
