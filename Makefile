@@ -59,8 +59,7 @@ demo: $(VENV)/.train
 # The tests run in parts, because a worker loads and keeps what all tests of its run import.
 TESTS_studio := tests/studio
 TESTS_deploy := tests/deploy tests/bench
-TESTS_training := $(addprefix tests/,cli evaluation experiments faults jobs models scoring training trials tuning workflow \
-  test_pages.py test_questions.py)
+TESTS_training := $(addprefix tests/,experiments models training workflow)
 TESTS_other := $(filter-out $(TESTS_studio) $(TESTS_deploy) $(TESTS_training), \
   $(patsubst %/,%,$(wildcard tests/*/)) $(wildcard tests/test_*.py))
 
