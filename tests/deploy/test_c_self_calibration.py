@@ -70,7 +70,9 @@ def test_a_good_checksum_makes_no_calibrated_model(calibrated_library: Any) -> N
         "an unlimited channel": bytes([1, 0]),
         "a short block": bytes([1, 1, 2, 3, 1]),
         "a long block": bytes([1, 1, 2, 3, 9]),
+        "a channel twice": bytes([1, 1, 2, 2]),
+        "a channel of two sensors": bytes([2, 1, 2, 3, 5, 1, 2, 3, 5]),
     }.items():
-        wrong = body[:at] + change + body[at + len(change) :]
+        wrong = body[:at] + change + body[at + min(len(change), len(plan)) :]
         image = image_head(wrong, version=8) + wrong
         assert Seat(calibrated_library, image, 4, 3).status == DAMAGED, what

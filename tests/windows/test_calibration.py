@@ -158,6 +158,10 @@ def test_a_session_can_be_read_from_another_state(tmp_path: Path) -> None:
     [
         ({"self_calibration": ("x", "y")}, "accepted are all three axes"),
         ({"self_calibration": ("x", "y", "z"), "vectors": ()}, "here none"),
+        (
+            {"self_calibration": tuple("xxyyzz"), "vectors": (tuple("xyz"), tuple("zyx"))},
+            "no axis in two of them, here x, y, z; z, y, x",
+        ),
         ({"channels": tuple(replace(c, valid_max=1e6) for c in WIDE)}, "within ±524288"),
     ],
 )

@@ -261,11 +261,11 @@ class Layout:
     def _problems_of_calibration(self, kinds: Mapping[str, str]) -> Iterator[str]:
         accelerometers = [v for v in self.vectors if kinds[v[0]] == ACCELERATION]
         whole = [axis for v in accelerometers if set(v) <= set(self.self_calibration) for axis in v]
-        if sorted(self.self_calibration) != sorted(whole):  # both are empty by default
+        if sorted(self.self_calibration) != sorted(whole) or len(set(whole)) < len(whole):
             known = "; ".join(", ".join(v) for v in accelerometers) or "none"
             yield (
                 f"self_calibration is {', '.join(self.self_calibration)}: accepted are all three axes of vectors of "
-                f"the kind '{ACCELERATION}', here {known}."
+                f"the kind '{ACCELERATION}', no axis in two of them, here {known}."
             )
         if len(whole) > 3 * MOST_CALIBRATED_VECTORS:
             yield f"self_calibration names {len(whole) // 3} sensors: accepted are up to {MOST_CALIBRATED_VECTORS}."

@@ -486,22 +486,26 @@ PLUSH_SMALL static int read_input_plan(plush_toy *toy, source *from)
 PLUSH_SMALL static int read_sensors(plush_toy *toy, source *from)
 {
     const uint8_t *p = next_bytes(from, 1);
-    uint32_t i, n;
+    uint32_t i, k;
 
     toy->sensors = p == NULL ? 0 : *p;
     toy->sensor_plan = p = next_bytes(from, 4u * toy->sensors);
     if (p == NULL || toy->sensors == 0 || toy->sensors > MOST_SENSORS)
         return 0;
-    for (i = 0; i < toy->sensors; i++, p += 4) {
-        if (p[3] < LEAST_BLOCK_SHIFT || p[3] > MOST_BLOCK_SHIFT)
-            return 0;
-        for (n = 0; n < 3; n++) {
-            const uint8_t *range = toy->ranges + RANGE_BYTES * p[n];
+    for (i = 0; i < 4u * toy->sensors; i++) {
+        const uint8_t *range;
 
-            if (p[n] >= toy->channels || as_signed(word_at(range)) < -MOST_READING ||
-                as_signed(word_at(range + 4)) > MOST_READING)
+        if (i % 4 == 3 ? p[i] < LEAST_BLOCK_SHIFT || p[i] > MOST_BLOCK_SHIFT : p[i] >= toy->channels)
+            return 0;
+        if (i % 4 == 3)
+            continue;
+        range = toy->ranges + RANGE_BYTES * p[i];
+        if (as_signed(word_at(range)) < -MOST_READING || as_signed(word_at(range + 4)) > MOST_READING)
+            return 0;
+        /* What a sensor puts in place of a reading is no reading for another. */
+        for (k = 0; k < i; k++)
+            if (k % 4 != 3 && p[k] == p[i])
                 return 0;
-        }
     }
     return 1;
 }
