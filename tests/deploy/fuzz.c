@@ -1,5 +1,5 @@
-/* Entry points of the C library for libFuzzer: models, frames, swaps and patches, and lines. PLUSHSENSE_ENTRY chooses
- * one by its first letter (m, f, s, p, l), and PLUSHSENSE_MODEL is the image that toys run. With FILES it is a program
+/* Entry points of the C library for libFuzzer: models (of the library for self-calibration, too), frames, swaps and
+ * patches, and lines. PLUSHSENSE_ENTRY chooses one by its first letter (m, c, f, s, p, l), and PLUSHSENSE_MODEL is the image that toys run. With FILES it is a program
  * that tries each of the files given to it once. */
 #include "toy.c"
 #include "plush_wire.h"
@@ -104,7 +104,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size_)
     memcpy(image, data, size);
     if (size > 0 && image[size - 1] % 8 != 0)
         seal(image, size);
-    if (entry == 'm') {
+    if (entry == 'm' || entry == 'c') {
         seat *s = (seat *)seat_new(image, size, &status, 0, 0);
 
         if (status == PLUSH_OK) {

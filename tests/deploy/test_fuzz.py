@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,9 @@ from plushsense.deploy.proof.scenarios import patches_of
 from plushsense.deploy.quantize import integer_model
 from support.c_toy import C_FOLDER
 from support.exports import bundle_of
+from support.integers import vector_model
 
-ENTRIES = ("model", "frames", "swap", "patch", "lines")
+ENTRIES = ("model", "calibrated", "frames", "swap", "patch", "lines")
 FUZZ = int(os.environ.get("PLUSHSENSE_FUZZ", "0"))
 DRIVER = Path(__file__).with_name("fuzz.c")
 
@@ -39,7 +41,16 @@ def corpus(folder: Path) -> tuple[dict[str, list[bytes]], Path]:
     width = load_layout("phone-6").n_channels
     lines = "".join(f"{' '.join(f'{v:.6g}' for v in rng.normal(size=width))} {10 * k}\n" for k in range(40))
     lines += "1e-9 +2.5E+7 .5 -0 7. 1 2\r\n"
-    found = {"model": images, "frames": frames, "swap": images, "patch": patches, "lines": [lines.encode()]}
+    axes = vector_model()
+    calibrated = replace(axes, layout=replace(axes.layout, self_calibration=("x", "y", "z"))).to_bytes()
+    found = {
+        "model": images,
+        "calibrated": [calibrated],
+        "frames": frames,
+        "swap": images,
+        "patch": patches,
+        "lines": [lines.encode()],
+    }
     return {entry: [*inputs, *(i + b"\0" for i in inputs)] for entry, inputs in found.items()}, out
 
 
@@ -47,16 +58,20 @@ def environment(out: Path, entry: str) -> dict[str, str]:
     return os.environ | {"PLUSHSENSE_ENTRY": entry, "PLUSHSENSE_MODEL": str(out / "plush_model.bin")}
 
 
-def command(compiler: str, out: Path, program: Path, *flags: str) -> list[str]:
+def built(compiler: str, out: Path, folder: Path, entry: str, *flags: str) -> Path:
+    """Return the program of an entry, compiled once for all entries of one library."""
+    flags = (*flags, "-DPLUSH_CALIBRATE") if entry == "calibrated" else flags
+    program = folder / ("of-calibrated" if entry == "calibrated" else "program")
+    if program.exists():
+        return program
     includes = [f"-I{folder}" for folder in (C_FOLDER, DRIVER.parent, out, out / ARDUINO / "src")]
     sources = [str(DRIVER), str(out / ARDUINO / "src" / "plush_wire.c")]
-    return [compiler, "-std=c99", *flags, *includes, *sources, "-o", str(program)]
+    subprocess.run([compiler, "-std=c99", *flags, *includes, *sources, "-o", str(program)], check=True)
+    return program
 
 
 def test_every_entry_survives_a_few_broken_inputs(tmp_path: Path, c_compiler: str) -> None:
     inputs, out = corpus(tmp_path)
-    program = tmp_path / "program"
-    subprocess.run(command(c_compiler, out, program, "-O0", "-DFILES"), check=True)
     rng = random.Random(3)
     for entry in ENTRIES:
         folder = tmp_path / entry
@@ -66,6 +81,7 @@ def test_every_entry_survives_a_few_broken_inputs(tmp_path: Path, c_compiler: st
             for _ in range(rng.randrange(4) if data else 0):
                 data[rng.randrange(len(data))] = rng.randrange(256)
             (folder / f"{n}").write_bytes(data)
+        program = built(c_compiler, out, tmp_path, entry, "-O0", "-DFILES")
         subprocess.run([program, *map(str, folder.iterdir())], env=environment(out, entry), check=True)
 
 
@@ -73,14 +89,13 @@ def test_every_entry_survives_a_few_broken_inputs(tmp_path: Path, c_compiler: st
 def test_libfuzzer_finds_nothing(tmp_path: Path, needs: Callable[..., None]) -> None:
     needs("clang")
     inputs, out = corpus(tmp_path)
-    program = tmp_path / "program"
     flags = ("-O1", "-g", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all")
-    subprocess.run(command("clang", out, program, *flags), check=True)
     for entry in ENTRIES:
         folder = tmp_path / entry
         folder.mkdir()
         for n, data in enumerate(inputs[entry]):
             (folder / f"{n}").write_bytes(data)
+        program = built("clang", out, tmp_path, entry, *flags)
         options = [f"-runs={10_000 * FUZZ}", "-seed=1", "-max_len=4096", "-timeout=20", "-print_final_stats=1"]
         done = subprocess.run(
             [program, *options, str(folder)], env=environment(out, entry), cwd=tmp_path, capture_output=True, text=True
