@@ -30,18 +30,22 @@ GROUPS = tuple(
     tuple(files.split())
     for files in (
         "cli/test_baselines.py cli/test_publish.py",
+        "dataset/importing/test_importers_fuzz.py",
         "evaluation/test_reidentification.py scoring/test_metrics.py",
         "experiments/baselines/test_models.py experiments/baselines/test_report.py experiments/baselines/test_score.py"
         " experiments/streams/test_predictions.py",
         "experiments/sweep/test_cluster.py experiments/sweep/test_mlflow.py experiments/sweep/test_report.py",
         "jobs/test_cluster.py",
-        "studio/test_hostile_results.py studio/test_train_scores.py studio/test_words.py",
+        "studio/test_hostile_results.py studio/test_words.py",
+        "studio/test_train_scores.py",
         "test_pages.py test_questions.py",
         "tuning/test_gate.py",
         "workflow/test_demo.py workflow/test_estimator.py workflow/test_exchange.py",
         # Trainings in the process of the tests, 100 MB each time one is under way and afterwards.
-        "cli/test_adapt.py cli/test_main.py cli/test_stream_eval.py experiments/people/test_explanation.py"
-        " experiments/people/test_merging.py experiments/people/test_people.py experiments/search/test_run.py"
+        "cli/test_adapt.py cli/test_live.py cli/test_main.py cli/test_paper_page.py cli/test_protocol.py"
+        " cli/test_stream_eval.py cli/test_trim.py"
+        " experiments/people/test_explanation.py experiments/people/test_merging.py"
+        " experiments/people/test_people.py experiments/search/test_run.py"
         " experiments/streams/test_training.py experiments/test_abstention_run.py faults/test_interrupted.py"
         " models/test_net.py training/fast/test_net.py training/test_fit.py trials/test_budget.py"
         " trials/test_estimate.py workflow/test_api.py workflow/test_calibration.py workflow/test_forget_beside.py"
