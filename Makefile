@@ -24,8 +24,6 @@ BIN := $(VENV)/bin
 endif
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(PIP_FLAGS) -c constraints.txt
 
-PARTS := studio deploy training other
-
 # Tests start hundreds of processes, each of which would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -57,6 +55,7 @@ demo: $(VENV)/.train
 	$(BIN)/plushsense demo --out $(DEMO_OUT) $(DEMO_FLAGS)
 
 # The tests run in parts, because a worker loads and keeps what all tests of its run import.
+PARTS := studio deploy training other
 TESTS_studio := tests/studio
 TESTS_deploy := tests/deploy tests/bench
 TESTS_training := $(addprefix tests/,experiments models training workflow)
@@ -80,9 +79,12 @@ collect: $(VENV)/.dev
 	@mkdir -p build
 	$(BIN)/python -m pytest --collect-only -q > build/collected.txt || { cat build/collected.txt; false; }
 
+# For tests that may take longer than the ten minutes after which a test is taken to hang.
+UNLIMITED := -o faulthandler_timeout=0
+
 FUZZ ?= 1000
 fuzz: $(VENV)/.dev
-	PLUSHSENSE_FUZZ=$(FUZZ) $(BIN)/python -m pytest -n auto --dist worksteal tests/deploy/test_fuzz.py \
+	PLUSHSENSE_FUZZ=$(FUZZ) $(BIN)/python -m pytest $(UNLIMITED) -n auto --dist worksteal tests/deploy/test_fuzz.py \
 	  tests/deploy/test_bundle_fuzz.py tests/core/test_toml.py tests/deploy/test_c_image.py::test_a_drill_of_bad_updates \
 	  tests/deploy/test_firmware.py::test_computer_and_toy_read_one_grammar
 
@@ -91,7 +93,7 @@ SOAK_HOURS ?= 24
 STUDIO_HOURS ?= 1
 DRILLS ?= 30
 soak: $(VENV)/.dev
-	PLUSHSENSE_SOAK=1 PLUSHSENSE_DRILLS=$(DRILLS) $(BIN)/python -m pytest tests/faults tests/studio/test_live_long.py \
+	PLUSHSENSE_SOAK=1 PLUSHSENSE_DRILLS=$(DRILLS) $(BIN)/python -m pytest $(UNLIMITED) tests/faults tests/studio/test_live_long.py \
 	  tests/studio/test_record_whole.py tests/recording/test_whole_session.py
 	$(BIN)/python bench/soak.py --hours $(SOAK_HOURS) --studio-hours $(STUDIO_HOURS)
 
@@ -102,7 +104,7 @@ SECONDS := build/coverage/seconds.json
 $(SECONDS): $(VENV)/.dev
 	rm -rf build/coverage
 	mkdir -p build/coverage
-	-TEST_SECONDS=$@ $(BIN)/python -m coverage run -m pytest -p no:xdist -p support.contexts $(COVERED)
+	-TEST_SECONDS=$@ $(BIN)/python -m coverage run -m pytest $(UNLIMITED) -p no:xdist -p support.contexts $(COVERED)
 	$(BIN)/python -m coverage combine -q
 
 coverage:

@@ -1,6 +1,6 @@
 """Test files in a process of their own beside a worker: what they load and keep is gone when it ends.
 
-A worker collects all tests (400 MB with PyTorch) and keeps what one of them has loaded: scikit-learn 120 MB, MLflow
+A worker collects all tests of its run and keeps what one of them has loaded: scikit-learn 120 MB, MLflow
 190 MB. The files of a line of `GROUPS` run in a process that collects these only and runs the tests that the worker
 asks for. It ends when the worker comes to another line, or after a test that leaves more than `ENOUGH_MB` behind.
 
