@@ -78,6 +78,9 @@ def test_a_chip_of_qemu_answers_over_its_uart(
 ) -> None:
     command = list(TARGETS[target_here(target)].run)
     command[command.index("-serial") + 1] = "tcp:127.0.0.1:0,server=on" if way == "tcp" else "pty"
+    if target == "xtensa":
+        # It has a UART. The console of "sim" can lose bytes: QEMU's two threads change its buffer without a lock.
+        command[command.index("sim")] = "lx60-nommu"
     program = chip(target, export, tmp_path)
     streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     with subprocess.Popen([*command, str(program)], text=True, **streams) as qemu:
@@ -85,10 +88,12 @@ def test_a_chip_of_qemu_answers_over_its_uart(
             told = qemu.stdout.readline()
             place = re.search(r"disconnected:tcp:(\S+:\d+)|redirected to (/dev/\S+)", told)
             assert place is not None, told
-            code, report, _ = verified(capsys, export, f"tcp://{place[1]}" if place[1] else f"serial://{place[2]}")
+            url = f"tcp://{place[1]}" if place[1] else f"serial://{place[2]}"
+            code, report, error = verified(capsys, export, url)
         finally:
             qemu.kill()
-    assert code == 0 and report["passed"] and report["mismatches"] == 0 == report["max_abs_diff"]
+    assert code == 0, error
+    assert report["passed"] and report["mismatches"] == 0 == report["max_abs_diff"]
     assert report["own"] is None, "what the chip runs is not known"
     assert [s["name"] for s in report["streams"]] == ["golden", "patch"] and report["decisions"] > 30
     (run,) = report["runs"]
