@@ -72,9 +72,9 @@ def server() -> Iterator[Callable[[bytes], str]]:
         one.close()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def chromium() -> Iterator[Browser]:
-    """Debian's Chromium, headless, driven by Playwright, whose loop stays in this thread while it lives: a module."""
+    """Debian's Chromium, headless, driven by Playwright, whose loop stays in this thread until the end of the run."""
     found = find_chromium()
     if found is None:
         missing("browser", "neither chromium-headless-shell nor chromium is installed")
@@ -88,7 +88,7 @@ def chromium() -> Iterator[Browser]:
         browser.close()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def profiles(chromium: Browser) -> dict[tuple[str, bool], list[BrowserContext]]:
     """Browser profiles that wait for the next test, by language and touch screen.
 

@@ -12,7 +12,7 @@ import pytest
 from plushsense.recording.session import is_finished
 from plushsense.recording.session_files import SessionHead
 from support.browsing import DESK, PHONE, TABLET, axe, connected, marked
-from support.recording_pages import CALM, begun, choose, events, files, heard, sat, showing, take, whats
+from support.recording_pages import CALM, begun, choose, events, files, heard, sat, showing, stop, take, whats
 from support.waiting import until
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def test_one_press_is_one_command(studio: Fixture, look: Fixture, tmp_path: Path
     page.locator("body").click(position={"x": 2, "y": 400})
     page.keyboard.press("PageDown")
     showing(page, "recording.2.")
-    page.keyboard.press("Enter")
+    stop(page, key="Enter")
     showing(page, "idle.3.3.0.1")
     # A question is answered by its own buttons, and no recording begins.
     marked(page, "end").focus()

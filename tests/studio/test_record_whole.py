@@ -16,7 +16,7 @@ from plushsense.devices.virtual.session import GESTURES
 from plushsense.recording.session_files import SESSION_LOG, SessionHead, read_events
 from support.browsing import connected, marked
 from support.pty_toys import check_whole, pty_toy, recordings
-from support.recording_pages import choose, showing, start_recording
+from support.recording_pages import choose, showing, start_recording, stop
 from support.requirements import LONG
 from support.waiting import until
 
@@ -74,7 +74,7 @@ def test_a_whole_session_by_the_space_bar(studio: Fixture, look: Fixture, tmp_pa
                 assert "interrupted" in marked(page, "notice").first.inner_text()
                 runs = start_recording(page, number)
             if runs:
-                page.keyboard.press("Space")
+                stop(page)
             showing(page, f"idle.{number + 1}.", "finished.")
         showing(page, f"finished.{TOTAL - 1}.{TOTAL}.0.0")
         assert marked(page, "progress").inner_text() == f"{TOTAL} of {TOTAL} recorded"

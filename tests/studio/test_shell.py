@@ -48,7 +48,7 @@ def empty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 def test_pages_open_without_complaint(empty: str, look: Fixture, shots: Fixture) -> None:
     for language, dark, size in (("en", False, DESK), ("lv", True, PHONE)):
-        browser = look(size, dark, language)
+        browser = look(size, dark, language, own=True)
         for name, path in PAGES.items():
             page = browser.open(empty + path)
             assert marked(page, "title").inner_text()

@@ -16,6 +16,7 @@ from plushsense.core.gestures import load_gestures
 from plushsense.core.layouts import load_layout
 from plushsense.dataset.store import DatasetHead
 from plushsense.studio.app.workspace import BUNDLES, DATASETS, EXPORTS, ChangeSignal, Workspace
+from support.browsing import alone
 
 ODD = [
     "../secret",
@@ -228,7 +229,7 @@ def test_many_rings_are_heard_as_one_and_none_after_the_end() -> None:
         signal.notify()
         return first, len(calls)
 
-    assert asyncio.run(listen()) == (1, 1)
+    assert alone(listen()) == (1, 1)
 
 
 def test_a_ring_after_the_loop_closed_is_harmless() -> None:
@@ -237,6 +238,6 @@ def test_a_ring_after_the_loop_closed_is_harmless() -> None:
     async def listen() -> None:
         signal.subscribe(lambda: None)
 
-    asyncio.run(listen())
+    alone(listen())
     signal.notify()
     signal.notify()

@@ -204,7 +204,7 @@ class Look:
         self.empty.append(page)
 
     def close(self) -> None:
-        """Leave one tab, and close the others."""
+        """Forget what pages stored, leave one tab, and close the others."""
         from playwright.sync_api import Error
 
         self.context.remove_listener("request", self.ask)
@@ -213,6 +213,7 @@ class Look:
             page.close()
         for page in pages[:1] if not self.empty else ():
             try:
+                page.evaluate("() => localStorage.clear()")
                 self.leave(page)
             except Error:
                 page.close()

@@ -105,13 +105,22 @@ def sat(page: Page, name: str) -> None:
     heard(page)
 
 
-def take(page: Page, number: int, seconds: float = 0.0) -> None:
-    """Make a recording by the space bar; a stop within half a second of the toy's time would be taken for a slip."""
+def stop(page: Page, seconds: float = 0.1, key: str = "Space") -> None:
+    """End the recording after so many seconds, which must be half a second of the toy's time: see `take`."""
+    page.wait_for_timeout(1000.0 * seconds)
+    page.keyboard.press(key)
+
+
+def take(page: Page, number: int, seconds: float = 0.1) -> None:
+    """Make a recording by the space bar.
+
+    A stop within half a second of the toy's time is taken for a slip: the recording would go on to its longest. The
+    default is enough for a toy at five times its speed.
+    """
     showing(page, f"idle.{number}.")
     page.keyboard.press("Space")
     showing(page, f"recording.{number}.")
-    page.wait_for_timeout(1000.0 * seconds)
-    page.keyboard.press("Space")
+    stop(page, seconds)
     showing(page, "idle.", "finished.")
 
 
