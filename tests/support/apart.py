@@ -53,7 +53,7 @@ GROUPS = tuple(
     )
 )
 _GROUP_OF = {file: group for group in GROUPS for file in group}
-ENOUGH_MB = 380
+ENOUGH_MB = 440
 _CHANNEL = "TESTS_APART"
 SHARED = "TESTS_SHARED"
 """Environment variables: the socket on which a worker asks a process for tests; the folder that all workers share."""
