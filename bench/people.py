@@ -359,9 +359,6 @@ ROWS: dict[str, Row] = {
     "regained": Row("  each person's readings with another gain and offset", calibrated=True, regained=True),
     "uncalibrated": Row("  the same without self-calibration", regained=True),
     "both-states": Row("self-calibration, training windows in two states", calibrated=True, both_states=True),
-    "both-regained": Row(
-        "  each person's readings with another gain and offset", calibrated=True, regained=True, both_states=True
-    ),
 }
 
 
