@@ -106,17 +106,17 @@ def sat(page: Page, name: str) -> None:
 
 
 def stop(page: Page, seconds: float = 0.1, key: str = "Space") -> None:
-    """End the recording after so many seconds, which must be half a second of the toy's time: see `take`."""
+    """End the recording by a key, after so many seconds: at least half a second of the toy's time.
+
+    An earlier stop is taken for a slip, and the recording goes on to its longest. The default is enough for a toy at
+    five times its speed.
+    """
     page.wait_for_timeout(1000.0 * seconds)
     page.keyboard.press(key)
 
 
 def take(page: Page, number: int, seconds: float = 0.1) -> None:
-    """Make a recording by the space bar.
-
-    A stop within half a second of the toy's time is taken for a slip: the recording would go on to its longest. The
-    default is enough for a toy at five times its speed.
-    """
+    """Make a recording of so many seconds by the space bar; see `stop`."""
     showing(page, f"idle.{number}.")
     page.keyboard.press("Space")
     showing(page, f"recording.{number}.")
