@@ -11,8 +11,10 @@ from hypothesis import strategies as st
 
 from plushsense.deploy.emit import LIBRARY, library_text
 from plushsense.deploy.golden import answers_of
+from plushsense.deploy.quantize import integer_model
 from plushsense.runtime.image import IntegerModel, image_head, memory_bytes
 from support.c_toy import Seat, seat
+from support.exports import bundle_of
 from support.integers import any_frames, models, vector_model
 
 OK, OTHER_VERSION, DAMAGED = 0, 2, 3
@@ -58,6 +60,20 @@ def test_each_library_takes_its_own_models(c_library: Any, calibrated_library: A
     assert "#define PLUSH_IMAGE_VERSION 9\n" in library_text(LIBRARY[0], window=True, calibrate=True)
 
 
+def test_ten_touch_channels_and_an_accelerometer(calibrated_library: Any) -> None:
+    bundle = bundle_of("plush-15", "3d1_2d2", "3,4", window=40)
+    themselves = replace(bundle.layout, self_calibration=bundle.layout.names)
+    model = integer_model(replace(bundle, layout=themselves))
+    toy = seat(calibrated_library, model)
+    assert calibrated_library.plush_memory_bytes(model.to_bytes(), len(model.to_bytes())) == memory_bytes(model)
+    rng = np.random.default_rng(4)
+    touched = (np.arange(6000)[:, None] // 130 + np.arange(13)) % 4 == 1
+    values = np.rint(4000 + touched * 20_000 + rng.normal(size=(6000, 13)) * np.where(touched, 1500.0, 40.0))
+    times = np.cumsum(rng.choice([10, 10, 10, 11, 9, 10, 500], 6000, p=[0.2, 0.2, 0.2, 0.2, 0.1, 0.099, 0.001]))
+    frames = np.column_stack([times, values]).astype(np.int64)
+    assert np.array_equal(toy.push(frames), answers_of(model, frames))
+
+
 def test_a_good_checksum_makes_no_calibrated_model(calibrated_library: Any) -> None:
     model = calibrated_model()
     body = model.to_bytes()[16:]
@@ -65,11 +81,14 @@ def test_a_good_checksum_makes_no_calibrated_model(calibrated_library: Any) -> N
     at = body.index(plan)
     for what, change in {
         "no sensor": bytes([0]),
-        "nine": bytes([9]),
+        "sixty-five": bytes([65]),
         "an unknown channel": bytes([1, 1, 2, 4]),
         "an unlimited channel": bytes([1, 0]),
         "a short block": bytes([1, 1, 2, 3, 1]),
         "a long block": bytes([1, 1, 2, 3, 9]),
+        "a long block of another sensor": bytes([1, 1, 2, 3, 128 + 9]),
+        "one channel as an accelerometer": bytes([1, 1, 1, 1, 5]),
+        "two channels": bytes([1, 1, 1, 2, 128 + 5]),
         "a channel twice": bytes([1, 1, 2, 2]),
         "a channel of two sensors": bytes([2, 1, 2, 3, 5, 1, 2, 3, 5]),
     }.items():

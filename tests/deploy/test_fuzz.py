@@ -42,7 +42,9 @@ def corpus(folder: Path) -> tuple[dict[str, list[bytes]], Path]:
     lines = "".join(f"{' '.join(f'{v:.6g}' for v in rng.normal(size=width))} {10 * k}\n" for k in range(40))
     lines += "1e-9 +2.5E+7 .5 -0 7. 1 2\r\n"
     axes = vector_model()
-    calibrated = replace(axes, layout=replace(axes.layout, self_calibration=("x", "y", "z"))).to_bytes()
+    channels = tuple(replace(c, valid_min=-1000.0, valid_max=1000.0) for c in axes.layout.channels)
+    themselves = replace(axes.layout, channels=channels, self_calibration=axes.layout.names)
+    calibrated = replace(axes, layout=themselves).to_bytes()
     found = {
         "model": images,
         "calibrated": [calibrated],

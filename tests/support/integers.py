@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from plushsense.core.gestures import AFFECTS, Gesture, GestureSet
-from plushsense.core.layouts import Channel, CsvFormat, Derived, Layout, magnitude_limit
+from plushsense.core.layouts import MOST_CALIBRATED_OTHER, Channel, CsvFormat, Derived, Layout, magnitude_limit
 from plushsense.models.arch import Arch, ConvLayer, VectorLayer
 from plushsense.runtime.decisions import Rules
 from plushsense.runtime.events import NO_GESTURE, EventSettings
@@ -23,7 +23,7 @@ from plushsense.runtime.vectors import MOST_DOWN, IntegerVectors, down_for
 
 Ints = NDArray[np.int64]
 INT32 = -(1 << 31), (1 << 31) - 1
-RANGES = (INT32, (-2000, INT32[1]), (0, 1023), (-3, 3), (5, 5), (-40_000, 70_000))
+RANGES = (INT32, (-2000, INT32[1]), (0, 1023), (-3, 3), (5, 5), (-40_000, 70_000), (-2000, 1_000_000))
 GRAVITY_RANGES = ((0, 1023), (-3, 3), (5, 5), (-32_768, 32_767), (-262_000, 262_000))
 # In no decade round, in a whole number of ms, and where a period is a whole number of 1/100 or 1/200 ms.
 RATES = (50.0, 62.5, 99.7, 100.0, 104.0, 333.3)
@@ -32,7 +32,7 @@ RATES = (50.0, 62.5, 99.7, 100.0, 104.0, 333.3)
 def any_layout(draw: st.DrawFn, calibrated: bool = False) -> Layout:
     """1 to 8 measured channels, up to 3 magnitudes, 1 to 11 inputs, each rate and gap; at times 1 or 2 vectors.
 
-    With ``calibrated`` there is a vector, and the last or all calibrate themselves.
+    With ``calibrated`` there is a vector, and the last or all calibrate themselves, beside any of the other channels.
     """
     ranges = draw(st.lists(st.sampled_from(RANGES), min_size=1, max_size=8))
     magnitudes = draw(st.lists(st.lists(st.integers(0, len(ranges) - 1), min_size=1, max_size=4), max_size=3))
@@ -47,10 +47,14 @@ def any_layout(draw: st.DrawFn, calibrated: bool = False) -> Layout:
     for v in range(draw(st.sampled_from((1, 2) if calibrated else (0, 0, 1, 2)))):
         low, high = draw(st.sampled_from(GRAVITY_RANGES))
         zero = draw(st.integers(low, high))
-        channels += tuple(
-            Channel(f"v{v}{a}", "raw", "acceleration", offset=zero, valid_min=low, valid_max=high) for a in "xyz"
-        )
+        kind = draw(st.sampled_from(("acceleration", "angular rate"))) if calibrated and v == 1 else "acceleration"
+        channels += tuple(Channel(f"v{v}{a}", "raw", kind, offset=zero, valid_min=low, valid_max=high) for a in "xyz")
         vectors.append(tuple(f"v{v}{a}" for a in "xyz"))
+    themselves: tuple[str, ...] = ()
+    if calibrated:
+        themselves = tuple(a for v in vectors[-draw(st.integers(1, 2)) :] for a in v)
+        fitting = [i for i, edges in enumerate(ranges) if max(map(abs, edges)) <= MOST_CALIBRATED_OTHER]
+        themselves += tuple(f"c{i}" for i in fitting if draw(st.booleans()))
     derived = tuple(Derived(f"m{i}", "magnitude", tuple(f"c{k}" for k in of)) for i, of in enumerate(magnitudes))
     names = [c.name for c in channels] + [d.name for d in derived]
     inputs = draw(st.lists(st.sampled_from(names), min_size=1, max_size=11))
@@ -65,7 +69,7 @@ def any_layout(draw: st.DrawFn, calibrated: bool = False) -> Layout:
         csv=CsvFormat(("device_ms",), ("device_ms",), ","),
         gap_ms=draw(st.sampled_from((30, 100, 250, 4000))),
         vectors=tuple(vectors),
-        self_calibration=tuple(a for v in vectors[-draw(st.integers(1, 2)) :] for a in v) if calibrated else (),
+        self_calibration=themselves,
     )
     return layout.for_vectors() if vectors else layout
 

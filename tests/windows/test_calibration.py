@@ -159,8 +159,14 @@ def test_a_session_can_be_read_from_another_state(tmp_path: Path) -> None:
         ({"self_calibration": ("x", "y")}, "accepted are all three axes"),
         ({"self_calibration": ("x", "y", "z"), "vectors": ()}, "here none"),
         (
-            {"self_calibration": tuple("xxyyzz"), "vectors": (tuple("xyz"), tuple("zyx"))},
-            "no axis in two of them, here x, y, z; z, y, x",
+            {"self_calibration": ("x", "y", "z"), "vectors": (tuple("xyz"), tuple("zyx"))},
+            "names x, y, z twice, or two vectors with it",
+        ),
+        ({"self_calibration": tuple("xxyz")}, "names x twice"),
+        ({"self_calibration": ("x", "y", "z", "w")}, "'w'"),
+        (
+            {"self_calibration": ("x",), "vectors": (), "channels": (replace(WIDE[0], kind="count"), *WIDE[1:])},
+            "has no scale to find",
         ),
         ({"channels": tuple(replace(c, valid_max=1e6) for c in WIDE)}, "within ±524288"),
     ],
@@ -183,7 +189,8 @@ def test_a_long_stream_halves_its_sums_and_reads_on(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(calibration, "MOST_WEIGHT", 1 << 16)
     halving = SelfCalibration(LAYOUT)
     out = halving.apply(x)
-    assert 1 << 14 < halving._fits[0]._weight <= 1 << 16
+    (fit,) = halving._fits
+    assert isinstance(fit, calibration.SphereFit) and 1 << 14 < fit._weight <= 1 << 16
     assert np.abs(out - long)[-1500:].mean() < 0.01 * UNIT and not np.array_equal(out, long)
     one_by_one = SelfCalibration(LAYOUT)
     assert [one_by_one.push(row) for row in x.tolist()] == out.tolist()
@@ -194,3 +201,40 @@ def test_without_such_sensors_samples_stay_as_they_are() -> None:
     plain = SelfCalibration(PLAIN)
     assert plain.apply(x).tolist() == x.tolist()
     assert list(plain.push(x[0].tolist())) == x[0].tolist()
+
+
+PLUSH = load_layout("plush-15")
+TOUCH = replace(PLUSH, self_calibration=PLUSH.names)  # ten channels alone, and an accelerometer
+
+
+def touches(n: int, seed: int) -> NDArray[np.int64]:
+    """Readings (n, 13): channels that are touched for one second of four, and an accelerometer."""
+    rng = np.random.default_rng(seed)
+    touched = (np.arange(n)[:, None] // 100 + np.arange(10)) % 4 == 1
+    # A hand is less still than nothing; where it is not, what is rest may depend on rounding.
+    x = 4000.0 + 20_000.0 * touched + rng.normal(size=(n, 10)) * np.where(touched, 1500.0, 40.0)
+    return np.concatenate([np.rint(x).astype(np.int64), readings(n, seed)], axis=1)
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 1 << 20), st.floats(0.2, 5.0), st.integers(-100_000, 100_000))
+def test_other_channels_with_any_gain_and_offset_give_the_same(seed: int, gain: float, offset: int) -> None:
+    x = touches(2500, seed)
+    plain = SelfCalibration(TOUCH).apply(x)[:, :10]
+    changed = x.copy()
+    changed[:, :10] = np.rint(x[:, :10] * gain + offset)
+    other = SelfCalibration(TOUCH).apply(changed)[:, :10]
+    # Until the spread is that of touch, it is a multiple of the noise, which is rounded more where the gain is small.
+    assert np.abs(other - plain)[2000:].max() <= 0.02 * UNIT
+    state = SelfCalibration(TOUCH)
+    assert [state.push(row)[:10] for row in changed.tolist()] == other.tolist()
+
+
+def test_a_touched_channel_reads_zero_at_rest_and_one_when_touched() -> None:
+    x = touches(6000, 1)
+    out = SelfCalibration(TOUCH).apply(x)[3000:, 0]
+    touched = x[3000:, 0] > 14_000
+    assert abs(np.median(out[~touched])) < 0.02 * UNIT
+    assert np.median(out[touched]) == pytest.approx(UNIT, rel=0.1)
+    still = np.rint(np.random.default_rng(1).normal(700.0, 6.0, (3000, 13))).astype(np.int64)
+    assert np.abs(SelfCalibration(TOUCH).apply(still)[:, :10]).max() < 0.8 * UNIT, "noise is no touch"

@@ -22,8 +22,9 @@ GRAVITY_FRACTION_BITS = 4
 GRAVITY_STATE_BITS = 10  # fraction bits of the running mean itself
 GRAVITY_S = 0.64  # time constant of the running mean; chosen on 14 people (bench/people.py)
 CALIBRATION_BLOCK_S = 0.32
-MOST_CALIBRATED_VECTORS = 8  # as many flags as fit a byte of the image
-MOST_CALIBRATED = 1 << 19  # size of a reading in steps, so that the sums of a self-calibration fit 64 bits
+MOST_CALIBRATED_SENSORS = 64
+# Size of a reading in steps, so that the sums of a self-calibration fit 64 bits: of accelerometers, of other channels.
+MOST_CALIBRATED, MOST_CALIBRATED_OTHER = 1 << 19, 1 << 20
 ACCELERATION = "acceleration"
 BINARY, COUNT = "binary", "count"
 DERIVED_KINDS = ("magnitude", "gravity")
@@ -169,8 +170,10 @@ class Layout:
             anew (1 to 60000, and at most 60000 samples).
         vectors: the axes of each three-axis sensor as a list of three channels of one kind. With an acceleration among
             them, the default network does not depend on how the toy is held.
-        self_calibration: axes of accelerometers whose zero and 1 g are found from the readings themselves, while they
-            come; their offsets in ``channels`` then do not matter. All three axes of vectors (default: none).
+        self_calibration: channels whose zero and scale are found from the readings themselves, while they come; their
+            offsets in ``channels`` then do not matter. Of accelerometers, all three axes of vectors: zero and 1 g. Of
+            other channels, such as capacitive ones or gyroscopes: rest, and how far touch or movement leads away from
+            it; the three axes of a vector have one scale and are named together (default: none).
     """
 
     name: str
@@ -259,22 +262,32 @@ class Layout:
                 )
 
     def _problems_of_calibration(self, kinds: Mapping[str, str]) -> Iterator[str]:
-        accelerometers = [v for v in self.vectors if kinds[v[0]] == ACCELERATION]
-        whole = [axis for v in accelerometers if set(v) <= set(self.self_calibration) for axis in v]
-        if sorted(self.self_calibration) != sorted(whole) or len(set(whole)) < len(whole):
-            known = "; ".join(", ".join(v) for v in accelerometers) or "none"
-            yield (
-                f"self_calibration is {', '.join(self.self_calibration)}: accepted are all three axes of vectors of "
-                f"the kind '{ACCELERATION}', no axis in two of them, here {known}."
-            )
-        if len(whole) > 3 * MOST_CALIBRATED_VECTORS:
-            yield f"self_calibration names {len(whole) // 3} sensors: accepted are up to {MOST_CALIBRATED_VECTORS}."
-        for axis in whole:
-            at = self.index(axis)
-            if max(abs(int(self.valid_min_int[at])), abs(int(self.valid_max_int[at]))) > MOST_CALIBRATED:
+        if not self.self_calibration:
+            return
+        named, sensors = self.self_calibration, self.calibrated_sensors
+        axes = [self.names[at] for sensor in sensors for at in sensor]
+        if twice := [name for name in dict.fromkeys(named) if named.count(name) > 1 or axes.count(name) > 1]:
+            yield f"self_calibration names {', '.join(twice)} twice, or two vectors with it: accepted is once."
+        for vector in self.vectors:
+            if 0 < len(set(vector) & set(named)) < len(set(vector)):
                 yield (
-                    f"channel '{axis}' is in self_calibration but is valid from {self.valid_min_int[at]} to "
-                    f"{self.valid_max_int[at]} steps: give it valid_min and valid_max within ±{MOST_CALIBRATED}."
+                    f"self_calibration names {', '.join(a for a in vector if a in named)}: accepted are all three axes "
+                    f"of a vector, here {', '.join(vector)}."
+                )
+        for (name,) in (tuple(self.names[at] for at in sensor) for sensor in sensors if len(sensor) == 1):
+            if kinds[name] == ACCELERATION:
+                known = "; ".join(", ".join(v) for v in self.vectors if kinds[v[0]] == ACCELERATION) or "none"
+                yield f"self_calibration names {name}: accepted are all three axes of an accelerometer, here {known}."
+            elif kinds[name] in (BINARY, COUNT):
+                yield f"self_calibration names {name}: a channel of the kind '{kinds[name]}' has no scale to find."
+        if len(sensors) > MOST_CALIBRATED_SENSORS:
+            yield f"self_calibration names {len(sensors)} sensors: accepted are up to {MOST_CALIBRATED_SENSORS}."
+        for name in named:
+            at, most = self.index(name), MOST_CALIBRATED if kinds[name] == ACCELERATION else MOST_CALIBRATED_OTHER
+            if max(abs(int(self.valid_min_int[at])), abs(int(self.valid_max_int[at]))) > most:
+                yield (
+                    f"channel '{name}' is in self_calibration but is valid from {self.valid_min_int[at]} to "
+                    f"{self.valid_max_int[at]} steps: give it valid_min and valid_max within ±{most}."
                 )
 
     @property
@@ -323,9 +336,12 @@ class Layout:
         return max(0, round(math.log2(GRAVITY_S * self.rate_hz)))
 
     @property
-    def calibrated_vectors(self) -> tuple[tuple[int, ...], ...]:
-        """Indices of the channels (x, y, z) of each accelerometer that calibrates itself."""
-        return tuple(tuple(map(self.index, v)) for v in self.vectors if set(v) <= set(self.self_calibration))
+    def calibrated_sensors(self) -> tuple[tuple[int, ...], ...]:
+        """Indices of the channels of each sensor that calibrates itself: the axes of vectors, then single channels."""
+        named = set(self.self_calibration)
+        vectors = [vector for vector in self.vectors if set(vector) <= named]
+        alone = named - {axis for vector in vectors for axis in vector}
+        return tuple(tuple(map(self.index, sensor)) for sensor in (*vectors, *((n,) for n in self.names if n in alone)))
 
     @property
     def calibration_shift(self) -> int:

@@ -198,7 +198,7 @@ def code_files(model: IntegerModel, bundle: Bundle) -> dict[str, bytes]:
     facts = facts_of(model, bundle, image)
     return {
         **{
-            name: library_text(name, window=model.is_window, calibrate=bool(model.layout.calibrated_vectors)).encode()
+            name: library_text(name, window=model.is_window, calibrate=bool(model.layout.self_calibration)).encode()
             for name in LIBRARY
         },
         MODEL[0]: _header(facts).encode(),

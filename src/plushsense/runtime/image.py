@@ -9,8 +9,8 @@ of everything after the head. The following sections come in this order:
 - for each measured channel: i32 lowest and i32 highest valid value, i32 zero
 - for each input: u8 kind (0 channel, 1 magnitude, 2 gravity), u8 n, u8 shift of the running mean (else 0), n × u8
   measured channels
-- self-calibration, only in images of such models: u8 sensors (1 to 8); for each, 3 × u8 measured channels, u8 binary
-  logarithm of the samples in a block
+- self-calibration, only in images of such models: u8 sensors (1 to 64); for each, 3 × u8 measured channels (a single
+  one three times), u8 binary logarithm of the samples in a block, plus 128 if it is no accelerometer
 - vector layer: u8 vectors, u8 filters, u16 taps (all 0 without one); then for each vector: u8 shift + 16, and for each
   filter: u8 down, taps × u8 weight + 128
 - 0 to 3 bytes 0, up to a multiple of 4 bytes from the beginning: scales and weights of all layers are then aligned
@@ -53,7 +53,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BundleError
 from plushsense.core.gestures import GestureSet
-from plushsense.core.layouts import Layout
+from plushsense.core.layouts import ACCELERATION, Layout
 from plushsense.runtime.decisions import Rules
 from plushsense.runtime.events import AFFECT_CODES
 from plushsense.runtime.fixed import PROBABILITY_BITS, LogitScale, Requantize
@@ -67,7 +67,8 @@ PATCH_MAGIC = b"PLPT"
 IMAGE_VERSION = 6
 WINDOW_IMAGE_VERSION = 7  # of window networks; otherwise as 6
 _CALIBRATED = 2  # added to the version of a model with a self-calibration
-SENSOR_BYTES = 192  # of the state of a sensor that calibrates itself
+_NO_SPHERE = 128  # added to the shift of a sensor that is no accelerometer
+SENSOR_BYTES = 200  # of the state of a sensor that calibrates itself
 HEAD_BYTES = 16
 IDLE_BIT = 4
 GROUP = 4  # number of filters, and of channels, in a block of weights
@@ -157,7 +158,7 @@ class IntegerModel:
     def image_version(self) -> int:
         """Version of the image, and of a patch of it."""
         version = WINDOW_IMAGE_VERSION if self.is_window else IMAGE_VERSION
-        return version + _CALIBRATED if self.layout.calibrated_vectors else version
+        return version + _CALIBRATED if self.layout.self_calibration else version
 
     @property
     def pooled_steps(self) -> int:
@@ -205,10 +206,13 @@ class IntegerModel:
             shift = layout.gravity_shift if kind == "gravity" else 0
             source = bytes([_INPUT_KINDS.index(kind), len(parts), shift, *parts])
             sections.append((f"input '{name}': {kind}, measured channels", source))
-        if layout.calibrated_vectors:
-            plan = [bytes([*axes, layout.calibration_shift]) for axes in layout.calibrated_vectors]
-            title = "self-calibration: sensors; measured channels and shift of a block of each"
-            sections.append((title, bytes([len(plan)]) + b"".join(plan)))
+        if layout.self_calibration:
+            plan = [bytes([len(layout.calibrated_sensors)])]
+            for axes in layout.calibrated_sensors:
+                other = _NO_SPHERE * (layout.channels[axes[0]].kind != ACCELERATION)
+                plan.append(bytes([*(axes if len(axes) > 1 else 3 * axes), layout.calibration_shift + other]))
+            title = "self-calibration: sensors; measured channels, shift of a block and kind of each"
+            sections.append((title, b"".join(plan)))
         sections += _vectors(self.network.vectors)
         sections.append(("filling up to a multiple of 4 bytes", bytes(-sum(len(piece) for _, piece in sections) % 4)))
         scale = self.network.inputs
@@ -350,7 +354,7 @@ def memory_bytes(model: IntegerModel) -> int:
     health = model.rules.health
     if health.low or health.still_ms:
         pieces.append(4 * channels)  # the frame before
-    if sensors := len(model.layout.calibrated_vectors):
+    if sensors := len(model.layout.calibrated_sensors):
         pieces.append(SENSOR_BYTES * sensors + 4)
     if gate.rules:
         past = max((s.lag for s in gate.signals if s.kind == JERK), default=1)

@@ -1,14 +1,19 @@
-"""Self-calibration: offset and scale of accelerometers, estimated from the samples so far, without labels.
+"""Self-calibration: offset and scale of channels, estimated from the samples so far, without labels.
 
-Held still, an accelerometer reads a vector of 1 g, whatever its direction: readings lie on a sphere whose centre is the
-offset of the sensor and whose radius is 1 g (autocalibration, van Hees et al. 2014, 10.1152/japplphysiol.00421.2014).
-Each axis of the vectors named in ``Layout.self_calibration`` becomes ``(reading - centre) * UNIT / radius``, so that
-readings with another gain and offset give the same numbers but for rounding. All in integers, and causal:
+In integers, and causal. A channel of ``Layout.self_calibration`` becomes ``(reading - offset) * UNIT / scale``, so that
+readings with another gain above 0 and another offset give the same numbers but for rounding. Until the first block of
+about 0.3 s is complete, the output is 0. The state survives gaps, and is cleared by a new stream. Quotients are rounded
+toward 0. ``deploy/c/plushsense.c`` computes the same.
 
-1. Samples are taken in blocks of about 0.3 s. A block gives the mean m of the vector and its variance within the block.
-2. The weight of a block is ``(level / (variance + level))²``; the level follows the variance of the stillest blocks: it
-   falls by 1/4 where a block is stiller, else rises by 1/32, so that a sixth of the blocks is.
-3. Weighted sums of m, of the products of its components, of ``q = |m|²``, ``q m`` and ``q²`` are kept; all are halved
+Samples are taken in blocks. A block gives the mean m of each axis and their variance within the block. Its weight is
+``(level / (variance + level))²``; the level follows the variance of the stillest blocks: it falls by 1/4 where a block
+is stiller, else rises by 1/32, so that a sixth of the blocks is.
+
+**Accelerometers** (`SphereFit`). Held still, an accelerometer reads a vector of 1 g, whatever its direction: readings
+lie on a sphere whose centre is the offset of the sensor and whose radius is 1 g (autocalibration, van Hees et al. 2014,
+10.1152/japplphysiol.00421.2014):
+
+1. Weighted sums of m, of the products of its components, of ``q = |m|²``, ``q m`` and ``q²`` are kept; all are halved
    when the sum of weights exceeds `MOST_WEIGHT`. With d the distance of the centre from the weighted mean of m, least
    squares ask for ``A d = b``: A is the covariance of m, b half the covariance of ``|m - mean|²`` and m. While the
    sensor has hardly been turned, noise makes such a sphere too small. So the variance of the distances from the sphere
@@ -16,11 +21,21 @@ readings with another gain and offset give the same numbers but for rounding. Al
    that of the previous centre, and at most the determinant of A divided by the sum of its principal minors of order
    two, which is not above the smallest eigenvalue. Each block makes eight Gauss-Seidel sweeps from the previous centre,
    so that a direction which nothing is known of keeps what it had.
-4. The square of the radius is the mean of ``|m - centre|²``, but at least `LEAST_RADIUS` times the level, so that a
+2. The square of the radius is the mean of ``|m - centre|²``, but at least `LEAST_RADIUS` times the level, so that a
    sensor that was not turned yet does not show its noise as movement.
 
-Until the first block is complete, the output is 0. The state survives gaps, and is cleared by a new stream. Quotients
-are rounded toward 0. ``deploy/c/plushsense.c`` computes the same.
+**Other channels** (`RunningQuantiles`), each alone, but the three axes of a vector together, with one scale:
+
+1. Of each interval, the mean of the block with the greatest weight is kept. An interval is one block at first. Whenever
+   `KEPT` means have come, the one with the greater weight of every two stays, and intervals become twice as long, up to
+   `MOST_INTERVAL` blocks.
+2. The offset, rest, is the median of these means, each with its weight: at most half of them, by weight, may be touch.
+3. The distance of a block from rest is the root mean square of its samples. The scale, spread, is a high quantile of
+   the distances, by stochastic approximation: it rises to the distance of a block that is farther away, but at most to
+   twice itself, and falls by 1 / 1024 in other blocks. Blocks nearer than the least spread, without touch and
+   movement, change nothing: how long a sensor rests between touches does not matter.
+4. The least spread is the root of `LEAST_SPREAD` times the level, so that a sensor that only rested does not show its
+   noise as touch.
 """
 
 from __future__ import annotations
@@ -32,9 +47,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.layouts import Layout
+from plushsense.core.layouts import ACCELERATION, Layout
 
-UNIT = 2048  # of the output: 1 g
+UNIT = 2048  # of the output: 1 g, or the spread
 MOST_OUTPUT = 32767
 MEAN_BITS = 12  # magnitude of the components of m: larger ones raise the exponent of all sums
 WEIGHT_BITS = 14
@@ -46,6 +61,10 @@ OFFSET_BITS = 4  # fraction bits of the offset that is subtracted
 _MOST_VARIANCE = (1 << 47) - 1
 _VARIANCE_OF_STEPS = 256  # three times that of rounding to whole numbers, in the units of the variance
 _SWEEPS = 8
+KEPT = 8
+MOST_INTERVAL = 128  # 40 s
+LEAST_SPREAD = 64
+_SPREAD_BITS = 10  # fraction bits of the spread, and binary logarithm of its slowness
 _MINOR_BITS = 20  # magnitude of the covariance from which determinant and minors are computed
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 _PLACE = ((0, 3, 4), (3, 1, 5), (4, 5, 2))  # of the product of two components among the pairs
@@ -58,21 +77,17 @@ def _quotient(a: int, b: int) -> int:
     return a // b if a >= 0 else -(-a // b)
 
 
-class SphereFit:
-    """The state of one accelerometer: sums over blocks, and the offset and scale that follow from them."""
+class _Blocks:
+    """Offset and scale of a sensor with A axes, which each complete block of samples changes."""
 
-    def __init__(self, shift: int) -> None:
+    def __init__(self, axes: int, shift: int) -> None:
+        self._axes = axes
         self._shift = shift  # binary logarithm of the samples in a block
-        self._base: list[int] | None = None  # the first sample, from which all is measured
+        self._base: list[int] = []  # the first sample, from which all is measured
         self._count = 0
-        self._sum, self._squares = [0, 0, 0], 0
+        self._sum, self._squares = [0] * axes, 0
         self._level = 0
-        self._exponent = 0
-        self._weight = 0
-        self._first, self._second = [0] * 3, [0] * 6
-        self._square, self._third, self._fourth = 0, [0] * 3, 0
-        self._centre = [0, 0, 0]
-        self.offset = [0, 0, 0]  # with `OFFSET_BITS`
+        self.offset = [0] * axes  # with `OFFSET_BITS`
         self.multiplier = 0  # 0 before the first block, else 16 bits
         self.down = 1
 
@@ -82,26 +97,24 @@ class SphereFit:
         return (1 << self._shift) - self._count
 
     def output(self, axis: int, x: int) -> int:
-        """Return a reading of an axis in steps of 1 / `UNIT` g."""
+        """Return a reading of an axis in steps of 1 / `UNIT` of the scale."""
         scaled = ((x << OFFSET_BITS) - self.offset[axis]) * self.multiplier + (1 << (self.down - 1)) >> self.down
         return min(max(scaled, -MOST_OUTPUT), MOST_OUTPUT)
 
     def outputs(self, x: Ints) -> Ints:
-        """Return readings (n, 3) in steps of 1 / `UNIT` g, with the current offset and scale."""
+        """Return readings (n, A) in steps of 1 / `UNIT` of the scale, with the current offset and scale."""
         scaled = ((x << OFFSET_BITS) - np.array(self.offset)) * self.multiplier + (1 << (self.down - 1)) >> self.down
         return np.asarray(np.clip(scaled, -MOST_OUTPUT, MOST_OUTPUT), dtype=np.int64)
 
     def add(self, x: Sequence[int]) -> None:
-        """Add one sample (3,)."""
-        if self._base is None:
-            self._base = list(x)
+        """Add one sample (A,)."""
+        self._base = self._base or list(x)
         y = [a - b for a, b in zip(x, self._base, strict=True)]
         self._take(y, sum(v * v for v in y), 1)
 
     def add_all(self, x: Ints) -> None:
-        """Add samples (n, 3) of one block, at most those that are `left`."""
-        if self._base is None:
-            self._base = x[0].tolist()
+        """Add samples (n, A) of one block, at most those that are `left`."""
+        self._base = self._base or x[0].tolist()
         y = x - np.array(self._base)
         self._take(y.sum(axis=0).tolist(), int((y * y).sum()), len(y))
 
@@ -111,16 +124,39 @@ class SphereFit:
         self._count += n
         if self._count >> self._shift:
             self._block()
-            self._count, self._sum, self._squares = 0, [0, 0, 0], 0
+            self._count, self._sum, self._squares = 0, [0] * self._axes, 0
 
     def _block(self) -> None:
         """Take a complete block into account."""
-        variance = (self._squares << self._shift) - sum(v * v for v in self._sum) + _VARIANCE_OF_STEPS
+        raise NotImplementedError
+
+    @property
+    def _variance(self) -> int:
+        """The variance of the block's samples, in units of the square of one over their number."""
+        return (self._squares << self._shift) - sum(v * v for v in self._sum)
+
+    def _weight_of(self, variance: int) -> int:
+        """Return the weight of a block with this variance, and let the level follow."""
         variance = min(variance, _MOST_VARIANCE)
         level = self._level or variance
         share = (level << WEIGHT_BITS) // (variance + level)
         self._level = level - (level >> 2) if variance < level else level + (level >> 5)
-        self._add_mean(share * share >> WEIGHT_BITS)
+        return share * share >> WEIGHT_BITS
+
+
+class SphereFit(_Blocks):
+    """The state of one accelerometer: sums over blocks, and the offset and scale that follow from them."""
+
+    def __init__(self, shift: int) -> None:
+        super().__init__(3, shift)
+        self._exponent = 0
+        self._weight = 0
+        self._first, self._second = [0] * 3, [0] * 6
+        self._square, self._third, self._fourth = 0, [0] * 3, 0
+        self._centre = [0, 0, 0]
+
+    def _block(self) -> None:
+        self._add_mean(self._weight_of(self._variance + _VARIANCE_OF_STEPS))
         self._fit()
 
     def _add_mean(self, w: int) -> None:
@@ -193,7 +229,6 @@ class SphereFit:
         self.multiplier = (1 << (bits + 15)) // radius
         self.down = bits + self._exponent - self._shift
         to_raw = FRACTION_BITS + self._shift - OFFSET_BITS
-        assert self._base is not None
         self.offset = [
             (x << OFFSET_BITS) + _quotient(c << self._exponent, 1 << to_raw)
             for x, c in zip(self._base, self._centre, strict=True)
@@ -221,26 +256,82 @@ def _least_eigenvalue(a: list[int]) -> int:
     return max(determinant, 0) // max(sum(minors), 1) << down
 
 
+class RunningQuantiles(_Blocks):
+    """The state of one channel, or of the three axes of a vector: means of still blocks, and the spread."""
+
+    def __init__(self, axes: int, shift: int) -> None:
+        super().__init__(axes, shift)
+        self._kept: list[tuple[int, list[int]]] = []  # weight and sum of blocks, the last of the interval at hand
+        self._interval, self._blocks = 1, 0
+        self._rest = [0] * axes  # as the sum of a block
+        self._spread = 0  # as the sum of a block, with `_SPREAD_BITS`
+
+    def _block(self) -> None:
+        variance = self._variance
+        # An eighth of a step's square for each axis: more than that of rounding, and never 0.
+        self._keep(self._weight_of(variance + (self._axes << (2 * self._shift - 3))))
+        distance = math.isqrt(variance + sum((v - rest) ** 2 for v, rest in zip(self._sum, self._rest, strict=True)))
+        least = max(math.isqrt(LEAST_SPREAD * self._level), 1)
+        spread = max(self._spread >> _SPREAD_BITS, least)
+        if distance > spread:
+            self._spread = min(distance, 2 * spread) << _SPREAD_BITS
+        elif distance > least:
+            self._spread -= self._spread >> _SPREAD_BITS
+        spread = max(self._spread >> _SPREAD_BITS, least)
+        bits = spread.bit_length()
+        self.multiplier = (1 << (bits + 15)) // spread
+        self.down = bits + 8 - self._shift
+        self.offset = [
+            (x << OFFSET_BITS) + _quotient(rest << OFFSET_BITS, 1 << self._shift)
+            for x, rest in zip(self._base, self._rest, strict=True)
+        ]
+
+    def _keep(self, weight: int) -> None:
+        """Keep the block if it is the stillest of its interval so far; at the end of an interval, derive rest."""
+        if self._blocks == 0:
+            self._kept.append((weight, self._sum))
+        elif weight > self._kept[-1][0]:
+            self._kept[-1] = weight, self._sum
+        self._blocks += 1
+        if self._blocks < self._interval:
+            return
+        self._blocks = 0
+        if len(self._kept) == KEPT:
+            pairs = zip(self._kept[::2], self._kept[1::2], strict=True)
+            self._kept = [other if other[0] > one[0] else one for one, other in pairs]
+            self._interval = min(2 * self._interval, MOST_INTERVAL)
+        whole = sum(weight for weight, _ in self._kept)
+        for axis in range(self._axes):
+            values = [(kept[axis], weight) for weight, kept in self._kept]
+            self._rest[axis] = min(
+                value for value, _ in values if 2 * sum(w for other, w in values if other <= value) >= whole
+            )
+
+
 class SelfCalibration:
-    """The self-calibration of all accelerometers that a layout names."""
+    """The self-calibration of all sensors that a layout names."""
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
         self._zeros = layout.zero_int.tolist()
-        self._vectors = layout.calibrated_vectors
+        self._sensors = layout.calibrated_sensors
         self.reset()
 
     def reset(self) -> None:
         """Forget all samples, as at the beginning of a new stream."""
-        self._fits = [SphereFit(self._layout.calibration_shift) for _ in self._vectors]
+        shift, kinds = self._layout.calibration_shift, [c.kind for c in self._layout.channels]
+        self._fits: list[_Blocks] = [
+            SphereFit(shift) if kinds[axes[0]] == ACCELERATION else RunningQuantiles(len(axes), shift)
+            for axes in self._sensors
+        ]
 
     def copy(self) -> SelfCalibration:
         """Return an independent copy with the same state."""
         return copy.deepcopy(self)
 
     def push(self, sample: list[int]) -> list[int]:
-        """Return one sample (C,) with calibrated axes, around the offsets of the layout."""
-        for axes, fit in zip(self._vectors, self._fits, strict=True):
+        """Return one sample (C,) with calibrated channels, around the offsets of the layout."""
+        for axes, fit in zip(self._sensors, self._fits, strict=True):
             x = [sample[axis] for axis in axes]
             sample = list(sample)
             for number, axis in enumerate(axes):
@@ -249,11 +340,11 @@ class SelfCalibration:
         return sample
 
     def apply(self, data: Ints) -> Ints:
-        """Return consecutive samples (T, C) with calibrated axes; the same as `push` of each."""
-        if not self._vectors:
+        """Return consecutive samples (T, C) with calibrated channels; the same as `push` of each."""
+        if not self._sensors:
             return data
         out = data.copy()
-        for axes, fit in zip(self._vectors, self._fits, strict=True):
+        for axes, fit in zip(self._sensors, self._fits, strict=True):
             columns, at = list(axes), 0
             x = data[:, columns]
             while at < len(x):

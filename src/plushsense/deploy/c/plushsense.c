@@ -62,8 +62,9 @@
 #define MOST_AXIS_SHIFT 16u
 #define MOST_MEAN_SHIFT 15u
 #ifdef PLUSH_CALIBRATE
-#define MOST_SENSORS 8u
-#define MOST_READING (INT32_C(1) << 19) /* of a self-calibration, so that its sums fit 64 bits */
+#define MOST_SENSORS 64u
+#define NO_SPHERE 128u /* added to the shift of a sensor that is no accelerometer */
+#define MOST_READING (INT32_C(1) << 19) /* of an accelerometer that calibrates itself, so that its sums fit 64 bits */
 #define LEAST_BLOCK_SHIFT 2u
 #define MOST_BLOCK_SHIFT 8u
 #endif /* PLUSH_CALIBRATE */
@@ -482,30 +483,33 @@ PLUSH_SMALL static int read_input_plan(plush_toy *toy, source *from)
 }
 
 #ifdef PLUSH_CALIBRATE
-/* The accelerometers that calibrate themselves: of each, three channels, and the binary logarithm of a block's samples. */
+/* The sensors that calibrate themselves: of each, three channels, or one three times, and shift and kind. */
 PLUSH_SMALL static int read_sensors(plush_toy *toy, source *from)
 {
-    const uint8_t *p = next_bytes(from, 1);
-    uint32_t i, k;
+    const uint8_t *p = next_bytes(from, 1), *range;
+    uint32_t n, i, k;
 
     toy->sensors = p == NULL ? 0 : *p;
     toy->sensor_plan = p = next_bytes(from, 4u * toy->sensors);
     if (p == NULL || toy->sensors == 0 || toy->sensors > MOST_SENSORS)
         return 0;
-    for (i = 0; i < 4u * toy->sensors; i++) {
-        const uint8_t *range;
+    for (n = 0; n < 4u * toy->sensors; n += 4) {
+        uint32_t other = p[n + 3] / NO_SPHERE, shift = p[n + 3] % NO_SPHERE;
 
-        if (i % 4 == 3 ? p[i] < LEAST_BLOCK_SHIFT || p[i] > MOST_BLOCK_SHIFT : p[i] >= toy->channels)
+        if (shift < LEAST_BLOCK_SHIFT || shift > MOST_BLOCK_SHIFT)
             return 0;
-        if (i % 4 == 3)
-            continue;
-        range = toy->ranges + RANGE_BYTES * p[i];
-        if (as_signed(word_at(range)) < -MOST_READING || as_signed(word_at(range + 4)) > MOST_READING)
-            return 0;
-        /* What a sensor puts in place of a reading is no reading for another. */
-        for (k = 0; k < i; k++)
-            if (k % 4 != 3 && p[k] == p[i])
+        for (i = n; i < n + 3; i++) {
+            if (p[i] >= toy->channels)
                 return 0;
+            range = toy->ranges + RANGE_BYTES * p[i];
+            if (as_signed(word_at(range)) < -MOST_READING * (other ? 2 : 1)
+                || as_signed(word_at(range + 4)) > MOST_READING * (other ? 2 : 1))
+                return 0;
+            /* What a sensor puts in place of a reading is no reading for another. */
+            for (k = 0; k < i; k++)
+                if (k % 4 != 3 && p[k] == p[i] && !(other && k >= n && p[n] == p[n + 1] && p[n] == p[n + 2]))
+                    return 0;
+        }
     }
     return 1;
 }
@@ -2165,6 +2169,9 @@ static void read_inputs(plush_toy *toy)
 #define MINOR_BITS 20u
 #define MOST_OUTPUT 32767
 #define MOST_CENTRE (INT64_C(4) << 20)
+#define MOST_INTERVAL_BITS 7u
+#define LEAST_SPREAD 64u
+#define SPREAD_BITS 10u
 
 /* Halves, or quarters and so on, toward 0. */
 PLUSH_SMALL static void divide(int64_t *sums, uint32_t n, int64_t by)
@@ -2209,14 +2216,15 @@ PLUSH_SMALL static int64_t least_eigenvalue(const int64_t *a)
 }
 
 /* The mean of a block, with its weight, into the sums. */
-PLUSH_SMALL static void add_mean(plush_sensor *s, int64_t weight)
+PLUSH_SMALL static void add_mean(plush_sensor *sensor, int64_t weight)
 {
+    plush_sphere *s = &sensor->of.sphere;
     int64_t m[3], squared = 0;
     uint32_t top = 0, i, n = 3;
 
     for (i = 0; i < 3; i++)
-        top |= distance_of(s->sum[i], 0);
-    for (; top >> (s->exponent + MEAN_SIZE_BITS) != 0; s->exponent++) {
+        top |= distance_of(sensor->sum[i], 0);
+    for (; top >> (sensor->exponent + MEAN_SIZE_BITS) != 0; sensor->exponent++) {
         divide(s->first, 3, 2);
         divide(s->second, 6, 4);
         divide(&s->square, 1, 4);
@@ -2226,7 +2234,7 @@ PLUSH_SMALL static void add_mean(plush_sensor *s, int64_t weight)
             s->centre[i] /= 2;
     }
     for (i = 0; i < 3; i++) {
-        m[i] = s->sum[i] / (INT32_C(1) << s->exponent);
+        m[i] = sensor->sum[i] / (INT32_C(1) << sensor->exponent);
         squared += m[i] * m[i];
     }
     squared >>= SQUARE_BITS;
@@ -2251,13 +2259,25 @@ PLUSH_SMALL static void add_mean(plush_sensor *s, int64_t weight)
     }
 }
 
-/* The centre moves toward the solution of A d = b; offset and scale follow. All with 8 fraction bits, products with 16. */
-PLUSH_SMALL static void fit_sphere(plush_sensor *s, uint32_t shift)
+/* The multiplier and shift by which readings with 4 fraction bits become 2048 for a scale, given that times 2^-more. */
+PLUSH_SMALL static void set_scale(plush_sensor *s, uint32_t scale, int32_t more)
 {
+    uint32_t bits = 0;
+
+    while (scale >> bits != 0)
+        bits++;
+    s->multiplier = (uint32_t)((UINT64_C(1) << (bits + 15)) / scale);
+    s->down = (uint8_t)((int32_t)bits + more);
+}
+
+/* The centre moves toward the solution of A d = b; offset and scale follow. All with 8 fraction bits, products with 16. */
+PLUSH_SMALL static void fit_sphere(plush_sensor *sensor, uint32_t shift)
+{
+    plush_sphere *s = &sensor->of.sphere;
     int64_t n = s->weight != 0 ? (int64_t)s->weight : 1, mean[3], a[6], b[3], d[3], k[3], whole = s->square / n;
     int64_t over = s->square - whole * n, noise, most, squared = 0, least;
     uint64_t size = UINT64_C(1) << 16;
-    uint32_t radius, bits = 0, i, j;
+    uint32_t radius, i, j;
 
     noise = (s->fourth - whole * s->square - whole * over) / n * (INT64_C(1) << (2 * SQUARE_BITS + 3));
     for (i = 0; i < 6; i++) {
@@ -2288,7 +2308,7 @@ PLUSH_SMALL static void fit_sphere(plush_sensor *s, uint32_t shift)
         d[i] = (b[i] - row_times(a, i, d) + a[i] * d[i]) / (most + 1);
         d[i] = d[i] < -MOST_CENTRE ? -MOST_CENTRE : d[i] > MOST_CENTRE ? MOST_CENTRE : d[i];
     }
-    least = s->level >> (2 * s->exponent);
+    least = sensor->level >> (2 * sensor->exponent);
     least = (least < INT64_C(1) << 36 ? least : INT64_C(1) << 36) * LEAST_RADIUS * 65536;
     squared = (a[0] + a[1] + a[2]) * 256;
     for (i = 0; i < 3; i++)
@@ -2298,40 +2318,106 @@ PLUSH_SMALL static void fit_sphere(plush_sensor *s, uint32_t shift)
     if (squared > (int64_t)size)
         size = (uint64_t)squared;
     radius = square_root(size);
-    while (radius >> bits != 0)
-        bits++;
-    s->multiplier = (uint32_t)((UINT64_C(1) << (bits + 15)) / radius);
-    s->down = (uint8_t)(bits + s->exponent - shift);
+    set_scale(sensor, radius, (int32_t)sensor->exponent - (int32_t)shift);
     for (i = 0; i < 3; i++) {
         int64_t centre = mean[i] + d[i];
 
         s->centre[i] = (int32_t)centre;
-        s->offset[i] = 16 * s->base[i] + (int32_t)(centre * (INT32_C(1) << s->exponent) / (INT32_C(16) << shift));
+        sensor->offset[i] = 16 * sensor->base[i] + (int32_t)(centre * (INT32_C(1) << sensor->exponent) / (INT32_C(16) << shift));
     }
 }
 
-/* A complete block. */
-PLUSH_SMALL static void end_block(plush_sensor *s, uint32_t shift)
+/* At the end of an interval: of every two kept blocks the stiller one stays, when there are enough; then rest. */
+PLUSH_SMALL static void find_rest(plush_sensor *s, uint32_t axes)
 {
-    int64_t variance = s->squares * (INT32_C(1) << shift) + VARIANCE_OF_STEPS, share;
+    plush_quantiles *q = &s->of.quantiles;
+    uint32_t i, j, k, below, whole = 0;
+
+    s->blocks = 0;
+    if (++s->kept == PLUSH_KEPT) {
+        for (i = 0; i < PLUSH_KEPT / 2; i++) {
+            k = 2 * i + (q->weight[2 * i + 1] > q->weight[2 * i]);
+            q->weight[i] = q->weight[k];
+            for (j = 0; j < 3; j++)
+                q->kept[i][j] = q->kept[k][j];
+        }
+        s->kept = PLUSH_KEPT / 2;
+        if (s->exponent < MOST_INTERVAL_BITS)
+            s->exponent++;
+    }
+    for (i = 0; i < s->kept; i++)
+        whole += q->weight[i];
+    for (i = 0; i < axes; i++) {
+        q->rest[i] = INT32_MAX;
+        for (j = 0; j < s->kept; j++) {
+            for (below = 0, k = 0; k < s->kept; k++)
+                if (q->kept[k][i] <= q->kept[j][i])
+                    below += q->weight[k];
+            if (2 * below >= whole && q->kept[j][i] < q->rest[i])
+                q->rest[i] = q->kept[j][i];
+        }
+    }
+}
+
+/* Keeps the block if it is the stillest of its interval so far; offset and scale follow from rest and spread. */
+PLUSH_SMALL static void fit_quantiles(plush_sensor *s, uint32_t axes, uint32_t shift, int64_t squared, int64_t weight)
+{
+    plush_quantiles *q = &s->of.quantiles;
+    int64_t least = square_root((uint64_t)s->level * LEAST_SPREAD), spread, distance;
     uint32_t i;
 
-    for (i = 0; i < 3; i++)
-        variance -= (int64_t)s->sum[i] * s->sum[i];
+    if (s->blocks == 0 || weight > q->weight[s->kept]) {
+        q->weight[s->kept] = (uint16_t)weight;
+        memcpy(q->kept[s->kept], s->sum, sizeof s->sum);
+    }
+    if (++s->blocks >> s->exponent != 0)
+        find_rest(s, axes);
+    for (i = 0; i < axes; i++) {
+        distance = (int64_t)s->sum[i] - q->rest[i];
+        squared += distance * distance;
+    }
+    distance = square_root((uint64_t)squared);
+    least = least > 1 ? least : 1;
+    spread = q->spread >> SPREAD_BITS;
+    spread = spread > least ? spread : least;
+    if (distance > spread)
+        q->spread = (distance < 2 * spread ? distance : 2 * spread) * (INT32_C(1) << SPREAD_BITS);
+    else if (distance > least)
+        q->spread -= q->spread >> SPREAD_BITS;
+    spread = q->spread >> SPREAD_BITS;
+    set_scale(s, (uint32_t)(spread > least ? spread : least), 8 - (int32_t)shift);
+    for (i = 0; i < axes; i++)
+        s->offset[i] = 16 * s->base[i] + (int32_t)((int64_t)q->rest[i] * 16 / (INT32_C(1) << shift));
+}
+
+/* A complete block of a sensor with one or three axes. */
+PLUSH_SMALL static void end_block(plush_sensor *s, uint32_t axes, uint32_t shift, uint32_t other)
+{
+    int64_t squared = s->squares * (INT32_C(1) << shift), variance, share;
+    uint32_t i;
+
+    for (i = 0; i < axes; i++)
+        squared -= (int64_t)s->sum[i] * s->sum[i];
+    variance = squared + (other ? (int64_t)axes << (2 * shift - 3) : VARIANCE_OF_STEPS);
     if (variance > MOST_VARIANCE)
         variance = MOST_VARIANCE;
     if (s->level == 0)
         s->level = variance;
     share = s->level * (INT32_C(1) << SHARE_BITS) / (variance + s->level);
     s->level += variance < s->level ? -(s->level >> 2) : s->level >> 5;
-    add_mean(s, share * share >> SHARE_BITS);
-    fit_sphere(s, shift);
+    share = share * share >> SHARE_BITS;
+    if (other) {
+        fit_quantiles(s, axes, shift, squared, share);
+    } else {
+        add_mean(s, share);
+        fit_sphere(s, shift);
+    }
     s->count = 0;
     s->squares = 0;
     memset(s->sum, 0, sizeof s->sum);
 }
 
-/* The even sample, with calibrated axes around the zeros of their channels. */
+/* The even sample, with calibrated channels around their zeros. */
 PLUSH_CODE
 static void calibrate(plush_toy *toy)
 {
@@ -2340,7 +2426,9 @@ static void calibrate(plush_toy *toy)
     uint32_t n, i;
 
     for (n = 0; n < toy->sensors; n++, s++, plan += 4) {
-        for (i = 0; i < 3; i++) {
+        uint32_t axes = plan[0] == plan[1] ? 1 : 3, shift = plan[3] % NO_SPHERE;
+
+        for (i = 0; i < axes; i++) {
             int32_t *sample = toy->sample + plan[i], x = *sample, y;
             int64_t out = 0;
 
@@ -2359,8 +2447,8 @@ static void calibrate(plush_toy *toy)
             s->squares += (int64_t)y * y;
         }
         s->begun = 1;
-        if (++s->count >> plan[3] != 0)
-            end_block(s, plan[3]);
+        if (++s->count >> shift != 0)
+            end_block(s, axes, shift, plan[3] / NO_SPHERE);
     }
 }
 

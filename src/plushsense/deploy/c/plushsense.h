@@ -41,7 +41,7 @@
 extern "C" {
 #endif
 
-#ifdef PLUSH_CALIBRATE /* models whose accelerometers find their offset and scale themselves */
+#ifdef PLUSH_CALIBRATE /* models whose sensors find their offset and scale themselves */
 #ifdef PLUSH_WINDOW
 #define PLUSH_IMAGE_VERSION 9
 #else
@@ -156,16 +156,36 @@ typedef struct {
 } plush_layer;
 
 #ifdef PLUSH_CALIBRATE
-/* What is known of an accelerometer: sums over the blocks so far, the block at hand, and what follows. */
+/* What is known of an accelerometer: sums over the blocks so far. */
 typedef struct {
     int64_t first[3], second[6];           /* weighted sums of the means, and of their products */
     int64_t square, third[3], fourth;      /* of q, the square of the length, of q times the means, and of q times q */
+    int32_t centre[3];
+    uint32_t weight;
+} plush_sphere;
+
+#define PLUSH_KEPT 8
+
+/* What is known of another sensor, of one channel or of three axes: sums of still blocks, and what follows. */
+typedef struct {
+    int64_t spread;                        /* with 10 fraction bits */
+    int32_t kept[PLUSH_KEPT][3], rest[3];
+    uint32_t spare;                        /* so that no compiler adds bytes of its own */
+    uint16_t weight[PLUSH_KEPT];
+} plush_quantiles;
+
+/* A sensor that calibrates itself: the block at hand, what is known, and what follows. */
+typedef struct {
+    union {
+        plush_sphere sphere;
+        plush_quantiles quantiles;
+    } of;
     int64_t squares, level;                /* of the block at hand; the variance of still blocks */
-    int32_t base[3], sum[3];               /* the first sample, from which all is measured; sums of the block at hand */
-    int32_t centre[3], offset[3];          /* offset: with 4 fraction bits */
-    uint32_t weight, multiplier;
+    int32_t base[3], sum[3], offset[3];    /* the first sample, from which all is measured; offset: with 4 fraction bits */
+    uint32_t multiplier;
     uint16_t count;                        /* samples of the block at hand */
-    uint8_t begun, exponent, down, spare[3];
+    uint8_t begun, down, exponent;         /* exponent: of the sums of a sphere; of the blocks of an interval */
+    uint8_t kept, blocks, spare;           /* kept blocks; blocks of the interval at hand */
 } plush_sensor;
 
 #endif /* PLUSH_CALIBRATE */
@@ -301,7 +321,7 @@ void plush_silence(plush_toy *toy);
 
 #ifdef PLUSH_CALIBRATE
 /* Forgets the past, as after a gap: what is going on ends; the counts stay, and so do a fault and what was found out of
- * the offset and scale of accelerometers, which only plush_begin() and plush_swap() forget. */
+ * the offset and scale of sensors, which only plush_begin() and plush_swap() forget. */
 #else
 /* Forgets the past, as after a gap: what is going on ends; the counts stay, and so does a fault. */
 #endif /* PLUSH_CALIBRATE */
