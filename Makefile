@@ -57,20 +57,18 @@ demo: $(VENV)/.train
 	$(BIN)/plushsense demo --out $(DEMO_OUT) $(DEMO_FLAGS)
 
 # The tests run in parts, because a worker loads and keeps what all tests of its run import.
-PARTS := studio training other deploy
+PARTS := studio deploy training other
 TESTS_studio := tests/studio
 TESTS_deploy := tests/deploy tests/bench
 TESTS_training := $(addprefix tests/,experiments models training workflow)
 TESTS_other := $(filter-out $(TESTS_studio) $(TESTS_deploy) $(TESTS_training), \
   $(patsubst %/,%,$(wildcard tests/*/)) $(wildcard tests/test_*.py))
 
-# Two parts at a time: tests of the studio wait for the browser a third of their time, and come first where both could go on.
-test: $(VENV)/.dev
-	$(MAKE) --jobs=2 --output-sync=target $(PARTS:%=test-%)
+test: $(PARTS:%=test-%)
 
 # Status 5: none of a part's tests was selected, as by PYTEST_FLAGS="-k NAME".
 $(PARTS:%=test-%): test-%: $(VENV)/.dev
-	$(if $(filter studio,$*),,nice) $(BIN)/python -m pytest -n auto --dist worksteal -m "not exhaustive" $(TESTS_$*) $(PYTEST_FLAGS) || [ $$? -eq 5 ]
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not exhaustive" $(TESTS_$*) $(PYTEST_FLAGS) || [ $$? -eq 5 ]
 
 test-exhaustive: $(VENV)/.dev
 	$(BIN)/python -m pytest -n auto --dist worksteal -m exhaustive $(PYTEST_FLAGS)

@@ -6,7 +6,7 @@ import json
 import random
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from plushsense.scoring.events import (
@@ -212,6 +212,9 @@ def test_every_truth_and_every_event_is_counted_once(
     assert 0 <= t.outside <= t.insertions and min(t.latencies, default=0.0) >= 0.0
 
 
+@example(
+    [Interval(6.5, 7.0, "squeeze"), Interval(6.5, 9.0, "squeeze")], [Interval(9.0, 9.0, "")], 0.5, random.Random(0)
+)
 @given(TRUTHS, EVENTS, LATE, st.randoms())
 def test_order_does_not_matter(
     truths: list[Interval], events: list[Interval], late_s: float, chance: random.Random

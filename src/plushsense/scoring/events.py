@@ -165,7 +165,7 @@ def _until(truths: Sequence[Interval], late_s: float) -> NDArray[np.float64]:
     """Return the time (T,) before which an event must begin to belong to each truth."""
     until = np.array([t.stop_s + late_s for t in truths])
     following: dict[str, float] = {}
-    for at in sorted(range(len(truths)), key=lambda i: truths[i].start_s, reverse=True):
+    for at in sorted(range(len(truths)), key=lambda i: (truths[i].start_s, truths[i].stop_s), reverse=True):
         t = truths[at]
         next_s = following.get(t.label, np.inf)
         until[at] = max(min(until[at], next_s), t.stop_s)
