@@ -58,7 +58,7 @@ def window_libraries(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture(scope="session")
 def calibrated_library(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """The library for models whose accelerometers calibrate themselves."""
+    """The library for models whose sensors calibrate themselves."""
     return compiled(c_compiler, tmp_path_factory, "-DPLUSH_CALIBRATE")
 
 

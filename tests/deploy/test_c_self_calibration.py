@@ -9,6 +9,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from plushsense.core.layouts import MOST_CALIBRATED_OTHER, Channel
 from plushsense.deploy.emit import LIBRARY, library_text
 from plushsense.deploy.golden import answers_of
 from plushsense.deploy.quantize import integer_model
@@ -91,7 +92,35 @@ def test_a_good_checksum_makes_no_calibrated_model(calibrated_library: Any) -> N
         "two channels": bytes([1, 1, 1, 2, 128 + 5]),
         "a channel twice": bytes([1, 1, 2, 2]),
         "a channel of two sensors": bytes([2, 1, 2, 3, 5, 1, 2, 3, 5]),
+        "an axis of a vector also alone": bytes([2, 1, 2, 3, 5, 2, 2, 2, 128 + 5]),
+        "a single channel of two sensors": bytes([2, 3, 3, 3, 128 + 5, 3, 3, 3, 128 + 5]),
+        "two axes alike": bytes([1, 1, 2, 2, 128 + 5]),
     }.items():
         wrong = body[:at] + change + body[at + min(len(change), len(plan)) :]
         image = image_head(wrong, version=8) + wrong
         assert Seat(calibrated_library, image, 4, 3).status == DAMAGED, what
+    for right in (bytes([1, 1, 2, 3, 128 + 5]), bytes([2, 1, 1, 1, 128 + 5, 3, 3, 3, 128 + 8])):
+        other = body[:at] + right + body[at + len(plan) :]
+        assert Seat(calibrated_library, image_head(other, version=8) + other, 4, 3).status == OK
+
+
+def test_readings_at_the_ends_of_the_largest_range(calibrated_library: Any) -> None:
+    axes, most = tuple(f"g{a}" for a in "xyz"), float(MOST_CALIBRATED_OTHER)
+    channels = tuple(Channel(n, "raw", "angular rate", valid_min=-most, valid_max=most) for n in ("pad", *axes))
+    layout = replace(
+        vector_model().layout,
+        # Blocks of 128 samples: their sums are large.
+        rate_hz=400.0,
+        channels=channels,
+        vectors=(axes,),
+        derived=(),
+        inputs=("pad", *axes),
+        wire=("device_ms", "pad", *axes),
+        self_calibration=("pad", *axes),
+    )
+    model = integer_model(bundle_of(layout, "3d1_2d2", "3,4", window=40))
+    rng, n = np.random.default_rng(6), 1000
+    still, jumping = np.full((n, 4), -most), rng.choice([-most, most], (n, 4))
+    values = np.concatenate([still, jumping, -still, rng.integers(-1, 2, (n, 4))])
+    frames = np.column_stack([np.arange(len(values)) * 5 // 2, values]).astype(np.int64)
+    assert np.array_equal(seat(calibrated_library, model).push(frames), answers_of(model, frames))

@@ -16,7 +16,7 @@ from plushsense.core.errors import ArchError, BadInput, BundleError, ConfigError
 from plushsense.core.gestures import load_gestures
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import read_stream
-from plushsense.deploy.convert import ConversionJob, compared, convert, made_up_windows
+from plushsense.deploy.convert import ConversionJob, compared, convert, describe, made_up_windows
 from plushsense.deploy.convert import onnx as as_onnx
 from plushsense.deploy.convert import tflite as as_tflite
 from plushsense.deploy.quantize import calibrated, integer_network
@@ -121,6 +121,13 @@ def test_real_windows(real_data: Path, onnx_here: None, litert_here: None) -> No
     fitted = Bundle(bundle.arch, bundle.weights, bundle.layout, Scaler.fit(raw), bundle.gestures)
     assert_floats(as_onnx.run_model(as_onnx.float_model(fitted), raw), fitted, raw)
     assert_floats(as_tflite.run_model(as_tflite.float_model(fitted), raw), fitted, raw)
+
+
+def test_a_converted_network_reads_calibrated_values() -> None:
+    bundle = made(NETS[0])
+    layout = replace(bundle.layout, self_calibration=bundle.layout.names)
+    assert "clock rule and self-calibration" in describe(replace(bundle, layout=layout))["input"]
+    assert "self-calibration" not in describe(bundle)["input"]
 
 
 def test_onnx_says_what_it_is(tmp_path: Path, onnx_here: None) -> None:

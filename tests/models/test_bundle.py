@@ -56,6 +56,16 @@ def test_everything_comes_back(tmp_path: Path) -> None:
     assert len(repr(read)) < 120
 
 
+def test_a_layout_that_calibrates_itself_comes_back(tmp_path: Path) -> None:
+    plush = load_layout("plush-15")
+    layout = dataclasses.replace(plush, self_calibration=plush.names)
+    arch = Arch.parse("3d1_2d2", (3, 4), channels=layout.n_inputs, classes=5, window=20)
+    scaler = Scaler(np.zeros(arch.channels), np.ones(arch.channels))
+    made = make(arch=arch, weights=random_weights(arch, 1), layout=layout, scaler=scaler)
+    read = Bundle.load(made.save(tmp_path / "m.plush"))
+    assert read.layout == layout and len(read.layout.calibrated_sensors) == 11
+
+
 def test_the_same_bundle_gives_the_same_bytes(tmp_path: Path) -> None:
     one = make().save(tmp_path / "a.plush").read_bytes()
     assert make().save(tmp_path / "b.plush").read_bytes() == one

@@ -1,7 +1,8 @@
 """Optional converters of the network to formats of other runtimes, and code that they share.
 
 A converted network computes a whole window for each decision, unlike the exported C, which computes each sample once.
-The caller must resample, compute derived channels, replace invalid values and smooth the probabilities.
+The caller must resample, replace invalid values, calibrate the sensors of a layout with ``self_calibration``, compute
+derived channels and smooth the probabilities.
 """
 
 from __future__ import annotations
@@ -229,8 +230,9 @@ def describe(bundle: Bundle) -> dict[str, str]:
         "step": arch.step,
         "rate_hz": layout.rate_hz,
         "input": (
-            f"'{RAW}': integers as the toy measures them, at {layout.rate_hz:g} Hz after the clock rule, derived "
-            "channels included, not scaled; the newest sample is the last"
+            f"'{RAW}': integers as the toy measures them, at {layout.rate_hz:g} Hz after the clock rule"
+            f"{' and self-calibration' * bool(layout.self_calibration)}, derived channels included, not scaled; the "
+            "newest sample is the last"
         ),
         "simulated": bool(provenance.get("simulated", False)),
         "code_version": str(provenance.get("code_version", "")),
