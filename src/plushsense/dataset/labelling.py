@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
 from plushsense.core.files import write_file
@@ -95,13 +96,12 @@ def find_streams(dataset: Dataset, pattern: str = "*") -> list[StreamInfo]:
     return [ids[identity] for identity in match_ids(pattern, ids, "stream")]
 
 
-def rows_between(dataset: Dataset, stream: StreamInfo, start_s: float, stop_s: float) -> tuple[int, int]:
-    """Return the rows of a stream from ``start_s`` to before ``stop_s``.
+def rows_between(stream: StreamInfo, seconds: NDArray[np.float64], start_s: float, stop_s: float) -> tuple[int, int]:
+    """Return the rows of a stream from ``start_s`` to before ``stop_s``; ``seconds`` are its `row_times_s`.
 
     Raises:
         DatasetError: for times outside the stream, or without a row between them.
     """
-    seconds = row_times_s(dataset.read_stream(stream.id))
     for value in (start_s, stop_s):
         if not 0.0 <= value <= seconds[-1] + 0.01:
             raise DatasetError(f"'{stream.id}' has no {value:g} s: it runs from 0 to {seconds[-1]:.3f} s.")
@@ -216,12 +216,16 @@ def read_stretches(dataset: Dataset, path: str | os.PathLike[str]) -> list[Label
     if missing := [c for c in COLUMNS if c not in columns]:
         raise DatasetError(f"The file of labels '{path}' lacks {', '.join(missing)}: it needs {', '.join(COLUMNS)}.")
     out = []
+    times: dict[str, NDArray[np.float64]] = {}
     for line, cells in rows:
         try:
             (stream, *others) = find_streams(dataset, cells["stream"])
             if others:
                 raise DatasetError(f"'{cells['stream']}' names {1 + len(others)} streams: give one.")
-            start, stop = rows_between(dataset, stream, _seconds(cells["start_s"]), _seconds(cells["stop_s"]))
+            if stream.id not in times:
+                times[stream.id] = row_times_s(dataset.read_stream(stream.id))
+            between = _seconds(cells["start_s"]), _seconds(cells["stop_s"])
+            start, stop = rows_between(stream, times[stream.id], *between)
             out.append(LabelledStretch(stream.id, start, stop, check_label(dataset, cells["label"])))
         except DatasetError as cause:
             raise DatasetError(f"The file of labels '{path}' line {line}: {cause}") from None
@@ -293,9 +297,10 @@ def decide_labels(
     if file is not None:
         labelled = len(label_stretches(dataset, read_stretches(dataset, file), who, why))
     elif label is not None or timed:
+        seconds = row_times_s(dataset.read_stream(streams[0].id))
         first = 0.0 if start_s is None else start_s
-        last = float(row_times_s(dataset.read_stream(streams[0].id))[-1]) if stop_s is None else stop_s
-        start, stop = rows_between(dataset, streams[0], first, last)
+        last = float(seconds[-1]) if stop_s is None else stop_s
+        start, stop = rows_between(streams[0], seconds, first, last)
         if undo:
             undone = unlabel(dataset, streams[0], start, stop, who, why)
         else:

@@ -76,6 +76,8 @@ class LabelledStretch:
 
     def outside(self, start: int, stop: int) -> list[LabelledStretch]:
         """Return what remains without the rows from ``start`` to before ``stop`` (-1: the end)."""
+        if self.stop <= start or 0 <= stop <= self.start:
+            return [self]
         ends = [(self.start, min(self.stop, start)), (max(self.start, stop) if stop >= 0 else self.stop, self.stop)]
         return [replace(self, start=a, stop=b) for a, b in ends if a < b]
 
