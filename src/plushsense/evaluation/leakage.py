@@ -173,12 +173,27 @@ def _sorted_values(windows: WindowSet, scale: NDArray[np.float32]) -> NDArray[np
 
 
 def _difference(x: NDArray[np.float32], y: NDArray[np.float32], shift: int) -> NDArray[np.float64]:
-    """Return the RMS difference (n,) of windows (n, F, T) at the best shift, as a share of the variation of ``x``."""
+    """Return the RMS difference (n,) of windows (n, F, T) at the best shift, as a share of the variation of ``x``.
+
+    With both around the mean of ``x``, whose squares then lose no digits, it follows from the sums of squares of the
+    samples that overlap and the cross-correlation.
+    """
     samples = x.shape[2]
-    best = np.full(len(x), np.inf)
-    for lag in range(-shift, shift + 1):
-        a, b = (x[..., lag:], y[..., : samples - lag]) if lag >= 0 else (x[..., :lag], y[..., -lag:])
-        variation = a.var(axis=2).sum(axis=1)
-        error = np.square(a - b).mean(axis=2).sum(axis=1)
-        best = np.minimum(best, np.sqrt(error / np.maximum(variation, 1e-12)))
+    middle = x.mean(axis=2, keepdims=True, dtype=np.float64)
+    a, b = x - middle, y - middle
+    size = 1 << (samples + shift - 1).bit_length()
+    spectrum = (np.fft.rfft(a, size) * np.fft.rfft(b, size).conj()).sum(axis=1)
+    lags = np.arange(-shift, shift + 1)
+    products = np.fft.irfft(spectrum, size)[:, lags]
+    first, last = np.maximum(lags, 0), samples + np.minimum(lags, 0)
+    n = last - first
+
+    def between(values: NDArray[np.float64], first: Index, last: Index) -> NDArray[np.float64]:
+        sums = np.pad(values.cumsum(axis=-1), [(0, 0)] * (values.ndim - 1) + [(1, 0)])
+        return np.asarray(sums[..., last] - sums[..., first])
+
+    squares = between(np.square(a).sum(axis=1), first, last)
+    variation = (squares - np.square(between(a, first, last)).sum(axis=1) / n) / n
+    error = (squares + between(np.square(b).sum(axis=1), first - lags, last - lags) - 2 * products) / n
+    best: NDArray[np.float64] = np.sqrt(np.maximum(error, 0) / np.maximum(variation, 1e-12)).min(axis=1)
     return best
