@@ -4,6 +4,7 @@ They repeat what shorter ones test with more pages, languages, chips, compilers,
 """
 
 EXHAUSTIVE = {
+    "bench/test_peers.py::test_without_any_peer_ours_and_plain_loops_are_measured_with_both_algorithms",
     "cli/test_kill.py::test_kill_9_in_the_middle",
     "cli/test_paper_page.py::test_every_command_runs",
     "deploy/proof/test_verify.py::test_every_way_to_compile_on_the_host",
@@ -12,13 +13,30 @@ EXHAUSTIVE = {
     "deploy/proof/test_verify.py::test_the_same_on_every_chip[paper-11]",
     "deploy/proof/test_verify.py::test_the_same_on_every_chip[vectors-3]",
     "deploy/proof/test_verify.py::test_without_smoothing_no_mutant_is_applied_that_cannot_show",
+    *(
+        f"deploy/proof/test_verify.py::test_faults_are_caught_on_every_chip[{chip}]"
+        for chip in ("cortex-m0", "cortex-m4", "riscv32")
+    ),
     "deploy/test_c_source.py::test_clang_tidy",
     "deploy/test_c_source.py::test_no_warning_and_three_functions_of_the_c_library[plain-clang]",
     "deploy/test_c_source.py::test_no_warning_and_three_functions_of_the_c_library[window-clang]",
+    *(
+        f"deploy/test_c_source.py::test_small_cores_need_no_long_division[{form}]"
+        for form in ("stream-cortex-m4", "window-cortex-m4", "stream-lx106")
+    ),
     "deploy/test_firmware.py::test_clang_agrees",
+    "deploy/test_profile.py::test_counts[cortex-m33]",
+    "deploy/test_profile.py::test_counts[cortex-m4]",
+    "deploy/test_profile.py::test_the_networks_of_the_issue_stay_within_their_limits[14d1_39d2_41d4-limits0]",
+    "deploy/test_profile.py::test_the_networks_of_the_issue_stay_within_their_limits[14d1_19d2_19d4-limits1]",
     "experiments/search/test_run.py::test_killed_in_every_rung_and_gone_on_with",
+    "experiments/sweep/test_cluster.py::test_a_cluster_that_is_not_there[127.0.0.1:1]",
     "experiments/sweep/test_cluster.py::test_a_node_lost_in_a_sweep_changes_nothing",
     "experiments/sweep/test_run.py::test_killed_three_times_and_gone_on_with",
+    *(
+        f"faults/test_interrupted.py::test_given_again_it_does_what_it_does_undisturbed[{command}-full-0]"
+        for command in ("adapt", "backup", "check", "export", "forget")
+    ),
     "recording/test_whole_session.py::test_killed_three_times",
     "studio/test_export_page.py::test_export_verify_and_break",
     "studio/test_live_long.py::test_every_gesture_is_seen_with_its_affect_and_nothing_grows",
@@ -31,6 +49,8 @@ EXHAUSTIVE = {
     "studio/test_record.py::test_it_speaks_latvian_and_fits_a_phone",
     "studio/test_record.py::test_two_tabs_show_and_press_the_same_once",
     "studio/test_record_whole.py::test_a_whole_session_by_the_space_bar",
+    "studio/test_review.py::test_a_click_moves_the_mark_to_within_a_sample[size1]",
+    "studio/test_review.py::test_a_click_moves_the_mark_to_within_a_sample[size2]",
     "studio/test_review.py::test_one_recording_has_no_violation_in_any_light",
     "studio/test_review.py::test_real_recordings_one_after_the_other",
     "studio/test_train.py::test_a_proof_its_table_and_the_recordings_of_a_cell",
@@ -38,7 +58,15 @@ EXHAUSTIVE = {
     "studio/test_train.py::test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle",
     "studio/test_train.py::test_one_button_makes_a_network_that_a_stop_does_not_lose",
     "test_questions.py::test_every_program_runs",
+    *(
+        f"tuning/test_gate.py::test_neither_humidity_nor_the_hand_matters_much[{form}]"
+        for form in ("damp skin", "small hands", "the same day")
+    ),
     "workflow/test_demo.py::test_demo_twice",
+    *(
+        f"workflow/test_forget_beside.py::test_who_is_forgotten_meanwhile_does_not_come_back[{command}-early]"
+        for command in ("abstaining", "baselines", "evaluate_in_processes", "search", "streams", "sweep")
+    ),
     *(
         f"studio/test_pictures_of_pages.py::test_a_page_reads_well[{page}-{view}]"
         for page in ("home", "record", "review", "train", "live", "export", "publish")
@@ -46,8 +74,9 @@ EXHAUSTIVE = {
     ),
     *(
         f"studio/test_pictures_of_pages.py::test_a_page_reads_well[{page}-phone-dark-lv]"
-        for page in ("review", "train", "live", "export", "publish")
+        for page in ("home", "record", "review", "train", "live", "export", "publish")
     ),
+    "studio/test_pictures_of_pages.py::test_a_page_reads_well[export-desk-light-en]",
     *(
         f"test_pages.py::test_every_command_of_the_page_runs[docs/{page}.md]"
         for page in (
@@ -64,6 +93,7 @@ EXHAUSTIVE = {
             "questions",
             "results",
             "streams",
+            "sweep",
             "trim",
             "virtual-toy",
         )
