@@ -36,18 +36,21 @@ $(VENV)/.python:
 	$(PIP) --upgrade pip
 	@touch $@
 
-$(VENV)/.train: $(VENV)/.python pyproject.toml constraints.txt
+# The registry's plain `torch` brings gigabytes of CUDA; an exact version takes a CPU build where one is at hand.
+TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
+
+$(VENV)/.torch: $(VENV)/.python pyproject.toml constraints.txt
 	@echo "Installing PlushSense and PyTorch (once, a few minutes) ..."
 	$(PIP) torch==$(TORCH)
+	@touch $@
+
+$(VENV)/.train: $(VENV)/.torch
 	$(PIP) -e '.[train]'
 	@touch $@
 
-$(VENV)/.dev: $(VENV)/.train
+$(VENV)/.dev: $(VENV)/.torch
 	$(PIP) -e '.[train,baselines,ble,cluster,lsl,mlflow,onnx,publish,studio,tables,tflite,dev,docs]'
-	@touch $@
-
-# The registry's plain `torch` brings gigabytes of CUDA; an exact version takes a CPU build where one is at hand.
-TORCH := $(shell sed -n 's/^torch==//p' constraints.txt)
+	@touch $@ $(VENV)/.train
 
 install: $(VENV)/.train
 
