@@ -10,6 +10,7 @@ import secrets
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -23,6 +24,7 @@ PART = ".part"
 _UNFINISHED = "-unfinished-"
 _OWNER = "owner.lock"
 _TEMPORARY = "plushsense"
+_STARTED_S = 3600.0  # after which a work folder with nothing in it is taken for abandoned
 
 
 def unfinished(dest: Path) -> str:
@@ -41,7 +43,8 @@ def abandoned_folders(place: Path) -> list[Path]:
     for entry in place.glob(f".*{_UNFINISHED}*"):
         # Those of other users cannot be read.
         with contextlib.suppress(PermissionError):
-            if (entry / _OWNER).is_file() and not is_in_use(entry):
+            held = [file.name for file in entry.iterdir()] if entry.is_dir() else [""]
+            if (_OWNER in held or not held) and not is_in_use(entry):
                 found.append(entry)
     return sorted(found)
 
@@ -58,10 +61,11 @@ def is_in_use(folder: Path) -> bool:
     Folders of earlier versions have no lock file and count as not in use.
     """
     try:
-        if (folder / _OWNER).is_file():
-            # Nothing else is in it until its owner has locked it.
-            if [entry.name for entry in folder.iterdir()] == [_OWNER]:
-                return True
+        held = [entry.name for entry in folder.iterdir()]
+        # Nothing else is in it until its owner has locked it, nor when its owner was killed while deleting it.
+        if held in ([], [_OWNER]) and time.time() - folder.stat().st_mtime < _STARTED_S:
+            return True
+        if _OWNER in held:
             with FileLock(folder / _OWNER, timeout=0):
                 pass
     except (OSError, Timeout, NotImplementedError):

@@ -117,9 +117,27 @@ def next_session(person: Path) -> str:
 
 
 def new_session(person: Path, prefix: str = "") -> str:
-    """Return an unused name for a new session: ``prefix`` and a number."""
-    taken = {p.name for p in person.iterdir()} if person.is_dir() else set()
+    """Return an unused name for a new session: ``prefix`` and a number.
+
+    A folder in which a session was about to begin when the program was killed or the disk was full is used again.
+    """
+    taken = {p.name for p in person.iterdir() if not _is_left_empty(p)} if person.is_dir() else set()
     return next(name for number in itertools.count(1) if (name := f"{prefix}{number}") not in taken)
+
+
+def _is_left_empty(folder: Path) -> bool:
+    """Return whether nothing was written into the folder of a session, and no program uses it."""
+    if not folder.is_dir() or any(map(_is_content, folder.iterdir())):
+        return False
+    try:
+        with FileLock(folder / LOCK, timeout=0):
+            return True
+    except (Timeout, OSError, NotImplementedError):
+        return False
+
+
+def _is_content(path: Path) -> bool:
+    return path.name != LOCK and path.suffix != PART
 
 
 class OpenSession:
@@ -165,7 +183,7 @@ class OpenSession:
         known = SessionHead.read(self.folder)
         if known is None:
             assert given is not None
-            others = [p.name for p in self.folder.iterdir() if p.name != LOCK and not p.name.endswith(PART)]
+            others = [p.name for p in self.folder.iterdir() if _is_content(p)]
             if others:
                 raise DatasetError(
                     f"'{self.folder}' holds '{others[0]}' but no session: give another --session or an empty folder.",

@@ -22,8 +22,9 @@ def test_the_zip_depends_on_nothing_but_the_files(tmp_path: Path) -> None:
     (root / "z.txt").chmod(0o600)
     write_zip(root, tmp_path / "2.zip", "n")
     assert (tmp_path / "1.zip").read_bytes() == (tmp_path / "2.zip").read_bytes()
+    write_zip(root, tmp_path / "1.zip", "n")
     with pytest.raises(DatasetError, match="already there"):
-        write_zip(root, tmp_path / "1.zip", "n")
+        write_zip(root, tmp_path / "1.zip", "another")
     with open_package(tmp_path / "1.zip") as folder:
         assert (folder / "a" / "b" / "ü.csv").read_text() == "1\n"
         assert folder.name == "n"

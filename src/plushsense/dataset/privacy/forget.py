@@ -345,7 +345,7 @@ def _remove_derived(folder: Path, plan: RemovalPlan) -> None:
 def _remove_own(folder: Path, plan: RemovalPlan) -> None:
     for path in plan.files:
         (folder / path).unlink(missing_ok=True)
-    _remove_empty(folder, plan.files)
+    _remove_empty(folder, plan)
     _rewrite_marks(folder, plan.subject)
     people = read_people(folder)
     if people.pop(_row_of(plan.subject, people), None) is not None:
@@ -438,12 +438,14 @@ def _ignore_missing(_: object, path: str, cause: Any) -> None:
         raise cause[1]
 
 
-def _remove_empty(folder: Path, files: Iterable[str]) -> None:
-    """Remove those folders of ``files`` that are empty now."""
-    places = {parent for f in files for parent in PurePosixPath(f).parents if len(parent.parts) > 1}
+def _remove_empty(folder: Path, plan: RemovalPlan) -> None:
+    """Remove the folders of the removed files that are empty now, and those that an interrupted run left empty."""
+    places = {folder / parent for f in plan.files for parent in PurePosixPath(f).parents if len(parent.parts) > 1}
+    for own in (folder / RECORDINGS / plan.subject, folder / STREAMS / plan.subject):
+        places |= {own, *own.rglob("*")}
     for place in sorted(places, key=lambda p: len(p.parts), reverse=True):
-        if (folder / place).is_dir() and not any((folder / place).iterdir()):
-            (folder / place).rmdir()
+        if place.is_dir() and not place.is_symlink() and not any(place.iterdir()):
+            place.rmdir()
 
 
 def _read_intent(folder: Path) -> _Intent | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import time
 from collections import Counter
 from dataclasses import dataclass, field, replace
@@ -164,7 +163,7 @@ def check_output_folder(dataset: Dataset, out: Path) -> Path:
     """Check the target folder ``out`` and return the path of the zip beside it.
 
     Raises:
-        DatasetError: if ``out`` is not empty or lies in the data set, or the zip exists.
+        DatasetError: if ``out`` is not empty or lies in the data set.
     """
     real = out.resolve()
     target = real.with_name(real.name + ".zip")
@@ -173,12 +172,6 @@ def check_output_folder(dataset: Dataset, out: Path) -> Path:
             f"'{out}' already holds something: give a new or empty folder, nothing is overwritten.",
             reason="name_exists",
             name=out.name,
-        )
-    if target.exists():
-        raise DatasetError(
-            f"'{target}' is already there: nothing is overwritten, give another OUT.",
-            reason="name_exists",
-            name=target.name,
         )
     if dataset.path.resolve() in (real, *real.parents):
         raise DatasetError(f"'{out}' lies in the data set itself: give a folder elsewhere.")
@@ -199,6 +192,8 @@ def publish(
 ) -> PublishResult:
     """Write the package into the new folder ``out``, validate it, and pack it as ``out.zip`` if it is valid.
 
+    The folder appears last, so that the same call can be given again until it does.
+
     Args:
         head: the head from `complete_head`.
         bids: whether to add a Motion-BIDS tree.
@@ -217,31 +212,31 @@ def publish(
     target = check_output_folder(dataset, out)
     options = options or PublishOptions()
     day = published or date.today().isoformat()
-    with new_folder(out, DatasetError, finishing=dataset.generation.writing) as work:
-        contents = ContentsWriter(dataset, work / DATA, head, options, partial(progress, "writing")).write()
-        d = Description(
-            contents.dataset,
-            find_licence(head.licence),
-            head.about,
-            head.consent,
-            day,
-            write_tables(work, contents),
-            contents.notes,
-        )
-        _write_texts(work, d, dataset, reidentification)
-        if bids:
-            write_bids(work, d)
-        _write_metadata(work, d)
-    checked = check_folder(out, thorough=thorough, progress=progress)
+    packed = False
     try:
-        if checked.valid:
-            write_zip(out, target, f"{d.name}-{d.version}", dataset.generation.writing)
-        dataset.generation.check()
+        with new_folder(out, DatasetError, finishing=dataset.generation.writing) as work:
+            contents = ContentsWriter(dataset, work / DATA, head, options, partial(progress, "writing")).write()
+            d = Description(
+                contents.dataset,
+                find_licence(head.licence),
+                head.about,
+                head.consent,
+                day,
+                write_tables(work, contents),
+                contents.notes,
+            )
+            _write_texts(work, d, dataset, reidentification)
+            if bids:
+                write_bids(work, d)
+            _write_metadata(work, d)
+            checked = check_folder(work, thorough=thorough, progress=progress)
+            if checked.valid:
+                write_zip(work, target, f"{d.name}-{d.version}", dataset.generation.writing)
+                packed = True
     except ForgottenError:
-        # A person was removed during the validation. ``out`` itself may be the current folder.
-        for entry in list(out.iterdir()):
-            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
-        target.unlink(missing_ok=True)
+        # A person was removed after the zip was written.
+        if packed:
+            target.unlink(missing_ok=True)
         raise
     files = list_package_files(out)
     return PublishResult(

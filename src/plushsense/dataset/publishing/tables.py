@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import filecmp
 import io
 import re
 import tomllib
@@ -186,22 +187,19 @@ def write_zip(
     ``finishing`` is as in `replacing_file`.
 
     Raises:
-        DatasetError: if ``target`` exists.
+        DatasetError: if ``target`` exists with another content.
     """
-    if target.exists():
-        raise DatasetError(
-            f"'{target}' is already there: nothing is overwritten, give another OUT.",
-            reason="name_exists",
-            name=target.name,
-        )
-    with (
-        work_folder(target) as work,
-        replacing_file(target, within=work, finishing=finishing) as part,
-        zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive,
-    ):
-        for path in list_package_files(root):
-            entry = zip_entry(f"{folder}/{path.relative_to(root).as_posix()}")
-            archive.writestr(entry, path.read_bytes())
+    with work_folder(target) as work, replacing_file(target, within=work, finishing=finishing) as part:
+        with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
+            for path in list_package_files(root):
+                entry = zip_entry(f"{folder}/{path.relative_to(root).as_posix()}")
+                archive.writestr(entry, path.read_bytes())
+        if target.exists() and not filecmp.cmp(part, target, shallow=False):
+            raise DatasetError(
+                f"'{target}' is already there: nothing is overwritten, give another OUT.",
+                reason="name_exists",
+                name=target.name,
+            )
 
 
 @contextmanager
