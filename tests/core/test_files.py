@@ -135,6 +135,17 @@ def test_what_a_killed_program_left_goes_at_the_next_start_and_nothing_of_a_live
     assert names(tmp_path) == [".old-unfinished-1", "out"]
 
 
+def test_a_work_folder_with_nothing_in_it_goes_after_an_hour(tmp_path: Path) -> None:
+    for left in ("new", "old", "new-locked", "old-locked"):
+        (tmp_path / f".out-unfinished-{left}").mkdir()
+        if left.endswith("locked"):
+            (tmp_path / f".out-unfinished-{left}" / "owner.lock").touch()
+        if left.startswith("old"):
+            os.utime(tmp_path / f".out-unfinished-{left}", (0, 0))
+    with work_folder(tmp_path / "out") as work:
+        assert names(tmp_path) == sorted([work.name, ".out-unfinished-new", ".out-unfinished-new-locked"])
+
+
 def test_temporary_copies_of_a_killed_program_go_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     with temporary_folder() as one:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.layouts import load_layout
@@ -246,6 +247,16 @@ def test_which_session_comes_next(tmp_path: Path) -> None:
     assert next_session(person) == "2"
     opened(person / "1", SessionEvent("redo", 10, {"file": "x"}))
     assert not is_finished(person / "1")
+
+
+def test_a_folder_in_which_no_session_could_begin_is_used(tmp_path: Path) -> None:
+    (tmp_path / "1").mkdir()
+    (tmp_path / "1" / ".session.json.0a1b2c3d.part").touch()
+    assert new_session(tmp_path) == "1"
+    (tmp_path / "1" / "thesis.txt").touch()
+    (tmp_path / "2").mkdir()
+    with FileLock(tmp_path / "2" / "session.lock"):
+        assert new_session(tmp_path) == "3", "another program is about to begin there"
 
 
 @pytest.mark.parametrize("code", ["S01", "none", "7", "P1-b", "child_3", "AB"])

@@ -26,6 +26,7 @@ from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any, Literal
 
+from plushsense.core.files import is_unfinished
 from plushsense.dataset.marks import Mark, append_marks
 
 REPETITIONS = int(os.environ.get("PLUSHSENSE_DRILLS", "1"))
@@ -180,6 +181,12 @@ def contents(folder: Path, *, without: tuple[str, ...] = ()) -> dict[str, str]:
 
 
 def names(folder: Path, without: tuple[str, ...] = ()) -> set[str]:
-    """The path of everything below a folder, but what is in the folders ``without``."""
-    paths = (path.relative_to(folder).as_posix() for path in folder.rglob("*"))
-    return {name for name in paths if not name.startswith(without)} if without else set(paths)
+    """The path of everything below a folder, but what is in the folders ``without``, and empty work folders.
+
+    A program that is killed while it deletes its work folder leaves one with nothing but its lock.
+    """
+    works = [left for left in folder.rglob("*") if is_unfinished(left.name) and left.is_dir()]
+    empty = {left for left in works if [path.name for path in left.iterdir()] in ([], ["owner.lock"])}
+    paths = [path for path in folder.rglob("*") if not empty & {path, path.parent}]
+    found = {path.relative_to(folder).as_posix() for path in paths}
+    return {name for name in found if not name.startswith(without)} if without else found

@@ -200,6 +200,13 @@ def test_files_of_others_that_are_gone_are_not_hushed_up(folder: Path) -> None:
     assert (folder / "recordings" / "P1").is_dir()
 
 
+def test_empty_folders_of_an_interrupted_removal_go(folder: Path) -> None:
+    for file in [*(folder / "recordings" / "P2").rglob("*.csv"), *(folder / "streams" / "P2").rglob("*.csv")]:
+        file.unlink()
+    forget(folder, "P2")
+    assert not [path for path in folder.rglob("*") if "P2" in path.parts]
+
+
 def test_the_last_person_can_go(folder: Path) -> None:
     for person in ("P1", "P2", "P11"):
         forget(folder, person)
