@@ -41,10 +41,10 @@ def abandoned_folders(place: Path) -> list[Path]:
     """Return the work folders in ``place`` that no process uses any more, as a killed program leaves them."""
     found = []
     for entry in place.glob(f".*{_UNFINISHED}*"):
-        # Those of other users cannot be read.
-        with contextlib.suppress(PermissionError):
+        # Those of other users cannot be read, and their owners may delete them meanwhile.
+        with contextlib.suppress(PermissionError, FileNotFoundError):
             held = [file.name for file in entry.iterdir()] if entry.is_dir() else [""]
-            if (_OWNER in held or not held) and not is_in_use(entry):
+            if (_OWNER in held or (not held and _is_old(entry))) and not is_in_use(entry):
                 found.append(entry)
     return sorted(found)
 
@@ -63,7 +63,7 @@ def is_in_use(folder: Path) -> bool:
     try:
         held = [entry.name for entry in folder.iterdir()]
         # Nothing else is in it until its owner has locked it, nor when its owner was killed while deleting it.
-        if held in ([], [_OWNER]) and time.time() - folder.stat().st_mtime < _STARTED_S:
+        if held == [_OWNER] and not _is_old(folder):
             return True
         if _OWNER in held:
             with FileLock(folder / _OWNER, timeout=0):
@@ -71,6 +71,10 @@ def is_in_use(folder: Path) -> bool:
     except (OSError, Timeout, NotImplementedError):
         return True
     return False
+
+
+def _is_old(folder: Path) -> bool:
+    return time.time() - folder.stat().st_mtime >= _STARTED_S
 
 
 @contextlib.contextmanager
