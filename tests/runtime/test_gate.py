@@ -124,6 +124,10 @@ def test_suspect_samples_are_not_read_and_after_some_it_begins_anew() -> None:
 def test_a_blow_that_touches_the_end_stop_is_one() -> None:
     hit = [100] * 30 + [30_000, 30_000, 30_000, 20_000] + [100] * 30
     assert fired(LEVELS, tremble(hit), {31, 32})[0][0] == 33
+    # Up to nine suspect samples in its middle; after ten, all begins anew.
+    for doubts, heard in ((9, [(40, 0)]), (10, [])):
+        longer = tremble([100] * 30 + [30_000] * (1 + doubts) + [20_000])
+        assert fired(LEVELS, longer, set(range(31, 31 + doubts))) == heard
 
 
 def test_a_reset_forgets_the_deafness_too() -> None:

@@ -200,9 +200,9 @@ def made(layers: tuple[ConvLayer, ...], **settings_: Any) -> IntegerModel:
 
 
 def test_counts_that_do_not_fit_their_bits() -> None:
-    made((ConvLayer(17, 4095, 1),)).to_bytes()  # 65521 samples
-    with pytest.raises(BundleError, match="Layer 1 of 17d4096 1 remembers 65537 samples"):
-        made((ConvLayer(17, 4096, 1),))
+    made((ConvLayer(32, 2114, 1),)).to_bytes()  # 65535 samples
+    with pytest.raises(BundleError, match="Layer 1 of 18d3855 1 remembers 65536 samples"):
+        made((ConvLayer(18, 3855, 1),))
     made((ConvLayer(2, 1, 1),), pool=65535).to_bytes()
     with pytest.raises(BundleError, match="pools 65536 steps"):
         made((ConvLayer(2, 1, 1),), pool=65536)

@@ -71,8 +71,18 @@ def test_confidences_by_hand():
     assert found["known score, smoothed"].tolist() == [7, 8]
     assert found["known score"] == pytest.approx(np.log([2, 6]))
     assert found["energy"] == pytest.approx(np.log([4, 10]))
+    assert confidences(logits, [[0.5, 0.25, 0.25]] * 2, [7.0, 8.0], 0.25)["set size"].tolist() == [-3, -3]
     empty = confidences(logits, [[0.5, 0.3, 0.2], [0.2, 0.1, 0.7]], [7.0, 8.0], 0.6)
     assert empty["set size"].tolist() == [-4, -1]
+
+
+def test_typical_features_by_hand() -> None:
+    # One feature: the classes have the means 0 and 10, and within them squares that sum to 4, over all to 104.
+    fitted = RelativeMahalanobis.fit(np.array([[-1.0], [1.0], [9.0], [11.0]]), np.array([0, 0, 1, 1]))
+    ridge = 0.01 * 4 / 3
+    for x in (-2.0, 3.0, 5.0, 12.0):
+        expected = (x - 5) ** 2 / (104 / 3 + ridge) - min(x**2, (x - 10) ** 2) / (4 / 3 + ridge)
+        assert fitted.scores(np.array([[x]])) == pytest.approx([expected])
 
 
 def test_typical_features_lie_near_a_class_and_not_merely_near_the_mean() -> None:

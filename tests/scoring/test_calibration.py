@@ -14,6 +14,7 @@ def test_calibration_error_by_hand() -> None:
     found = reliability(p, np.array([0, 1, 0, 1]))
     # Two predictions at 0.95 of which one is right, two at 0.65 that are both right.
     assert found["ece"] == pytest.approx(0.5 * 0.45 + 0.5 * 0.35)
+    assert found["log_loss"] == pytest.approx(-np.log(0.95 * 0.05 * 0.65 * 0.65) / 4)
     assert found["accuracy"] == 0.75 and found["confidence"] == pytest.approx(0.8)
     assert [b["n"] for b in found["bins"]] == [0, 0, 0, 0, 0, 0, 2, 0, 0, 2]
     assert found["bins"][0] == {"low": 0.0, "high": 0.1, "n": 0, "confidence": None, "accuracy": None}

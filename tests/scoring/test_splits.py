@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plushsense.core.errors import ArrayError, BadInput, ConfigError
-from plushsense.scoring.splits import EXAMPLES, Fold, Splitter, make_folds, parse_split, purge
+from plushsense.scoring.splits import EXAMPLES, Fold, Split, Splitter, make_folds, parse_split, purge
 
 CLASSES = 4
 
@@ -219,6 +219,7 @@ def test_a_splitter_keeps_people_and_recordings_apart_and_says_what_it_lacks() -
 
 def test_a_split_knows_what_it_splits_and_what_it_needs() -> None:
     assert [parse_split(text).unit for text in ("windows:5", "by-recording:5")] == ["window", "recording"]
+    assert [len(make_folds(Split(kind), *study(6))) for kind in ("by-subject", "by-recording")] == [5, 5]
     assert [parse_split(text).apart for text in EXAMPLES] == [True, True, *[False] * 5]
     assert parse_split("by-subject:2").k == 2 and parse_split("windows:1000").k == 1000
     with pytest.raises(ConfigError, match="from 2 to 1000"):

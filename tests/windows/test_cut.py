@@ -12,7 +12,15 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.store import Dataset
-from plushsense.windows.cut import WindowSpec, cut_windows, recordings_in_time, shared_gestures, whole_gestures
+from plushsense.windows.clock import resample
+from plushsense.windows.cut import (
+    WindowSpec,
+    cut_windows,
+    from_recording,
+    recordings_in_time,
+    shared_gestures,
+    whole_gestures,
+)
 
 ACCEL = load_layout("accel-3")
 
@@ -58,6 +66,9 @@ def test_loops_repeat_from_the_start_and_are_never_padded(dataset: Dataset) -> N
     assert set(w.stream[w.subject == "ana"]) == {"ana/fulldatastream"}, "where it lies is known all the same"
     assert np.all(w.window_rows == -1)
     assert set(w.stream[w.subject == "ben"]) == {""}
+    ben = next(r for r in dataset.used if r.subject == "ben" and r.gesture == "Wave")
+    (looped,) = from_recording(resample(dataset.read(ben), ACCEL), dataset, 250, 50)
+    assert (looped.context, looped.begin) == ("loop", 0)
 
 
 def test_stream_context_is_what_came_before(dataset: Dataset) -> None:

@@ -266,16 +266,13 @@ class BothEngines(IntegerClassifier):
     def push(self, frame: Frame) -> list[Decision]:
         """Process one frame; return the deployed model's decisions that it completes."""
         decisions = super().push(frame)
-        answered = [d for d in decisions if d.probabilities is not None]
-        others = [d for d in self.original.push(frame) if d.probabilities is not None]
-        for one, other in zip(answered, others, strict=True):
-            if one.probabilities is None or other.probabilities is None:
-                continue
+        both = (decisions, self.original.push(frame))
+        answered = [[(d, d.probabilities) for d in part if d.probabilities is not None] for part in both]
+        for (one, shares), (other, other_shares) in zip(*answered, strict=True):
             self._compared += 1
             self._gesture += one.gesture == other.gesture
             self._affect += one.affect == other.affect
-            difference = max(abs(a - b) for a, b in zip(one.probabilities, other.probabilities, strict=True))
-            self._largest = max(self._largest, difference)
+            self._largest = max(self._largest, *(abs(a - b) for a, b in zip(shares, other_shares, strict=True)))
         return decisions
 
     def agreement(self) -> dict[str, Any]:

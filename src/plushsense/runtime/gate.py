@@ -319,18 +319,17 @@ def _one_by_one(settings: GateSettings, x: NDArray[np.int64], suspect: NDArray[n
 
 def raw_signals(x: NDArray[np.int64], signals: Sequence[Signal]) -> NDArray[np.int64]:
     """Return the values (T, S) of signals, before their baseline is subtracted, from inputs (T, I)."""
+    keys = [(s.kind, s.inputs, s.lag, s.shift) for s in signals]
     known: dict[tuple[object, ...], NDArray[np.int64]] = {}
-    for s in signals:
-        key = s.kind, s.inputs, s.lag, s.shift
-        if key in known:
-            continue
-        columns: NDArray[np.int64] = np.clip(x[:, list(s.inputs)] >> s.shift, -HELD, HELD)
-        if s.kind == LEVEL:
+    for key in dict.fromkeys(keys):
+        kind, inputs, lag, shift = key
+        columns: NDArray[np.int64] = np.clip(x[:, list(inputs)] >> shift, -HELD, HELD)
+        if kind == LEVEL:
             known[key] = columns[:, 0]
         else:
             known[key] = np.zeros(len(x), dtype=np.int64)
-            known[key][s.lag :] = np.minimum(np.abs(columns[s.lag :] - columns[: -s.lag]).sum(axis=1), HELD)
-    return np.stack([known[s.kind, s.inputs, s.lag, s.shift] for s in signals], axis=1)
+            known[key][lag:] = np.minimum(np.abs(columns[lag:] - columns[:-lag]).sum(axis=1), HELD)
+    return np.stack([known[key] for key in keys], axis=1)
 
 
 def follow(block: NDArray[np.int32], signals: Sequence[Signal], deviations: bool = False) -> NDArray[np.int32]:
