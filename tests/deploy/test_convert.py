@@ -19,6 +19,7 @@ from plushsense.core.recorder_csv import read_stream
 from plushsense.deploy.convert import ConversionJob, compared, convert, describe, made_up_windows
 from plushsense.deploy.convert import onnx as as_onnx
 from plushsense.deploy.convert import tflite as as_tflite
+from plushsense.deploy.convert.espdl import plain_model
 from plushsense.deploy.quantize import calibrated, integer_network
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
@@ -243,6 +244,19 @@ def test_int8_refuses_what_has_no_whole_numbers(name: str, tmp_path: Path) -> No
 def test_espdl_refuses_what_cannot_be_folded(net: Any, tmp_path: Path) -> None:
     with pytest.raises(ArchError, match="train 9d1_5d3 with"):
         convert(made(net), tmp_path / "m", "espdl")
+
+
+@pytest.mark.parametrize("net", [NETS[0], NETS[-1]], ids=str)
+def test_the_folded_network_that_esp_ppq_reads_answers_as_the_network(net: Any, onnx_here: None) -> None:
+    import onnxruntime
+
+    bundle = made(net)
+    session = onnxruntime.InferenceSession(plain_model(bundle).SerializeToString(), providers=["CPUExecutionProvider"])
+    scaled = bundle.scaler.apply(others(bundle))
+    assert [[i.name, i.shape] for i in session.get_inputs()] == [["scaled", [1, *scaled.shape[1:]]]]
+    found = np.concatenate([session.run(["logits"], {"scaled": window[None]})[0] for window in scaled])
+    expected = bundle.network().forward(scaled)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
 
 def test_espdl_in_its_own_simulation(tmp_path: Path, espdl_here: None, capfd: pytest.CaptureFixture[str]) -> None:
