@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from plushsense.core.layouts import load_layout
+from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.windows.clock import SampleClock, resample
 
@@ -15,8 +17,8 @@ def frames(clock: list[int], values: list[list[int]]) -> Frames:
     return Frames(np.array(values, dtype=np.int64).reshape(-1, 3), np.array(clock, dtype=np.int64))
 
 
-def streamed(given_frames: Frames) -> list[NDArray[np.int64]]:
-    clock = SampleClock(ACCEL)
+def streamed(given_frames: Frames, layout: Layout = ACCEL) -> list[NDArray[np.int64]]:
+    clock = SampleClock(layout)
     segments: list[list[NDArray[np.int64]]] = [[]]
     for moment, row in zip(given_frames.device_ms.tolist(), given_frames.values.tolist(), strict=True):
         made = clock.push(moment, row)
@@ -63,6 +65,7 @@ def test_nothing_valid_gives_nothing() -> None:
 
 def test_a_causal_rule_does_not_wait_longer_than_one_frame() -> None:
     clock = SampleClock(ACCEL)
+    assert (clock.now_us, clock.restarts, clock.restarted) == (None, 0, False)
     assert [len(clock.push(t, (0, 0, 0))) for t in (0, 9, 18, 45)] == [1, 0, 1, 3]
     assert clock.now_us == 40_000
 
@@ -77,11 +80,21 @@ def test_stream_equals_batch_in_every_bit(data: st.DataObject, moves: list[int])
     clock = np.cumsum([0, *moves]).tolist()
     rows = data.draw(st.lists(st.lists(value, min_size=3, max_size=3), min_size=len(clock), max_size=len(clock)))
     given_frames = frames(clock, rows)
-    batch = resample(given_frames, ACCEL)
-    live = streamed(given_frames)
+    layout = replace(ACCEL, rate_hz=data.draw(st.sampled_from([100.0, 60.0])))
+    batch = resample(given_frames, layout)
+    live = streamed(given_frames, layout)
     assert len(batch) == len(live)
     for segment, samples in zip(batch, live, strict=True):
         assert np.array_equal(segment.data, samples)
+
+
+def test_a_sample_due_a_microsecond_later_waits_for_the_next_frame() -> None:
+    layout = replace(ACCEL, rate_hz=60.0)
+    assert layout.period_us == 16_667
+    until = frames([0, 20, 50], [[0, 0, 0], [20, 0, 0], [50, 0, 0]])
+    (segment,) = resample(until, layout)
+    assert segment.data[:, 0].tolist() == [0, 17, 33], "the next one is due at 50.001 ms"
+    assert np.array_equal(streamed(until, layout)[0], segment.data)
 
 
 @pytest.mark.parametrize("rate", [11, 30, 10, 7])
