@@ -26,6 +26,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
 from plushsense.runtime.integer import deployable
 from plushsense.windows.features import Scaler, network_inputs
+from support.exports import bundle_of
 
 # symbol, filters, layout, settings: every padding and normalisation, one layer to four, one reflection and several.
 NETS: list[tuple[str, tuple[int, ...], str, dict[str, Any]]] = [
@@ -111,6 +112,19 @@ def test_int8_comes_close_to_the_integers(name: str, net: Any, tmp_path: Path, r
     float_ones = bundle.network().forward(bundle.scaler.apply(raw))
     assert np.abs(found - expected).mean() < 0.2 * np.abs(float_ones - expected).mean(), "as far off as the floats are"
     assert done.bytes < len(bundle.to_bytes()) + 6000
+
+
+@pytest.mark.parametrize("layout", ["plush-15", "phone-6"])
+def test_a_vector_layer_is_written_to_onnx_only(layout: str, tmp_path: Path, onnx_here: None) -> None:
+    bundle = bundle_of(layout, "v9_5d2", "4,6")
+    raw = others(bundle)[:-1]
+    assert_floats(as_onnx.run_model(convert(bundle, tmp_path / "m", "onnx").path.read_bytes(), raw), bundle, raw)
+    found = as_onnx.run_model(convert(bundle, tmp_path / "n", "onnx-int8").path.read_bytes(), raw)
+    expected = integer_network(bundle).forward(raw) / 256
+    assert found is not None and np.abs(found - expected).max() < 0.01 * max(1.0, np.abs(expected).max())
+    for name in ("tflite", "tflite-int8", "espdl"):
+        with pytest.raises(ArchError, match="begins with a vector layer, which PlushSense does not write to"):
+            convert(bundle, tmp_path / "o", name)
 
 
 def test_real_windows(real_data: Path, onnx_here: None, litert_here: None) -> None:

@@ -121,6 +121,9 @@ def test_read_back(model: IntegerModel) -> None:
         for t in rule.terms:
             assert r.take("BbBBI") == (t.signal, t.sign, t.times, 0, t.threshold)
     assert r.at == len(r.data)
+    titles = [title for title, _ in model.sections() if title.startswith("gate: signal ")]
+    kinds = [("level", "jerk")[s.kind] for s in gate.signals if gate.rules]
+    assert [title.split(";")[0] for title in titles] == [f"gate: signal {n}, {k}" for n, k in enumerate(kinds, 1)]
 
 
 def test_weights_of_every_size_fit_a_byte() -> None:
