@@ -160,6 +160,26 @@ def test_onnx_says_what_it_is(tmp_path: Path, onnx_here: None) -> None:
     assert [d.dim_param or d.dim_value for d in shape] == ["N", 11, bundle.arch.span]
 
 
+@pytest.mark.parametrize("name", ["tflite", "tflite-int8"])
+def test_litert_says_what_it_is(name: str, tmp_path: Path, litert_here: None) -> None:
+    from ai_edge_litert.interpreter import Interpreter
+    from ai_edge_litert.schema_py_generated import Model, ModelT
+
+    bundle = made(NETS[0])
+    data = convert(bundle, tmp_path / "m", name).path.read_bytes()
+    run = Interpreter(model_content=data, num_threads=1).get_signature_runner("serving_default")
+    shapes = {n: part["shape"].tolist() for n, part in run.get_input_details().items()}
+    assert shapes == {"raw": [1, bundle.arch.span, 11]}
+    shapes = {n: part["shape"].tolist() for n, part in run.get_output_details().items()}
+    assert shapes == {"logits": [1, 7], "probabilities": [1, 7]}
+    model = ModelT.InitFromObj(Model.GetRootAs(data))
+    assert data[4:8] == b"TFL3" and bundle.arch.title in model.description.decode()
+    (entry,) = model.metadata
+    facts = json.loads(bytes(model.buffers[entry.buffer].data))
+    assert entry.name == b"plushsense" and facts["title"] == bundle.arch.title
+    assert json.loads(facts["gestures"]) == list(bundle.gestures.labels)
+
+
 def softmax(logits: Any) -> Any:
     e = np.exp(logits - logits.max(axis=1, keepdims=True))
     return e / e.sum(axis=1, keepdims=True)

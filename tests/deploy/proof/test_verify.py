@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -517,6 +519,17 @@ def test_a_model_of_another_layout_among_the_files_is_named(c_compiler: str, own
     done = verify(Export(own), ["host"], only=plainly, trust=True)
     assert not done.passed
     assert "other channels or classes than model.plush" in str(done.first)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the compilers are shell scripts")
+def test_a_compiler_without_sanitizers_is_named(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("gcc", "clang"):
+        (tmp_path / name).write_text("#!/bin/sh\nexit 1\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    for name, also in (("gcc", ""), ("clang", r" \(Debian's libclang-rt-dev\)")):
+        with pytest.raises(ToolError, match=f"Nothing can.*{name} makes no program with sanitizers here{also}[)]"):
+            verify(Export(small), ["host"], only=lambda s, name=name: s.cc == name and s.optimise == "-O1")
 
 
 def test_what_is_requested_must_be_there(
