@@ -26,7 +26,7 @@ _SIMILAR = 0.3
 # Windows in which fewer samples differ from the one before are not judged: two people press a switch alike.
 _CHANGING = 0.25
 _LISTED = 10
-_BLOCK = 256
+_BLOCK = 64
 
 KINDS = {
     "same_recording": "recording also trained on",
