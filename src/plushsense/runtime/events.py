@@ -149,10 +149,19 @@ class EventMachine:
 
     def _clear(self) -> None:
         self.mean: Ints | None = None
-        self.open, self._resting = False, 0  # what belongs to an event is set where it begins
+        self.open = False
+        self._close(rest=0)
         self._candidate = -1  # an affect's code, or 4 + gesture where the gesture has no affect
         self._candidate_steps, self._candidate_since = 0, 0
         self._gesture, self._gesture_steps = NO_GESTURE, 0
+
+    def _close(self, rest: int) -> None:
+        self.open = False
+        self.affect, self.gesture, self.source = 0, NO_GESTURE, CNN
+        self.since = 0
+        self._lasted = self._away = self._wait = 0
+        self._away_since = 0
+        self._resting = rest
 
     def lost(self, now: int) -> list[Update]:
         """End the open event after a gap, a clock reset or a fault, and reset all but the number of events."""
@@ -171,6 +180,7 @@ class EventMachine:
             return updates
         if self.open:
             updates.append(self._end(now, now))
+        self._wait = 0
         updates.append(self._begin(affect, gesture, GATE, now, now))
         self._wait = self.settings.wait
         return updates
@@ -333,5 +343,6 @@ class EventMachine:
         return Update(BEGUN, self.number, affect, gesture, source, since, now)
 
     def _end(self, since: int, now: int) -> Update:
-        self.open, self._resting = False, self.settings.rest
-        return Update(ENDED, self.number, self.affect, self.gesture, self.source, since, now)
+        update = Update(ENDED, self.number, self.affect, self.gesture, self.source, since, now)
+        self._close(self.settings.rest)
+        return update
