@@ -69,6 +69,7 @@ def stream(seed: int, length: int, troubles: list[tuple[str, float, int]]) -> Fr
             time[at:] += 50 + 5 * long
         if kind == "back" and at < length:
             time[at:] -= time[at] - long
+    time -= min(0, int(time.min()))  # several steps back: no clock of a toy is below 0
     return Frames(values.astype(np.int64), time.astype(np.int64), None)
 
 
