@@ -160,9 +160,9 @@ def test_a_session_can_be_read_from_another_state(tmp_path: Path) -> None:
         ({"self_calibration": ("x", "y", "z"), "vectors": ()}, "here none"),
         (
             {"self_calibration": ("x", "y", "z"), "vectors": (tuple("xyz"), tuple("zyx"))},
-            "names x, y, z twice, or two vectors with it",
+            "has x, y, z twice, by name or as axes of two vectors",
         ),
-        ({"self_calibration": tuple("xxyz")}, "names x twice"),
+        ({"self_calibration": tuple("xxyz")}, "has x twice"),
         ({"self_calibration": ("x", "y", "z", "w")}, "'w'"),
         (
             {"self_calibration": ("x",), "vectors": (), "channels": (replace(WIDE[0], kind="count"), *WIDE[1:])},

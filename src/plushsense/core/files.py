@@ -41,9 +41,9 @@ def abandoned_folders(place: Path) -> list[Path]:
     """Return the work folders in ``place`` that no process uses any more, as a killed program leaves them."""
     found = []
     for entry in place.glob(f".*{_UNFINISHED}*"):
-        # Those of other users cannot be read, and their owners may delete them meanwhile.
-        with contextlib.suppress(PermissionError, FileNotFoundError):
-            held = [file.name for file in entry.iterdir()] if entry.is_dir() else [""]
+        # Those of other users cannot be read, their owners may delete them meanwhile, and a file is no folder.
+        with contextlib.suppress(PermissionError, FileNotFoundError, NotADirectoryError):
+            held = [file.name for file in entry.iterdir()]
             if (_OWNER in held or (not held and _is_old(entry))) and not is_in_use(entry):
                 found.append(entry)
     return sorted(found)
@@ -74,6 +74,7 @@ def is_in_use(folder: Path) -> bool:
 
 
 def _is_old(folder: Path) -> bool:
+    """Return whether a program would have written into a work folder, or locked it, long ago."""
     return time.time() - folder.stat().st_mtime >= _STARTED_S
 
 

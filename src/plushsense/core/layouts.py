@@ -267,7 +267,7 @@ class Layout:
         named, sensors = self.self_calibration, self.calibrated_sensors
         axes = [self.names[at] for sensor in sensors for at in sensor]
         if twice := [name for name in dict.fromkeys(named) if named.count(name) > 1 or axes.count(name) > 1]:
-            yield f"self_calibration names {', '.join(twice)} twice, or two vectors with it: accepted is once."
+            yield f"self_calibration has {', '.join(twice)} twice, by name or as axes of two vectors: accepted is once."
         for vector in self.vectors:
             if 0 < len(set(vector) & set(named)) < len(set(vector)):
                 yield (

@@ -67,7 +67,7 @@ PATCH_MAGIC = b"PLPT"
 IMAGE_VERSION = 6
 WINDOW_IMAGE_VERSION = 7  # of window networks; otherwise as 6
 _CALIBRATED = 2  # added to the version of a model with a self-calibration
-_NO_SPHERE = 128  # added to the shift of a sensor that is no accelerometer
+_OTHER_SENSOR = 128  # added to the shift of a sensor that is no accelerometer
 SENSOR_BYTES = 200  # of the state of a sensor that calibrates itself
 HEAD_BYTES = 16
 IDLE_BIT = 4
@@ -209,7 +209,7 @@ class IntegerModel:
         if layout.self_calibration:
             plan = [bytes([len(layout.calibrated_sensors)])]
             for axes in layout.calibrated_sensors:
-                other = _NO_SPHERE * (layout.channels[axes[0]].kind != ACCELERATION)
+                other = _OTHER_SENSOR * (layout.channels[axes[0]].kind != ACCELERATION)
                 plan.append(bytes([*(axes if len(axes) > 1 else 3 * axes), layout.calibration_shift + other]))
             title = "self-calibration: sensors; measured channels, shift of a block and kind of each"
             sections.append((title, b"".join(plan)))

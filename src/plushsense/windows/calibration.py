@@ -42,6 +42,7 @@ from __future__ import annotations
 
 import copy
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
@@ -61,9 +62,9 @@ OFFSET_BITS = 4  # fraction bits of the offset that is subtracted
 _MOST_VARIANCE = (1 << 47) - 1
 _VARIANCE_OF_STEPS = 256  # three times that of rounding to whole numbers, in the units of the variance
 _SWEEPS = 8
-KEPT = 8
-MOST_INTERVAL = 128  # 40 s
-LEAST_SPREAD = 64
+KEPT = 8  # means of still blocks
+MOST_INTERVAL = 128  # blocks of 0.3 s
+LEAST_SPREAD = 64  # its square, as a multiple of the level
 _SPREAD_BITS = 10  # fraction bits of the spread, and binary logarithm of its slowness
 _MINOR_BITS = 20  # magnitude of the covariance from which determinant and minors are computed
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -77,8 +78,8 @@ def _quotient(a: int, b: int) -> int:
     return a // b if a >= 0 else -(-a // b)
 
 
-class _Blocks:
-    """Offset and scale of a sensor with A axes, which each complete block of samples changes."""
+class SensorFit(ABC):
+    """Offset and scale of a sensor with A axes, estimated anew from each complete block of samples."""
 
     def __init__(self, axes: int, shift: int) -> None:
         self._axes = axes
@@ -123,12 +124,12 @@ class _Blocks:
         self._squares += squares
         self._count += n
         if self._count >> self._shift:
-            self._block()
+            self._end_block()
             self._count, self._sum, self._squares = 0, [0] * self._axes, 0
 
-    def _block(self) -> None:
-        """Take a complete block into account."""
-        raise NotImplementedError
+    @abstractmethod
+    def _end_block(self) -> None:
+        """Estimate offset and scale with the block that is complete now."""
 
     @property
     def _variance(self) -> int:
@@ -144,7 +145,7 @@ class _Blocks:
         return share * share >> WEIGHT_BITS
 
 
-class SphereFit(_Blocks):
+class SphereFit(SensorFit):
     """The state of one accelerometer: sums over blocks, and the offset and scale that follow from them."""
 
     def __init__(self, shift: int) -> None:
@@ -155,7 +156,7 @@ class SphereFit(_Blocks):
         self._square, self._third, self._fourth = 0, [0] * 3, 0
         self._centre = [0, 0, 0]
 
-    def _block(self) -> None:
+    def _end_block(self) -> None:
         self._add_mean(self._weight_of(self._variance + _VARIANCE_OF_STEPS))
         self._fit()
 
@@ -256,7 +257,7 @@ def _least_eigenvalue(a: list[int]) -> int:
     return max(determinant, 0) // max(sum(minors), 1) << down
 
 
-class RunningQuantiles(_Blocks):
+class RunningQuantiles(SensorFit):
     """The state of one channel, or of the three axes of a vector: means of still blocks, and the spread."""
 
     def __init__(self, axes: int, shift: int) -> None:
@@ -266,7 +267,7 @@ class RunningQuantiles(_Blocks):
         self._rest = [0] * axes  # as the sum of a block
         self._spread = 0  # as the sum of a block, with `_SPREAD_BITS`
 
-    def _block(self) -> None:
+    def _end_block(self) -> None:
         variance = self._variance
         # An eighth of a step's square for each axis: more than that of rounding, and never 0.
         self._keep(self._weight_of(variance + (self._axes << (2 * self._shift - 3))))
@@ -320,7 +321,7 @@ class SelfCalibration:
     def reset(self) -> None:
         """Forget all samples, as at the beginning of a new stream."""
         shift, kinds = self._layout.calibration_shift, [c.kind for c in self._layout.channels]
-        self._fits: list[_Blocks] = [
+        self._fits: list[SensorFit] = [
             SphereFit(shift) if kinds[axes[0]] == ACCELERATION else RunningQuantiles(len(axes), shift)
             for axes in self._sensors
         ]

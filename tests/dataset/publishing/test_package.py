@@ -275,6 +275,16 @@ def test_who_is_removed_during_the_validation_is_in_no_package(source: Dataset, 
     assert [p.name for p in tmp_path.iterdir()] == ["DS"]
 
 
+def test_without_its_folder_there_is_no_zip(source: Dataset, tmp_path: Path) -> None:
+    def meanwhile(stage: str, done: int, total: int) -> None:
+        if stage == "validating":
+            (tmp_path / "out").write_text("mine")
+
+    with pytest.raises(DatasetError, match="cannot be created"):
+        publish(source, tmp_path / "out", source.head, progress=meanwhile)
+    assert [p.name for p in tmp_path.iterdir()] == ["out"] and (tmp_path / "out").read_text() == "mine"
+
+
 def test_a_control_character_in_the_description_is_refused_in_one_sentence(source: Dataset) -> None:
     about = replace(source.head.about, keywords=("touch", "a\0"))
     with pytest.raises(DatasetError, match=r"'about.keywords\[1\]' .* U\+0000"):

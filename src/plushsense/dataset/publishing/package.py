@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import DatasetError, ForgottenError, need
+from plushsense.core.errors import DatasetError, need
 from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import SIMULATION_MARK
@@ -212,7 +212,7 @@ def publish(
     target = check_output_folder(dataset, out)
     options = options or PublishOptions()
     day = published or date.today().isoformat()
-    packed = False
+    zipped = False
     try:
         with new_folder(out, DatasetError, finishing=dataset.generation.writing) as work:
             contents = ContentsWriter(dataset, work / DATA, head, options, partial(progress, "writing")).write()
@@ -231,11 +231,12 @@ def publish(
             _write_metadata(work, d)
             checked = check_folder(work, thorough=thorough, progress=progress)
             if checked.valid:
+                missing = not target.exists()
                 write_zip(work, target, f"{d.name}-{d.version}", dataset.generation.writing)
-                packed = True
-    except ForgottenError:
-        # A person was removed after the zip was written.
-        if packed:
+                zipped = missing
+    except BaseException:
+        # A zip without its folder would be in the way of the next call, and may contain a person removed since.
+        if zipped:
             target.unlink(missing_ok=True)
         raise
     files = list_package_files(out)

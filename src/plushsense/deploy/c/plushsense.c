@@ -63,7 +63,7 @@
 #define MOST_MEAN_SHIFT 15u
 #ifdef PLUSH_CALIBRATE
 #define MOST_SENSORS 64u
-#define NO_SPHERE 128u /* added to the shift of a sensor that is no accelerometer */
+#define OTHER_SENSOR 128u /* added to the shift of a sensor that is no accelerometer */
 #define MOST_READING (INT32_C(1) << 19) /* of an accelerometer that calibrates itself, so that its sums fit 64 bits */
 #define LEAST_BLOCK_SHIFT 2u
 #define MOST_BLOCK_SHIFT 8u
@@ -494,7 +494,7 @@ PLUSH_SMALL static int read_sensors(plush_toy *toy, source *from)
     if (p == NULL || toy->sensors == 0 || toy->sensors > MOST_SENSORS)
         return 0;
     for (n = 0; n < 4u * toy->sensors; n += 4) {
-        uint32_t other = p[n + 3] / NO_SPHERE, shift = p[n + 3] % NO_SPHERE;
+        uint32_t other = p[n + 3] / OTHER_SENSOR, shift = p[n + 3] % OTHER_SENSOR;
 
         if (shift < LEAST_BLOCK_SHIFT || shift > MOST_BLOCK_SHIFT)
             return 0;
@@ -2426,7 +2426,7 @@ static void calibrate(plush_toy *toy)
     uint32_t n, i;
 
     for (n = 0; n < toy->sensors; n++, s++, plan += 4) {
-        uint32_t axes = plan[0] == plan[1] ? 1 : 3, shift = plan[3] % NO_SPHERE;
+        uint32_t axes = plan[0] == plan[1] ? 1 : 3, shift = plan[3] % OTHER_SENSOR;
 
         for (i = 0; i < axes; i++) {
             int32_t *sample = toy->sample + plan[i], x = *sample, y;
@@ -2448,7 +2448,7 @@ static void calibrate(plush_toy *toy)
         }
         s->begun = 1;
         if (++s->count >> shift != 0)
-            end_block(s, axes, shift, plan[3] / NO_SPHERE);
+            end_block(s, axes, shift, plan[3] / OTHER_SENSOR);
     }
 }
 
