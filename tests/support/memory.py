@@ -9,9 +9,12 @@ LIMIT_MB = 600
 
 
 def memory_mb() -> tuple[float, float]:
-    """Return the resident memory of this process in MB, now and the most so far; 0 where the system does not say it."""
+    """Return in MB what this process has allocated now, and its most resident memory so far; 0 where it is not known.
+
+    Resident memory also counts pages of libraries, of which twice as many are resident after a fresh installation.
+    """
     with contextlib.suppress(OSError, IndexError):
         text = Path("/proc/self/status").read_text()
-        now, most = (int(text.split(name)[1].split()[0]) / 1000 for name in ("VmRSS:", "VmHWM:"))
+        now, most = (int(text.split(name)[1].split()[0]) / 1000 for name in ("RssAnon:", "VmHWM:"))
         return now, most
     return 0.0, 0.0
