@@ -52,17 +52,18 @@ SLOW_FILES = {
 }
 # Files that take longest, the longest first. The workers begin with them: one of them begun late would end alone.
 LONGEST = (
-    "studio/test_train.py",
-    "studio/test_record.py",
     "studio/test_therapist.py",
-    "deploy/proof/test_verify.py",
-    "studio/test_pictures_of_pages.py",
-    "studio/test_shell.py",
     "studio/test_review.py",
-    "test_pages.py",
-    "studio/test_home.py",
-    "studio/test_record_refusals.py",
+    "studio/test_record.py",
+    "studio/test_shell.py",
     "studio/test_live_page.py",
+    "studio/test_train_scores.py",
+    "studio/test_pictures_of_pages.py",
+    "studio/test_record_refusals.py",
+    "deploy/proof/test_verify.py",
+    "studio/test_home.py",
+    "test_pages.py",
+    "studio/test_train.py",
     "cli/test_paper_page.py",
     "studio/test_live_long.py",
     "studio/test_record_whole.py",
@@ -93,29 +94,29 @@ def _place(item: pytest.Item) -> str:
     return item.path.relative_to(REPO / "tests").as_posix() if item.path.is_relative_to(REPO / "tests") else ""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that `make test-quick` and `make test` leave out, and put the longest first."""
+@pytest.hookimpl(wrapper=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> Iterator[None]:
+    """Mark the tests that `make test-quick` and `make test` leave out, and deal those that are left to the workers."""
     for item in items:
         named = f"{_place(item)}::{item.name}"
         if {named, named.partition("[")[0]} & EXHAUSTIVE:
             item.add_marker(pytest.mark.exhaustive)
         if _in_slow_place(item.path) or SLOW_FIXTURES & set(getattr(item, "fixturenames", ())):
             item.add_marker(pytest.mark.slow)
+    yield
     items[:] = _dealt(items, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
 
 
 def _dealt(items: list[pytest.Item], workers: int) -> list[pytest.Item]:
-    """Deal the files to the workers, in turn the longest, then those of the studio, which wait, then the others.
+    """Deal the longest files to the workers in turn, then the others, in parts of as many tests each.
 
-    `--dist worksteal` cuts the list into one part for each worker; all parts are equally long in tests.
+    `--dist worksteal` cuts the list into one such part for each worker.
     """
     files: dict[str, list[pytest.Item]] = {}
     for item in items:
         files.setdefault(_place(item), []).append(item)
-    longest = [name for name in LONGEST if name in files]
-    waiting = [name for name in files if name.startswith("studio/") and name not in LONGEST]
     parts: list[list[pytest.Item]] = [[] for _ in range(workers)]
-    for at, name in enumerate([*longest, *waiting]):
+    for at, name in enumerate(name for name in LONGEST if name in files):
         parts[at % workers] += files.pop(name)
     # What runs in one process beside a worker is asked for by one worker, if it can be.
     together = [name for group in apart.GROUPS for name in group if name in files]
