@@ -3,7 +3,7 @@
 Two virtual children are recorded (the studio is killed once, the page closed once), reviewed, read by a network of her
 own, watched live, and handed over as a package. No page shows English, or anything that axe-core objects to.
 
-She asks each child for seven gestures; with PLUSHSENSE_SOAK, or for pictures, for all 17.
+She asks each child for five gestures; with PLUSHSENSE_SOAK, or for pictures, for all 17.
 """
 
 from __future__ import annotations
@@ -33,11 +33,7 @@ SPEED = 20
 NAME = "Viss pa reizei"
 PATIENT = bool(os.environ.get("PLUSHSENSE_SHOTS"))
 """Whether she waits for the test on people left out, which takes the minute that she gives it."""
-ASKED = (
-    GESTURES
-    if LONG or PATIENT
-    else ("Back stroke 1", "Tail hit 1", "Tail tap 1", "Hold in hands", "Head stroke 2", "Tail pull", "Hold strong")
-)
+ASKED = GESTURES if LONG or PATIENT else ("Back stroke 1", "Tail hit 1", "Tail tap 1", "Hold in hands", "Head stroke 2")
 KILLED, CLOSED = len(ASKED) // 3, len(ASKED) // 2
 
 

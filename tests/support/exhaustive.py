@@ -5,17 +5,22 @@ They repeat what shorter ones test with more pages, languages, chips, compilers,
 
 EXHAUSTIVE = {
     "bench/test_peers.py::test_without_any_peer_ours_and_plain_loops_are_measured_with_both_algorithms",
+    "bench/test_peers.py::test_a_peer_that_is_not_installed_is_named_with_how_to_get_it",
+    "cli/test_baselines.py::test_on_real_recordings_a_leaky_split_flatters_trees",
     "cli/test_kill.py::test_kill_9_in_the_middle",
     "cli/test_paper_page.py::test_every_command_runs",
+    "cli/test_paper_page.py::test_the_tutorial_ends_with_the_same_answers_in_c",
     "deploy/proof/test_verify.py::test_every_way_to_compile_on_the_host",
     "deploy/proof/test_verify.py::test_every_fault_is_caught_on_the_host[all]",
     "deploy/proof/test_verify.py::test_the_same_on_every_chip[one-layer-8]",
+    "deploy/proof/test_verify.py::test_the_same_on_every_chip[four-layers-6]",
     "deploy/proof/test_verify.py::test_the_same_on_every_chip[paper-11]",
     "deploy/proof/test_verify.py::test_the_same_on_every_chip[vectors-3]",
+    "deploy/proof/test_verify.py::test_the_same_on_every_chip[vectors-6]",
     "deploy/proof/test_verify.py::test_without_smoothing_no_mutant_is_applied_that_cannot_show",
     *(
         f"deploy/proof/test_verify.py::test_faults_are_caught_on_every_chip[{chip}]"
-        for chip in ("cortex-m0", "cortex-m4", "riscv32")
+        for chip in ("cortex-m0", "cortex-m33", "cortex-m4", "riscv32")
     ),
     "deploy/test_c_source.py::test_clang_tidy",
     "deploy/test_c_source.py::test_no_warning_and_three_functions_of_the_c_library[plain-clang]",
@@ -27,6 +32,7 @@ EXHAUSTIVE = {
     "deploy/test_firmware.py::test_clang_agrees",
     "deploy/test_profile.py::test_counts[cortex-m33]",
     "deploy/test_profile.py::test_counts[cortex-m4]",
+    "deploy/test_profile.py::test_counts[riscv32]",
     "deploy/test_profile.py::test_the_networks_of_the_issue_stay_within_their_limits[14d1_39d2_41d4-limits0]",
     "deploy/test_profile.py::test_the_networks_of_the_issue_stay_within_their_limits[14d1_19d2_19d4-limits1]",
     "experiments/search/test_run.py::test_killed_in_every_rung_and_gone_on_with",

@@ -335,10 +335,11 @@ def _croissant(p: PackageView) -> None:
         return
     mlcroissant = need("mlcroissant", EXTRA)
     need("absl.logging", EXTRA).set_verbosity("error")
-    metadata = mlcroissant.Dataset(str(p.root / CROISSANT_FILE)).metadata
-    for issue in sorted({*metadata.ctx.issues.errors, *metadata.ctx.issues.warnings}, key=str):
+    loaded = mlcroissant.Dataset(str(p.root / CROISSANT_FILE))
+    issues = loaded.metadata.ctx.issues
+    for issue in sorted({*issues.errors, *issues.warnings}, key=str):
         p.report(CROISSANT_FILE, str(issue))
-    records = compare_records(mlcroissant, p.root, p.built.dataset, None if p.thorough else STREAM_ROWS, p.report)
+    records = compare_records(loaded, p.root, p.built.dataset, None if p.thorough else STREAM_ROWS, p.report)
     p.looked_at = ", ".join(f"{n} records of {name}" for name, n in records.items())
 
 

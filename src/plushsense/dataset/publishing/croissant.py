@@ -12,7 +12,6 @@ import json
 from collections.abc import Callable, Iterable
 from importlib import resources
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -137,16 +136,15 @@ ReportProblem = Callable[[str, str], None]
 
 
 def compare_records(
-    mlcroissant: ModuleType, root: Path, dataset: Dataset, stream_rows: int | None, report: ReportProblem
+    loaded: Any, root: Path, dataset: Dataset, stream_rows: int | None, report: ReportProblem
 ) -> dict[str, int]:
     """Load every record set, compare it with the files, and return the number of compared records of each.
 
     Args:
+        loaded: the `mlcroissant.Dataset` of the package; which files its streams include is changed.
         stream_rows: number of rows to compare from the beginning of each stream; None for all.
         report: called with a file and its problem.
     """
-    path = str(root / CROISSANT_FILE)
-    loaded = mlcroissant.Dataset(path)
     by_id = {node.uuid: node for node in loaded.metadata.distribution}
     compared = {}
     loaded_files: set[str] = set()
