@@ -43,8 +43,8 @@ GROUPS = tuple(
         "tuning/test_gate.py",
         "workflow/test_demo.py workflow/test_estimator.py workflow/test_exchange.py",
         # Trainings in the process of the tests, 100 MB each time one is under way and afterwards.
-        "cli/test_adapt.py cli/test_live.py cli/test_main.py cli/test_paper_page.py cli/test_protocol.py"
-        " cli/test_stream_eval.py cli/test_trim.py"
+        "cli/test_adapt.py cli/test_extending.py cli/test_live.py cli/test_main.py cli/test_paper_page.py"
+        " cli/test_protocol.py cli/test_stream_eval.py cli/test_trim.py"
         " experiments/people/test_explanation.py experiments/people/test_merging.py"
         " experiments/people/test_people.py experiments/search/test_run.py"
         " experiments/streams/test_training.py experiments/test_abstention_run.py faults/test_interrupted.py"
