@@ -28,6 +28,8 @@ def test_results_reports_and_resuming(tmp_path: Path, workers: int, monkeypatch:
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
     journal = Journal(tmp_path)
     journal.save("job3", {"value": -1})
+    # As a process leaves it that is killed after it has saved.
+    (tmp_path / ".job3.lock").touch()
     done: list[tuple[str, bool]] = []
     said: list[Any] = []
     results = run_jobs(
@@ -45,6 +47,7 @@ def test_results_reports_and_resuming(tmp_path: Path, workers: int, monkeypatch:
     assert done[0] == ("job3", True) and sorted(done[1:]) == [(f"job{n}", False) for n in (0, 1, 2, 4)]
     assert sorted(said) == [(f"job{n}", "at", n) for n in (0, 1, 2, 4)]
     assert all(journal.has(job.id) for job in JOBS)
+    assert not list(tmp_path.glob(".*.lock"))
     made_by = {r["process"] for job, r in results.items() if job != "job3"}
     assert (os.getpid() in made_by) == (workers == 1)
     assert os.environ["OPENBLAS_NUM_THREADS"] == "2"

@@ -156,7 +156,7 @@ class Journal:
         Raises:
             PlushSenseError: if writing is no longer allowed, so that the result could not be saved.
         """
-        lock = FileLock(self.folder / f".{job}.lock", timeout=0, thread_local=False)
+        lock = FileLock(self._lock_path(job), timeout=0, thread_local=False)
         try:
             with self._writing():
                 self.folder.mkdir(parents=True, exist_ok=True)
@@ -166,6 +166,14 @@ class Journal:
         except (OSError, NotImplementedError):
             return Claim(None)
         return Claim(lock)
+
+    def delete_lock(self, job: str) -> None:
+        """Delete the lock of a job that is done: a process that was killed after it had saved the result left it."""
+        with suppress(OSError):
+            self._lock_path(job).unlink(missing_ok=True)
+
+    def _lock_path(self, job: str) -> Path:
+        return self.folder / f".{job}.lock"
 
     def save(self, job: str, result: Result) -> None:
         """Save the result of a job atomically. Values other than arrays must be JSON-serialisable.

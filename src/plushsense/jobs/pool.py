@@ -198,8 +198,9 @@ class _Left:
 
     def _found(self, job: Job) -> bool:
         kept = None if self._journal is None else self._journal.find(job.id)
-        if kept is None:
+        if self._journal is None or kept is None:
             return False
+        self._journal.delete_lock(job.id)
         self._done(job, kept, True)
         return True
 
