@@ -159,6 +159,7 @@ class Drill:
     raw: tuple[str, ...] = ("src", "DS/recordings", "DS/streams")
     names_differ: tuple[str, ...] = ()
     once: bool = False
+    done: Callable[[Path], bool] = lambda place: False
 
     def command(self, place: Path) -> list[str]:
         return [word.replace("DIR", str(place)) for word in shlex.split(self.words)]
