@@ -152,6 +152,7 @@ class Drill:
     run, what must be the same after any fault as after an undisturbed run. Files in the folders ``raw`` must never
     change. The names of what ``names_differ`` begins with differ from run to run. With ``once``, the command does
     something else, or refuses, when it is given again although it was done; its outcome is that of the files alone.
+    ``done`` says whether it was done although it was killed.
     """
 
     words: str
