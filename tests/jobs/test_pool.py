@@ -28,7 +28,7 @@ def test_results_reports_and_resuming(tmp_path: Path, workers: int, monkeypatch:
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
     journal = Journal(tmp_path)
     journal.save("job3", {"value": -1})
-    # As a process leaves it that is killed after it has saved.
+    # A process that is killed after it has saved the result leaves its lock.
     (tmp_path / ".job3.lock").touch()
     done: list[tuple[str, bool]] = []
     said: list[Any] = []

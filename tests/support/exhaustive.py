@@ -5,8 +5,6 @@ They repeat what shorter ones test with more pages, languages, chips, compilers,
 
 EXHAUSTIVE = {
     "bench/test_peers.py::test_without_any_peer_ours_and_plain_loops_are_measured_with_both_algorithms",
-    "bench/test_peers.py::test_a_peer_that_is_not_installed_is_named_with_how_to_get_it",
-    "cli/test_baselines.py::test_on_real_recordings_a_leaky_split_flatters_trees",
     "cli/test_kill.py::test_kill_9_in_the_middle",
     "cli/test_paper_page.py::test_every_command_runs",
     "cli/test_paper_page.py::test_the_tutorial_ends_with_the_same_answers_in_c",

@@ -197,8 +197,7 @@ class _Left:
             claim.release()
 
     def _found(self, job: Job) -> bool:
-        kept = None if self._journal is None else self._journal.find(job.id)
-        if self._journal is None or kept is None:
+        if self._journal is None or (kept := self._journal.find(job.id)) is None:
             return False
         self._journal.delete_lock(job.id)
         self._done(job, kept, True)
