@@ -17,7 +17,7 @@ from plushsense.core.errors import ConfigError, DatasetError, DeviceError, Plush
 from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.recording.recorder import SessionRequest
 from plushsense.recording.session import OpenSession
-from plushsense.recording.session_files import SessionHead, read_events
+from plushsense.recording.session_files import SessionEvent, SessionHead, read_events
 from plushsense.studio.app import toys
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.record.controller import MARKERS, NO_CONSENT, PSEUDO, ActiveSession, RecordController
@@ -97,6 +97,31 @@ def test_a_session_from_its_beginning_to_its_end(controller: RecordController, t
     assert [(s.folder.name, s.finished) for s in controller.sessions()] == [("2", False), ("1", True)]
     with pytest.raises(ConfigError, match="finished"):
         controller.resume("S01/1")
+
+
+def test_a_session_begins_although_the_last_event_of_the_one_before_is_not_yet_written(
+    controller: RecordController, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = controller.begin(QUICK)
+    log, closing = session.recorder.session.log, threading.Event()
+    write, close = log.write, session.recorder.close
+
+    def write_late(events: list[SessionEvent]) -> None:
+        if any(e.kind == "finished" for e in events):
+            closing.wait(60)
+        write(events)
+
+    def close_it() -> None:
+        closing.set()
+        close()
+
+    monkeypatch.setattr(log, "write", write_late)
+    monkeypatch.setattr(session.recorder, "close", close_it)
+    for number in range(4):
+        press(session, "go:" + str(number))
+        press(session, "s")
+    assert session.recorder.status().state == "finished"
+    assert controller.begin(QUICK).name == "S01/2"
 
 
 def test_a_command_counts_once(controller: RecordController, tmp_path: Path) -> None:

@@ -156,10 +156,12 @@ class RecordController:
         """
         self._check(request)
         with self._opening:
-            folder, known = session_folder(self._workspace.recordings, request, new=anew)
-            session = self._active_of(request, folder.parent.name)
+            person = session_folder(self._workspace.recordings, request, new=anew)[0].parent
+            session = self._active_of(request, person.name)
             if session is not None:
                 return session
+            # Again, as the end of a session of this person may have written what it was waiting to write.
+            folder, known = session_folder(self._workspace.recordings, request, new=anew)
             if known is not None:
                 raise ConfigError(
                     f"{folder.parent.name} has an unfinished session, {folder.name}: resume it, or choose to begin "
