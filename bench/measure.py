@@ -33,6 +33,8 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
+import torch
+
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from headlines import QUESTIONS, ROWS, SETS, Line, Row, git
@@ -112,12 +114,13 @@ def _load() -> float | None:
 
 
 def machine() -> str:
-    """Describe processor, cores, system, Python and PyTorch."""
+    """Describe processor, cores, system, Python, PyTorch, and the graphics card if `evaluate` would train on it."""
     lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines() if Path("/proc/cpuinfo").exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     cpu = names[0] if names else platform.processor() or platform.machine()
     versions = f"Python {platform.python_version()}, PyTorch {version('torch')}"
-    return f"{cpu}, {os.cpu_count()} cores, {platform.system()}, {versions}"
+    card = f", {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
+    return f"{cpu}, {os.cpu_count()} cores, {platform.system()}, {versions}{card}"
 
 
 def commit() -> str:
