@@ -46,21 +46,27 @@ def empty(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     assert not [line for line in one.errors if "Traceback" in line], "".join(one.errors)
 
 
-def test_pages_open_without_complaint(empty: str, look: Fixture, shots: Fixture) -> None:
-    for language, dark, size in (("en", False, DESK), ("lv", True, PHONE)):
-        browser = look(size, dark, language, own=True)
-        for name, path in PAGES.items():
-            page = browser.open(empty + path)
-            assert marked(page, "title").inner_text()
-            assert axe(page) == [], name
-            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{name} scrolls sideways"
-            assert page.locator(".ps-bar [aria-current]").evaluate(_IN_VIEW), name
-            shots(page, f"{name}-{language}-{'dark' if dark else 'light'}")
-            browser.leave(page)
-        assert browser.complaints == []
-        # The icons are drawn, see `icons.js`: their font would be a third of a page.
-        fonts = [url for url in browser.asked if url.endswith(".woff2")]
-        assert len(set(fonts)) <= 2, fonts
+@pytest.mark.parametrize(
+    ("language", "dark", "size"),
+    [("en", False, DESK), ("lv", True, PHONE)],
+    ids=["en-light-desk", "lv-dark-phone"],
+)
+def test_pages_open_without_complaint(
+    language: str, dark: bool, size: tuple[int, int], empty: str, look: Fixture, shots: Fixture
+) -> None:
+    browser = look(size, dark, language, own=True)
+    for name, path in PAGES.items():
+        page = browser.open(empty + path)
+        assert marked(page, "title").inner_text()
+        assert axe(page) == [], name
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), f"{name} scrolls sideways"
+        assert page.locator(".ps-bar [aria-current]").evaluate(_IN_VIEW), name
+        shots(page, f"{name}-{language}-{'dark' if dark else 'light'}")
+        browser.leave(page)
+    assert browser.complaints == []
+    # The icons are drawn, see `icons.js`: their font would be a third of a page.
+    fonts = [url for url in browser.asked if url.endswith(".woff2")]
+    assert len(set(fonts)) <= 2, fonts
 
 
 def test_every_icon_is_drawn() -> None:

@@ -39,6 +39,8 @@ CHROMIUM = [
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
+    # A page is gone before optimized code has paid for its compilation.
+    "--js-flags=--no-maglev,--no-turbofan",
 ]
 # What Chromium says of a message that a page sends just when its connection is closed, as on leaving the page.
 _CLOSED = "WebSocket is already in CLOSING or CLOSED state."
