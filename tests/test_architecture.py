@@ -56,6 +56,11 @@ def test_every_exhaustive_test_exists() -> None:
     assert wanted - found == set()
 
 
+def test_a_test_that_the_security_page_names_is_not_exhaustive() -> None:
+    named = set(re.findall(r"\btest_\w+", (ROOT / "docs/security.md").read_text(encoding="utf-8")))
+    assert [test for test in EXHAUSTIVE if test.partition("::")[2] in named] == []
+
+
 def test_three_modules_with_one_prefix_are_a_package() -> None:
     families = Counter((m.parent, m.stem.split("_")[0]) for m in MODULES if "_" in m.stem.strip("_"))
     assert [f"{name(folder)}/{prefix}_*" for (folder, prefix), n in families.items() if n >= 3] == []

@@ -39,7 +39,7 @@ CHROMIUM = [
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
-    # A page is gone before optimized code has paid for its compilation.
+    # Pages of tests are closed so soon that compiling optimized code takes longer than the code saves.
     "--js-flags=--no-maglev,--no-turbofan",
 ]
 # What Chromium says of a message that a page sends just when its connection is closed, as on leaving the page.
