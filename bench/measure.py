@@ -33,8 +33,6 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-import torch
-
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from headlines import QUESTIONS, ROWS, SETS, Line, Row, git
@@ -115,6 +113,8 @@ def _load() -> float | None:
 
 def machine() -> str:
     """Describe processor, cores, system, Python, PyTorch, and the graphics card if `evaluate` would train on it."""
+    import torch
+
     lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines() if Path("/proc/cpuinfo").exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     cpu = names[0] if names else platform.processor() or platform.machine()

@@ -1,20 +1,20 @@
 """Test files in a process of their own beside a worker: what they load and keep is gone when it ends.
 
 A worker collects all tests of its run and keeps what one of them has loaded: scikit-learn 120 MB, MLflow
-190 MB. The files of a line of `GROUPS` run in a process that collects these only and runs the tests that the worker
-asks for. It ends when the worker comes to another line, or after a test that leaves more than `ENOUGH_MB` allocated.
+190 MB. The files of a line of `GROUPS` run in a fork of a server process, which has collected the files of all lines.
+The fork ends when the worker comes to another line, or after a test that leaves more than `ENOUGH_MB` allocated.
 
 Without workers (``pytest tests/...``, coverage) all tests run in the one process.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -25,11 +25,13 @@ from _pytest.runner import runtestprotocol
 from support.memory import memory_mb
 
 TESTS = Path(__file__).parents[1]
-# Each line is one process, for files that load the same.
+# Each line is one fork, for files that load the same or share fixtures.
 GROUPS = tuple(
     tuple(files.split())
     for files in (
-        "cli/test_baselines.py cli/test_publish.py",
+        "cli/test_baselines.py",
+        "cli/test_publish.py dataset/publishing/test_checking.py dataset/publishing/test_contents.py"
+        " dataset/publishing/test_package.py",
         "dataset/importing/test_importers_fuzz.py",
         "evaluation/test_reidentification.py scoring/test_metrics.py",
         "experiments/baselines/test_models.py experiments/baselines/test_report.py experiments/baselines/test_score.py"
@@ -41,7 +43,12 @@ GROUPS = tuple(
         "studio/test_train_scores.py",
         "test_pages.py test_questions.py",
         "tuning/test_gate.py",
-        "workflow/test_demo.py workflow/test_estimator.py workflow/test_exchange.py",
+        "workflow/test_demo.py",
+        "workflow/test_estimator.py workflow/test_exchange.py",
+        "workflow/test_paper.py",
+        # The real recordings.
+        "dataset/importing/test_proposals.py dataset/quality/test_checks.py dataset/test_labelling.py"
+        " devices/test_virtual.py",
         # Trainings in the process of the tests, 100 MB each time one is under way and afterwards.
         "cli/test_adapt.py cli/test_extending.py cli/test_live.py cli/test_main.py cli/test_paper_page.py"
         " cli/test_protocol.py cli/test_stream_eval.py cli/test_trim.py"
@@ -50,7 +57,7 @@ GROUPS = tuple(
         " experiments/streams/test_training.py experiments/test_abstention_run.py faults/test_interrupted.py"
         " models/test_net.py training/fast/test_net.py training/test_fit.py trials/test_budget.py"
         " trials/test_estimate.py workflow/test_api.py workflow/test_calibration.py workflow/test_forget_beside.py"
-        " workflow/test_paper.py workflow/test_reporting.py workflow/test_resuming.py",
+        " workflow/test_reporting.py workflow/test_resuming.py",
     )
 )
 _GROUP_OF = {file: group for group in GROUPS for file in group}
@@ -59,49 +66,47 @@ _CHANNEL = "TESTS_APART"
 SHARED = "TESTS_SHARED"
 """Environment variables: the socket on which a worker asks a process for tests; the folder that all workers share."""
 
-Asked = tuple[str, str | None]  # the test, and the next one of the file, which may use the same fixtures
-Answer = tuple[list[dict[str, Any]], float, float]  # reports; memory now, and the most so far: see `memory_mb`
+Asked = tuple[str, str | None]  # the test, and the next one of its group, which may use the same fixtures
+Answer = tuple[list[dict[str, Any]], float]  # reports, and the most memory so far: see `memory_mb`
 
 
 class Apart:
-    """The process of a group of files, as its worker sees it."""
+    """The server process of a worker, as the worker sees it: it has collected ``files``."""
 
-    def __init__(self, group: tuple[str, ...], config: pytest.Config, base: Path) -> None:
-        self.group, self.config = group, config
-        self.peak_mb = self.now_mb = 0.0
+    def __init__(self, files: list[str], config: pytest.Config, base: Path) -> None:
+        self.config = config
         ours, theirs = socket.socketpair()
         with theirs:
-            files = [str(TESTS / file) for file in group]
-            words = [sys.executable, "-m", "pytest", *files, "-p", "no:xdist", "-p", "no:cacheprovider"]
+            words = [sys.executable, "-m", "pytest", *(str(TESTS / file) for file in files)]
             # A worker's folder lies in that of the run.
             environment = {**os.environ, _CHANNEL: str(theirs.fileno()), SHARED: str(base.parent)}
-            number = len(list(base.glob("apart-*")))
             self.process = subprocess.Popen(
-                [*words, "--rootdir", str(config.rootpath), f"--basetemp={base / f'apart-{number}'}"],
+                [*words, "-p", "no:xdist", "-p", "no:cacheprovider", "--rootdir", str(config.rootpath),
+                 f"--basetemp={base / 'apart'}"],
                 cwd=config.invocation_params.dir,
                 env=environment,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
-            )
+            )  # fmt: skip
         self.channel = Connection(ours.detach())
 
-    def run(self, item: pytest.Item, following: str | None) -> list[pytest.TestReport]:
-        """Run a test there and return its reports; one of a failure if the process ended."""
+    def run(self, item: pytest.Item, following: str | None) -> tuple[list[pytest.TestReport], float]:
+        """Run a test there; return its reports, or one of a failure if the process ended, and the memory in MB."""
         try:
             self.channel.send((item.nodeid, following))
-            data, self.now_mb, self.peak_mb = self.channel.recv()
+            answer: Answer = self.channel.recv()
         except (EOFError, OSError):
             said = (
                 f"The process of {item.path.name} ended with status {self.process.wait()} (see tests/support/apart.py)."
             )
             words: dict[str, Any] = dict.fromkeys(item.keywords, 1)
-            return [pytest.TestReport(item.nodeid, item.location, words, "failed", said, "call")]
+            return [pytest.TestReport(item.nodeid, item.location, words, "failed", said, "call")], 0.0
         make = self.config.hook.pytest_report_from_serializable
-        return [make(config=self.config, data=report) for report in data]
+        return [make(config=self.config, data=report) for report in answer[0]], answer[1]
 
     def close(self) -> None:
-        """End the process: its fixtures are torn down."""
+        """End the process."""
         self.channel.close()
         self.process.wait()
 
@@ -120,53 +125,89 @@ class Worker:
         group = _GROUP_OF.get(place)
         if group is None:
             return None
-        if self.apart is not None and self.apart.group is not group:
-            self._end()
-        if self.apart is None:
+        if self.apart is None or self.apart.process.poll() is not None:
             base = item.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
-            self.apart = Apart(group, item.config, base)
+            files = dict.fromkeys(file for file in map(_place, item.session.items) if file in _GROUP_OF)
+            self.apart = Apart(list(files), item.config, base)
         following = nextitem.nodeid if nextitem is not None and _GROUP_OF.get(_place(nextitem)) is group else None
         item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-        for report in self.apart.run(item, following):
+        reports, mb = self.apart.run(item, following)
+        for report in reports:
             item.ihook.pytest_runtest_logreport(report=report)
         item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
-        self.peaks[place] = max(self.peaks.get(place, 0.0), self.apart.peak_mb)
-        if self.apart.now_mb > ENOUGH_MB or self.apart.process.poll() is not None:
-            self._end()
+        self.peaks[place] = max(self.peaks.get(place, 0.0), mb)
         # What an earlier test left for others of its folder is not known to what runs in this process after it.
         item.session._setupstate.teardown_exact(nextitem)
         return True
 
     def pytest_sessionfinish(self) -> None:
-        self._end()
-
-    def _end(self) -> None:
         if self.apart is not None:
             self.apart.close()
-        self.apart = None
 
 
 class Served:
-    """Plugin of such a process: runs the tests that the worker asks for."""
+    """Plugin of the server: a fork of it, which has collected all tests already, runs those of one group.
+
+    The server itself runs no test, so that no library has threads when it forks.
+    """
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """Run what is asked for until the worker closes the channel."""
         items = {item.nodeid: item for item in session.items}
         channel = Connection(int(os.environ.pop(_CHANNEL)))
-        for name, following in _requests(channel):
-            reports = runtestprotocol(items[name], log=False, nextitem=items.get(following or ""))
-            to_data = session.config.hook.pytest_report_to_serializable
-            data = [to_data(config=session.config, report=report) for report in reports]
-            channel.send((data, *memory_mb()))
-        session._setupstate.teardown_exact(None)
+        # The first to ask for this folder makes it anew.
+        session.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]
+        while (asked := _asked(channel)) is not None:
+            _refuse_threads()
+            if child := os.fork():
+                _, status = os.waitpid(child, 0)
+                if status:
+                    # The worker learns of it, and starts another server.
+                    os._exit(os.waitstatus_to_exitcode(status) % 256)
+                continue
+            status = 1
+            try:
+                _run_group(session, items, channel, asked)
+                status = 0
+            finally:
+                with contextlib.suppress(Exception):
+                    atexit._run_exitfuncs()
+                os._exit(status)
         return True
 
 
-def _requests(channel: Connection) -> Iterator[Asked]:
+def _refuse_threads() -> None:
+    """End this process if it has threads, which a fork would lack: import what starts them within the tests."""
+    with contextlib.suppress(OSError):
+        tasks = sorted(Path("/proc/self/task").glob("*/comm"))
+        if len(tasks) > 1:
+            os.write(2, f"{__file__}: threads of {', '.join(p.read_text().strip() for p in tasks)}\n".encode())
+            os._exit(3)
+
+
+def _run_group(session: pytest.Session, items: dict[str, pytest.Item], channel: Connection, asked: Asked) -> None:
+    """Run the tests that are asked for, until the next is of another group or too much memory is allocated."""
+    while True:
+        name, following = asked
+        reports = runtestprotocol(items[name], log=False, nextitem=items.get(following or ""))
+        to_data = session.config.hook.pytest_report_to_serializable
+        data = [to_data(config=session.config, report=report) for report in reports]
+        now_mb, most_mb = memory_mb()
+        last = following is None or now_mb > ENOUGH_MB
+        if last:
+            session._setupstate.teardown_exact(None)
+        channel.send((data, most_mb))
+        if last or (next_asked := _asked(channel)) is None:
+            return
+        asked = next_asked
+
+
+def _asked(channel: Connection) -> Asked | None:
+    """Return the next test that is asked for; None once the worker has closed the channel."""
     with contextlib.suppress(EOFError, OSError):
-        while True:
-            yield channel.recv()
+        return channel.recv()  # type: ignore[no-any-return]
+    return None
 
 
 def _place(item: pytest.Item) -> str:

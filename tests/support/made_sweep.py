@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import polars
 
 from plushsense.core.gestures import load_gestures
 from plushsense.models.arch import PAPER_ARCHITECTURES, PAPER_FILTERS, Arch
@@ -40,6 +39,8 @@ def make_sweep(
     draw: int = 0,
 ) -> Path:
     """Write the folder; ``waiting`` is the share of trials that have no score yet. Returns it."""
+    import polars
+
     random = np.random.default_rng(draw)
     if labels is None:
         gestures = load_gestures("plush-18").gestures

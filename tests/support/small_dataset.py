@@ -85,7 +85,8 @@ def make_session() -> Callable[[Path, int], None]:
 
 @pytest.fixture(scope="session")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("recordings")
+    # The data set takes its name from this folder. It must be the one that the shared `bundle` was trained on.
+    folder = tmp_path_factory.mktemp("made") / "recordings"
     for person in range(5):
         session(folder / f"P{person + 1}", person)
     return folder

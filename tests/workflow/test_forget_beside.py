@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import polars
 import pytest
 
 import plushsense as ps
@@ -39,6 +38,8 @@ Hook = Callable[..., None]
 
 def traces(folder: Path) -> list[str]:
     """Where the person stands in a data set folder: in a name, in any byte, in any row; and every result kept."""
+    import polars
+
     found = []
     for path in folder.rglob("*"):
         where = path.relative_to(folder).as_posix()
@@ -161,6 +162,8 @@ def test_a_training_that_ends_after_it_gives_no_bundle(folder: Path) -> None:
 
 
 def test_done_again_it_is_without_the_person(folder: Path) -> None:
+    import polars
+
     out = folder / "evaluations" / "mine"
     with pytest.raises(ForgottenError):
         run_evaluate(open_dataset(folder), out, forgetting(folder, ended))
@@ -244,6 +247,8 @@ def test_no_byte_of_the_person_is_left_that_is_not_listed(
 
 def bytes_of(folder: Path) -> list[str]:
     """Files below a folder with the person in their path or in any byte, also of what zips and Parquet files hold."""
+    import polars
+
     found = []
     for path in (p for p in folder.rglob("*") if p.is_file()):
         where, data = path.relative_to(folder).as_posix(), [path.read_bytes()]

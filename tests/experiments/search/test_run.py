@@ -9,17 +9,18 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import polars
 import pytest
-from polars.testing import assert_frame_equal
 
 from plushsense.core.errors import ConfigError, DivergedError
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.search.run import SearchProgress, search
 from plushsense.experiments.sweep.run import sweep
+
+if TYPE_CHECKING:
+    import polars
 
 SMALL: dict[str, Any] = {
     "architectures": ("5_5d2", "9", "3d1_9d2", "20"),
@@ -33,6 +34,8 @@ COMMAND = [sys.executable, "-m", "plushsense", "search"]
 
 
 def frame(folder: Path, name: str) -> polars.DataFrame:
+    import polars
+
     return polars.read_parquet(folder / f"{name}.parquet")
 
 
@@ -42,6 +45,9 @@ def grid_keys() -> dict[str, Any]:
 
 
 def test_its_scores_are_those_of_trainings_without_a_stop(dataset: Dataset, recordings: Path, tmp_path: Path) -> None:
+    import polars
+    from polars.testing import assert_frame_equal
+
     seen: list[SearchProgress] = []
     found = search(dataset, seeds=(0, 1), progress=seen.append, **QUICK, **SMALL)
     other = import_recordings(recordings, tmp_path / "other", layout="accel-3").dataset
@@ -189,6 +195,8 @@ def test_one_that_diverges_is_left_out(dataset: Dataset, tmp_path: Path, monkeyp
 
 def test_killed_in_every_rung_and_gone_on_with(four_people: Path, tmp_path: Path) -> None:
     """Real recordings, ``kill -9`` once in each rung: each training once, the outcome that of an undisturbed search."""
+    from polars.testing import assert_frame_equal
+
     for name in ("DS", "whole"):
         shutil.copytree(four_people, tmp_path / name)
     options = {

@@ -7,9 +7,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-import polars
 import pytest
-from polars.testing import assert_frame_equal
 
 from plushsense.experiments.sweep.run import sweep
 from plushsense.jobs.progress import JobProgress
@@ -39,6 +37,9 @@ class Killer:
 
 
 def test_a_node_lost_in_a_sweep_changes_nothing(two_nodes: Any, four_people: Path, tmp_path: Path) -> None:
+    import polars
+    from polars.testing import assert_frame_equal
+
     for name in ("DS", "whole"):
         shutil.copytree(four_people, tmp_path / name)
     killer = Killer(two_nodes)

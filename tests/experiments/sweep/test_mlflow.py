@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 from pathlib import Path
 
-import polars
 import pytest
 
 from plushsense.core.errors import ConfigError, MissingExtraError
@@ -17,6 +16,8 @@ GRID = {"archs": ("250",), "filter_sets": ((4, 6, 8, 8),), "epochs": (5, 9), "ba
 
 
 def test_each_finished_trial_is_logged_once(tmp_path: Path, mlflow_here: None) -> None:
+    import polars
+
     folder = make_sweep(tmp_path / "S", **GRID, simulated=True)  # type: ignore[arg-type]
     whole = polars.read_parquet(folder / "trials.parquet")
     waiting = polars.when(polars.int_range(polars.len()) == 0)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import polars
 import pytest
 
 from plushsense.core.errors import BadInput, ConfigError
@@ -46,6 +45,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def known(folder: Path, scores: dict[tuple[str, str], list[float | None]], **more: object) -> Path:
     """A made-up sweep with these accuracies for (arch, filters) in the order of its schedules; macro-F1 is 0.1 less."""
+    import polars
+
     make_sweep(folder, **{**SMALL, **more})  # type: ignore[arg-type]
     frame = polars.read_parquet(folder / "trials.parquet")
     left = {key: iter(values) for key, values in scores.items()}
@@ -338,6 +339,8 @@ def test_a_sweep_without_a_score_is_a_page_too(tmp_path):
 
 
 def test_paddings_in_one_grid_are_other_networks(tmp_path):
+    import polars
+
     one = polars.read_parquet(make_sweep(tmp_path / "A", **ONE) / "trials.parquet")
     folder = make_sweep(tmp_path / "B", **ONE, padding="stream", draw=1)
     other = polars.read_parquet(folder / "trials.parquet").with_columns(trial=polars.lit("f" * 20))
@@ -369,6 +372,8 @@ def test_an_older_report_is_replaced_and_nothing_else_touched(tmp_path):
 
 
 def test_a_folder_that_is_no_sweep_is_one_sentence(tmp_path):
+    import polars
+
     with pytest.raises(BadInput, match=r"no sweep at .* plushsense sweep"):
         read_sweep(tmp_path)
     folder = make_sweep(tmp_path / "S", **ONE)
@@ -404,6 +409,8 @@ def test_nothing_is_cut_off_in_a_small_figure(tmp_path, dataset):
 
 def test_a_trial_of_some_folds_is_neither_ranked_nor_averaged(tmp_path: Path) -> None:
     """One easy person looks better than all together: what is not done wholly compares with nothing."""
+    import polars
+
     folder = known(tmp_path / "S", SCORES)
     frame = polars.read_parquet(folder / "trials.parquet")
     lucky = (polars.col("arch") == "250") & (polars.col("filters") == "8") & (polars.col("epochs") == 20)

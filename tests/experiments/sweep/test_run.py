@@ -11,11 +11,9 @@ import time
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import polars
 import pytest
-from polars.testing import assert_frame_equal
 
 from plushsense.core.errors import ConfigError, DivergedError, TrainingError
 from plushsense.dataset.importing.importers import import_recordings
@@ -28,6 +26,9 @@ from plushsense.scoring.metrics import confusion
 from plushsense.trials import tables as sweep_tables
 from plushsense.trials.plan import JOURNAL
 from plushsense.trials.tables import TRIAL_COLUMNS, TrialColumn
+
+if TYPE_CHECKING:
+    import polars
 
 SMALL: dict[str, Any] = {
     "architectures": ("5_5d2", "9"),
@@ -42,6 +43,8 @@ COMMAND = [sys.executable, "-m", "plushsense", "sweep"]
 
 
 def frame(folder: Path, name: str) -> polars.DataFrame:
+    import polars
+
     return polars.read_parquet(folder / f"{name}.parquet")
 
 
@@ -49,6 +52,9 @@ def frame(folder: Path, name: str) -> polars.DataFrame:
 def test_nested_epochs_score_as_trainings_of_their_own(
     dataset: Dataset, tmp_path: Path, changes: dict[str, Any]
 ) -> None:
+    import polars
+    from polars.testing import assert_frame_equal
+
     together = sweep(dataset, epochs=(1, 2, 5), split="by-subject:2", out=tmp_path / "all", **SMALL, **changes)
     assert (together.summary["trials"], together.summary["trainings"]) == (12, 8)
     for epochs in (1, 2, 5):
@@ -68,6 +74,9 @@ def test_where_validation_stops_each_is_trained_apart(dataset: Dataset, tmp_path
 
 
 def test_the_folder_holds_what_it_promises(dataset: Dataset, tmp_path: Path) -> None:
+    import polars
+    from polars.testing import assert_frame_equal
+
     seen: list[JobProgress] = []
     out = tmp_path / "o"
     found = sweep(dataset, epochs=(1, 3), seeds=(0, 1), split="by-subject:2", out=out, progress=seen.append, **SMALL)
@@ -156,6 +165,8 @@ def _tested(dataset: Dataset) -> list[Any]:
 
 
 def test_it_goes_on_and_is_made_again_from_the_journal(dataset: Dataset, tmp_path: Path) -> None:
+    from polars.testing import assert_frame_equal
+
     first = sweep(dataset, epochs=(1, 2), **SMALL)
     assert first.out.parent == dataset.path / "evaluations" and first.out.name.startswith(
         "sweep-paper-windows-holdout-"
@@ -190,6 +201,8 @@ def test_a_network_gets_the_past_that_it_needs(dataset: Dataset, tmp_path: Path)
 def test_one_that_diverges_is_told_and_the_others_go_on(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    import polars
+
     from plushsense.training import fit as room
 
     real = room.fit
@@ -219,6 +232,8 @@ def test_one_that_diverges_is_told_and_the_others_go_on(
 def test_a_long_training_goes_on_where_it_was_stopped(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    from polars.testing import assert_frame_equal
+
     from plushsense.training import fit as room
 
     whole = sweep(dataset, epochs=(2, 6), out=tmp_path / "whole", **SMALL)
@@ -258,6 +273,8 @@ def test_a_state_that_cannot_be_kept_stops_no_training(
 
 
 def test_a_grid_in_another_order_is_the_same_sweep(dataset: Dataset, tmp_path: Path) -> None:
+    from polars.testing import assert_frame_equal
+
     first = sweep(dataset, epochs=(1,), seeds=(0, 1), out=tmp_path, **SMALL)
     turned = SMALL | {"architectures": ("9", "5_5d2"), "batches": ("full", 4)}
     again = sweep(dataset, epochs=(1,), seeds=(1, 0), out=tmp_path, **turned)
@@ -397,6 +414,8 @@ def test_a_bad_grid_is_refused_with_all_its_problems(cli: Any, dataset: Dataset,
 
 def test_killed_three_times_and_gone_on_with(cli: Any, four_people: Path, tmp_path: Path) -> None:
     """Real recordings, ``kill -9`` at three random moments: each training once, tables as of an undisturbed run."""
+    from polars.testing import assert_frame_equal
+
     for name in ("DS", "whole"):
         shutil.copytree(four_people, tmp_path / name)
     words = [
