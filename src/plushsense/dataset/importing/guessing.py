@@ -144,7 +144,7 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
         raise DatasetError(f"'{source}' holds recordings of the GestureRecorder: import it without a pattern.")
     guess = _PatternDraft()
     if others := len(files) - len(of_ending):
-        guess.doubts.append(f"{others} files that do not end in '{ending}' are left out")
+        guess.doubts.append(f"files that do not end in '{ending}' are left out: {others}")
     samples = [text for f in mine[:: max(1, len(mine) // _FILES)][:_FILES] if (text := _lines(f, guess))]
     is_json = ENDINGS.get(ending) == "json" or samples[0][0].lstrip()[:1] in ("{", "[")
     columns = _json_columns(samples) if is_json else _text_columns(samples, guess)
