@@ -58,7 +58,7 @@ def test_every_exhaustive_test_exists() -> None:
 
 def test_a_test_that_the_security_page_names_is_not_exhaustive() -> None:
     named = set(re.findall(r"\btest_\w+", (ROOT / "docs/security.md").read_text(encoding="utf-8")))
-    assert [test for test in EXHAUSTIVE if test.partition("::")[2] in named] == []
+    assert [test for test in EXHAUSTIVE if test.partition("::")[2].partition("[")[0] in named] == []
 
 
 def test_three_modules_with_one_prefix_are_a_package() -> None:

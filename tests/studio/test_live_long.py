@@ -1,9 +1,9 @@
-"""Minutes of a virtual toy at twenty times the speed: every gesture is seen with its affect, and nothing grows.
+"""Minutes of a virtual toy at ten times the speed: every gesture is seen with its affect, and nothing grows.
 
 What is asked of the bundle is honest only for the virtual toy: it was trained on ten of its people and reads one
-whom it never met. Where this was written it found all 69 gestures of the ten minutes; one in fifty may be missed, and
-one in fewer, since another machine rounds otherwise. With PLUSHSENSE_REQUIRE, as in CI, it is four of the minutes, else
-two, and with PLUSHSENSE_SOAK all ten.
+whom it never met. Where this was written it found all 69 gestures of the ten minutes; one in fifty may be missed, or
+one if there are fewer, since another machine rounds otherwise. It plays four of the minutes with PLUSHSENSE_REQUIRE,
+else two, and with PLUSHSENSE_SOAK all ten.
 """
 
 from __future__ import annotations

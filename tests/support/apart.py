@@ -78,17 +78,17 @@ class Apart:
         ours, theirs = socket.socketpair()
         with theirs:
             words = [sys.executable, "-m", "pytest", *(str(TESTS / file) for file in files)]
+            words += ["-p", "no:xdist", "-p", "no:cacheprovider"]
             # A worker's folder lies in that of the run.
             environment = {**os.environ, _CHANNEL: str(theirs.fileno()), SHARED: str(base.parent)}
             self.process = subprocess.Popen(
-                [*words, "-p", "no:xdist", "-p", "no:cacheprovider", "--rootdir", str(config.rootpath),
-                 f"--basetemp={base / 'apart'}"],
+                [*words, "--rootdir", str(config.rootpath), f"--basetemp={base / 'apart'}"],
                 cwd=config.invocation_params.dir,
                 env=environment,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
-            )  # fmt: skip
+            )
         self.channel = Connection(ours.detach())
 
     def run(self, item: pytest.Item, following: str | None) -> tuple[list[pytest.TestReport], float]:

@@ -1,7 +1,7 @@
 """Tests, or single parameters of them, that `make test` leaves out and `make test-exhaustive` runs.
 
-They repeat what shorter ones test with more pages, languages, chips, compilers, kills or trainings. Tests that
-docs/security.md names are not among them.
+They repeat what shorter ones test with more pages, languages, chips, compilers, kills or trainings, or test details of
+a page or a command whose main use `make test` covers. Tests that docs/security.md names are not among them.
 """
 
 EXHAUSTIVE = {
@@ -144,7 +144,7 @@ EXHAUSTIVE = {
     *(f"workflow/test_estimator.py::test_labels_keep_their_type[{kind}]" for kind in ("bool", "case", "empty", "int")),
     *(
         f"tuning/test_gate.py::test_neither_humidity_nor_the_hand_matters_much[{form}]"
-        for form in ("damp and dry days", "damp skin", "large hands", "small hands", "the same day")
+        for form in ("damp skin", "small hands", "the same day")
     ),
     *(
         f"workflow/test_forget_beside.py::test_who_is_forgotten_meanwhile_does_not_come_back[{command}-early]"
