@@ -97,6 +97,7 @@ def test_saving_and_leaving_the_report_out(cli: Cli, dataset: Dataset, tmp_path:
         (("publish", "DS", "OUT", *SAID, "--key", "DS/key"), "store it elsewhere"),
         (("publish", "DS", "OUT", *SAID, "--key", "bad.key"), "is not a key"),
         (("publish", "DS", "OUT", *SAID, "--no-reidentification", "--allow-columns", "hand"), "no column 'hand'"),
+        (("publish", "DS", "taken", *SAID), "taken.zip' exists without its folder"),
     ],
 )
 def test_refusals_are_sentences(
@@ -104,6 +105,7 @@ def test_refusals_are_sentences(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bad.key").write_text("not hex")
+    (tmp_path / "taken.zip").write_text("mine")
     ran = cli(*words)
     assert ran.status == 2
     assert said in ran.err

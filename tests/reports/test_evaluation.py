@@ -45,6 +45,19 @@ def test_confusion_cells():
     assert evaluation.confusion_rows({"labels": ["a"], "counts": [[1, 2]]}) is None
 
 
+def test_a_matrix_of_many_gestures_is_a_list_of_its_most_frequent_confusions():
+    labels = [f"g{i}" for i in range(300)]
+    counts = np.ones((300, 300), dtype=int)
+    counts[7, 2], counts[1, 5] = 299, 50
+    case = {"confusion": {"labels": labels, "counts": counts}}
+    frequent = evaluation.frequent_confusions(case["confusion"])
+    assert frequent is not None and len(frequent.rows) == 60
+    assert frequent.cells()[:2] == [["g7", "g2", "299", "50.0 %"], ["g1", "g5", "50", "14.3 %"]]
+    page = evaluation.render(title="T", dataset={}, evaluations=[case], models=[], simulated=False)
+    assert len(page) < 50_000 and "<td>g2</td>" in page
+    assert evaluation.frequent_confusions({"labels": ["a"], "counts": [[1]]}) is None
+
+
 def test_people_in_natural_order_and_dashes_where_one_is_missing():
     one = {"subjects": [{"subject": "P10", "accuracy": 0.5}, {"subject": "P2", "accuracy": 0.25}]}
     rows = evaluation.subject_rows([one, {"subjects": [{"subject": "P2", "accuracy": 1.0}]}, {}])

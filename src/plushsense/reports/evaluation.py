@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plushsense.reports import wording
 from plushsense.reports.figures import data_uri, row_shares, shade, training_curves
@@ -15,6 +16,9 @@ from plushsense.reports.page import check_page_path, render_page, write_page
 from plushsense.reports.table import DASH, Column, Table, count, interval, mean_sd, number, text
 from plushsense.scoring.metrics import METRICS, column_metrics
 
+# With more labels, a list of the most frequent confusions takes the place of the matrix, whose cells are their square.
+_MOST_LABELS = 60
+_MOST_CONFUSIONS = 60
 AFFECT_MARKS = {"positive": "+ positive", "neutral": "o neutral", "negative": "− negative", "none": "none"}
 
 
@@ -104,12 +108,13 @@ def _evaluation(key: str, evaluation: Mapping[str, Any]) -> dict[str, Any]:
         | {"accuracy": number(nobody.get("accuracy"))},
         "classes": class_rows(evaluation),
         "confusions": [
-            (name, table)
-            for name, table in (
-                ("by gesture", confusion_rows(evaluation.get("confusion"))),
-                ("by affect", confusion_rows(evaluation.get("confusion_affect"))),
+            (name, rows, frequent)
+            for name, confusion in (
+                ("by gesture", evaluation.get("confusion")),
+                ("by affect", evaluation.get("confusion_affect")),
             )
-            if table and len(table["labels"]) > 1
+            for rows, frequent in [(confusion_rows(confusion), frequent_confusions(confusion))]
+            if frequent or (rows and len(rows["labels"]) > 1)
         ],
         "curves": data_uri(training_curves(histories)) if histories else None,
         "predictions": evaluation.get("predictions"),
@@ -260,13 +265,21 @@ def class_rows(evaluation: Mapping[str, Any]) -> list[dict[str, str]]:
     ]
 
 
-def confusion_rows(confusion: Any) -> dict[str, Any] | None:
-    """Return a confusion matrix ({labels, counts}) as rows of cells with count, percent and shade; None without one."""
+def _confusion(confusion: Any) -> tuple[list[str], NDArray[Any]]:
+    """Return labels (K) and counts (K, K) of a confusion matrix; no labels if it is unknown or not of that shape."""
     if not isinstance(confusion, Mapping) or not confusion.get("labels"):
-        return None
-    labels = [str(label) for label in confusion["labels"]]
-    counts = np.asarray(confusion["counts"])
-    if counts.shape != (len(labels), len(labels)):
+        return [], np.empty((0, 0))
+    labels, counts = [str(label) for label in confusion["labels"]], np.asarray(confusion["counts"])
+    return (labels if counts.shape == (len(labels), len(labels)) else []), counts
+
+
+def confusion_rows(confusion: Any) -> dict[str, Any] | None:
+    """Return a confusion matrix ({labels, counts}) as rows of cells with count, percent and shade.
+
+    None without a matrix, and with too many labels (see `frequent_confusions`).
+    """
+    labels, counts = _confusion(confusion)
+    if not 0 < len(labels) <= _MOST_LABELS:
         return None
     rows = []
     for i, share in enumerate(row_shares(counts)):
@@ -282,6 +295,28 @@ def confusion_rows(confusion: Any) -> dict[str, Any] | None:
         ]
         rows.append({"label": labels[i], "cells": cells, "total": count(int(counts[i].sum()))})
     return {"labels": labels, "rows": rows}
+
+
+def frequent_confusions(confusion: Any) -> Table | None:
+    """Return the most frequent confusions of a matrix that is too large to be shown; None for every other."""
+    labels, counts = _confusion(confusion)
+    if len(labels) <= _MOST_LABELS:
+        return None
+    wrong = np.where(np.eye(len(labels), dtype=bool), 0, counts)
+    truth, predicted = np.nonzero(wrong)
+    shares = row_shares(counts)
+    order = np.argsort(-wrong[truth, predicted], kind="stable")[:_MOST_CONFUSIONS]
+    columns = (
+        Column("truth", "What was done"),
+        Column("predicted", "What the network read"),
+        Column("windows", "Windows", "count"),
+        Column("share", "Percent of what was done", "percent"),
+    )
+    rows = tuple(
+        {"truth": labels[i], "predicted": labels[j], "windows": int(wrong[i, j]), "share": float(shares[i, j])}
+        for i, j in zip(truth[order], predicted[order], strict=True)
+    )
+    return Table("confusions", "Most frequent confusions", columns, rows)
 
 
 def dataset_rows(dataset: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -182,14 +182,14 @@ def publish_dataset(
         progress: called with (name of the stage, done, total).
 
     Raises:
-        DatasetError: without licence, contact or consent statement, or when ``out`` is not empty.
+        DatasetError: without licence, contact or consent statement, or when ``out`` is not empty or its zip exists.
         MissingExtraError: without the validators, or (for the re-identification) scikit-learn.
     """
     dataset = as_dataset(dataset)
     folder = Path(out)
     require_validators()
     head = complete_head(dataset.head, dataset.path, licence, contact, consent)
-    check_output_folder(dataset, folder)
+    check_output_folder(dataset, folder, repeatable=key is not None)
     secret = secrets.token_bytes(_KEY_BYTES) if key is None else _read_key(Path(key), dataset.path, folder)
     options = PublishOptions(streams, excluded, columns, secret)
     tested = None

@@ -159,11 +159,14 @@ def require_validators() -> None:
         need(module, EXTRA)
 
 
-def check_output_folder(dataset: Dataset, out: Path) -> Path:
+def check_output_folder(dataset: Dataset, out: Path, repeatable: bool = True) -> Path:
     """Check the target folder ``out`` and return the path of the zip beside it.
 
+    Args:
+        repeatable: whether the zip may exist, because the package may have the same bytes. Without a key it cannot.
+
     Raises:
-        DatasetError: if ``out`` is not empty or lies in the data set.
+        DatasetError: if ``out`` is not empty or lies in the data set, or the zip exists and may not.
     """
     real = out.resolve()
     target = real.with_name(real.name + ".zip")
@@ -175,6 +178,13 @@ def check_output_folder(dataset: Dataset, out: Path) -> Path:
         )
     if dataset.path.resolve() in (real, *real.parents):
         raise DatasetError(f"'{out}' lies in the data set itself: give a folder elsewhere.")
+    if target.exists() and not repeatable:
+        raise DatasetError(
+            f"'{target}' exists without its folder: give another OUT, or delete this zip if an interrupted publication "
+            "has left it; nothing is overwritten.",
+            reason="name_exists",
+            name=target.name,
+        )
     return target
 
 
