@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -130,9 +131,10 @@ def test_what_cannot_be_corrected_is_said(bundle: Bundle, marks: list[Correction
             correct(bundle, given_marks)
     with pytest.raises(BundleError, match="adapted to S07"):
         correct(correct(bundle, marks).bundle, [replace(marks[0], subject="S08")])
-    (tmp_path / "bad.jsonl").write_text('{"a": 1}\n' + marks[0].to_line(), encoding="utf-8")
-    with pytest.raises(DatasetError, match="line 1 is no correction"):
-        read_corrections(tmp_path / "bad.jsonl")
+    for bad in ('{"a": 1}\n', re.sub(r"\[\[\d+", "[[5E19", marks[0].to_line())):
+        (tmp_path / "bad.jsonl").write_text(bad + marks[0].to_line(), encoding="utf-8")
+        with pytest.raises(DatasetError, match="line 1 is no correction"):
+            read_corrections(tmp_path / "bad.jsonl")
     (tmp_path / "empty.jsonl").write_text("\n", encoding="utf-8")
     with pytest.raises(DatasetError, match="holds no correction"):
         read_corrections(tmp_path / "empty.jsonl")

@@ -74,7 +74,7 @@ class Correction:
 
     @classmethod
     def from_line(cls, line: str) -> Correction:
-        """Restore a correction from `to_line`; raise ValueError, TypeError or KeyError if it is not one."""
+        """Restore a correction from `to_line`; raise ValueError, TypeError, KeyError or OverflowError if not."""
         table = loads_json(line)
         rows = np.array(table.pop("rows"), dtype=np.int64).reshape(-1, 1 + len(table["channels"]))
         found = cls(**{**table, "channels": tuple(table["channels"])}, frames=Frames(rows[:, 1:], rows[:, 0]))
@@ -183,7 +183,7 @@ def read_corrections(path: str | os.PathLike[str]) -> list[Correction]:
             found.append(Correction.from_line(line))
         except json.JSONDecodeError:
             continue
-        except (ValueError, TypeError, KeyError):
+        except (ValueError, TypeError, KeyError, OverflowError):
             raise DatasetError(
                 f"'{path}' line {number} is no correction: give a file that plushsense feedback wrote."
             ) from None
