@@ -35,5 +35,9 @@ def test_the_temperature_of_a_network_that_is_too_sure_is_found() -> None:
     assert set(temperatures) == {"A", "B", "C", "D"}
     assert scaled.argmax(axis=1).tolist() == sure.argmax(axis=1).tolist()
     assert reliability(scaled, truth)["ece"] < 0.5 * reliability(sure, truth)["ece"]
+    # The temperature of a group is that of the others: here only D is too sure.
+    mixed = np.where((group == "D")[:, None], sure, true)
+    temperatures = cross_fitted_temperature(mixed, truth, group)[1]
+    assert temperatures["D"] == fit_temperature(mixed[:3000], truth[:3000]) < temperatures["A"]
     # A group alone has nobody to fit a temperature on.
     assert np.allclose(cross_fitted_temperature(sure, truth, np.full(4000, "A"))[0], sure, atol=1e-6)
