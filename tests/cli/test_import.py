@@ -39,7 +39,7 @@ def test_sessions_then_more_of_them(cli: Cli, tmp_path: Path) -> None:
     (folder / "Wave_1_2.csv.part").write_text("x")
     again = cli("import", tmp_path / "out", tmp_path / "DS", "--json")
     assert again.status == 2
-    assert "already holds something" in again.err
+    assert "is a data set already: add to it with --add" in again.err
     added = cli("import", tmp_path / "out", tmp_path / "DS", "--add", "--json").json
     assert (added["recordings"], added["added"], added["already_there"]) == (2, {"recordings": 1, "streams": 1}, 3)
     text = cli("import", tmp_path / "out", tmp_path / "DS", "--add")

@@ -75,6 +75,18 @@ def test_a_copy_of_another_person_is_found(change: object, copies: int, near: in
     assert len(said) == near and all("P01/" in line and "P03/" in line for line in said)
 
 
+def test_neighbours_in_a_stream_are_no_copies() -> None:
+    windows = moving()
+    mine, theirs = (np.flatnonzero(windows.subject == "P01")[at] for at in (0, -1))
+    x, rows, stream = windows.x.copy(), windows.window_rows.copy(), windows.stream.copy()
+    x[theirs], stream[theirs] = x[mine], stream[mine]
+    fold = Fold("f", ("P01",), np.array([theirs]), np.empty(0, np.int64), np.array([mine]))
+    for first, near in ((rows[mine, 0] + 20, 0), (rows[mine, 1], 1)):
+        rows[theirs] = (first, first + np.diff(rows[mine])[0])
+        planted = replace(windows, x=x, stream=stream, window_rows=rows)
+        assert audit_leakage(planted, planted, [fold])["near_duplicates"] == near
+
+
 def test_recordings_that_rarely_change_are_no_copies() -> None:
     windows = moving()
     pressed = (np.arange(windows.x.shape[2]) > 60).astype(np.int32)

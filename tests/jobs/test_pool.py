@@ -55,6 +55,14 @@ def test_results_reports_and_resuming(tmp_path: Path, workers: int, monkeypatch:
         assert all(r["threads"] == "1" for job, r in results.items() if job != "job3")
 
 
+def test_workers_import_nothing_from_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("re", "random", "multiprocessing"):
+        (tmp_path / f"{name}.py").write_text("import pathlib; pathlib.Path('ran').touch(); raise SystemExit(1)")
+    monkeypatch.chdir(tmp_path)
+    assert run_jobs(JOBS[:1], work.square, shared=1, workers=2)["job0"]["value"] == 1
+    assert not (tmp_path / "ran").exists()
+
+
 @pytest.mark.parametrize("workers", [1, 2])
 def test_an_error_of_the_work_comes_through_as_itself(tmp_path: Path, workers: int) -> None:
     journal = Journal(tmp_path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from plushsense.evaluation.leakage import KINDS
 from plushsense.reports import wording
 
 
@@ -44,6 +45,11 @@ def test_the_two_contexts_are_told_apart():
     )
     assert told["Trained on"].startswith("looped") and told["Scored on"].startswith("real context")
     assert "overlaps" in told["Leak"]
+    audit = {"windows": 4, "overlapping": 1}
+    shared = dict(
+        wording.describe_protocol({"split": "by-recording:5", "leakage": {**dict.fromkeys(KINDS, 0), **audit}})
+    )
+    assert "25.0 % of the scored windows" in shared["Leak"]
     assert "At rest" not in told
     assert "Leak" not in dict(wording.describe_protocol({"split": "windows:5", "leaky": True}))
     title = wording.evaluation_title({"split": "by-subject:5", "context": "stream", "train_context": "loop"})

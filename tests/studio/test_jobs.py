@@ -80,7 +80,12 @@ def test_work_reports_and_ends_with_its_result(workspace: Workspace, jobs: Jobs)
     assert (again.state, again.result, again.title) == (DONE, job.result, "Trying")
 
 
-def test_what_a_task_refuses_is_a_sentence(workspace: Workspace, jobs: Jobs) -> None:
+def test_what_a_task_refuses_is_a_sentence(
+    workspace: Workspace, jobs: Jobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Nothing is imported from the working folder.
+    (tmp_path / "re.py").write_text("raise SystemExit(1)")
+    monkeypatch.chdir(tmp_path)
     job = ended(jobs.start("check", {"dataset": str(workspace.folder / "nothing")}, "Check"))
     assert job.state == REFUSED
     assert job.message.startswith("There is no folder")

@@ -66,9 +66,9 @@ def lines(e: dict[str, Any]) -> list[str]:
     if rest and (whole := e.get("with_rest")):
         scores = ", ".join(f"{METRICS[key].name} {spread(of)}" for key, of in whole.items())
         out.append(f"with them, over all classes and {len(e['folds'])} folds, as the paper: {scores}")
-    for title, of in (("vote by recording", e["by_recording"]), ("pooled", e["pooled"])):
+    for title, of in (("pooled recordings, by vote", e["by_recording"]), ("pooled windows", e["pooled"])):
         scores = ", ".join(f"{name} {figure(of[k])}" for k, name in names.items())
-        out.append(f"{title}{', with recordings at rest' if rest and title == 'pooled' else ''}: {scores}")
+        out.append(f"{title}{', with recordings at rest' if rest and title == 'pooled windows' else ''}: {scores}")
     for kind, part in e["by_context"].items():
         out.append(f"  on {kind} windows: accuracy {figure(part['accuracy'])} ({part['windows']} windows)")
     if "leakage" in e:

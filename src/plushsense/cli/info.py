@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, table
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import ConfigError, printable
 
 if TYPE_CHECKING:
     from plushsense.dataset.statistics import Duration, SummaryStatistics
@@ -35,6 +35,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _bundle(args: argparse.Namespace) -> int:
     from plushsense.models.bundle import Bundle
+    from plushsense.reports.evaluation import model_rows
     from plushsense.workflow.reporting import card
 
     bundle = Bundle.load(args.path)
@@ -47,7 +48,14 @@ def _bundle(args: argparse.Namespace) -> int:
     )
     if bundle.personal:
         result["adapted"] = {key: value for key, value in bundle.personal.items() if key != "original"}
-    emit(args, result, [f"{key:<20}{value}" for key, value in result.items()])
+    rows = [
+        *model_rows(result),
+        ("Layout", bundle.layout.name),
+        ("Gestures", ", ".join(bundle.gestures.labels)),
+        *((key.capitalize(), value) for key, value in result.get("adapted", {}).items()),
+    ]
+    # A name from the file must not look like a line of this program.
+    emit(args, result, [f"{name:<31}{printable(str(value))}" for name, value in rows])
     return 0
 
 

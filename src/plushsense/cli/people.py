@@ -47,14 +47,16 @@ def run_lens(args: argparse.Namespace) -> int:
 
 def run_compare(args: argparse.Namespace) -> int:
     from plushsense.experiments.people.comparison import PAGE, compare
-    from plushsense.experiments.people.report import model_table, pair_table
+    from plushsense.experiments.people.report import OTHER_WINDOWS, model_table, pair_table
 
     result = compare(args.evaluations, out=args.out, overwrite=args.force)
     if args.out:
         result |= {"out": args.out, "report": str(Path(args.out) / PAGE)}
         say(f"written: {args.out}")
     lines = [SIMULATION, ""] if result["simulated"] else []
-    lines.append(model_table(result).text())
+    lines += [model_table(result).text(), "", *(f"{m['name']}: {m['folder']}" for m in result["models"])]
+    if result["scored"] == "recordings":
+        lines += ["", OTHER_WINDOWS]
     for key in result["pairs"]:
         pairs = pair_table(result, key)
         lines += ["", pairs.title, pairs.text()]

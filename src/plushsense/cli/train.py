@@ -83,8 +83,8 @@ def decided(decision: Mapping[str, Any]) -> list[str]:
     events, answers = fitted["events"], fitted.get("answers")
     text = f"Decisions fitted on {people} who {'was' if fitted['people'] == 1 else 'were'} held back"
     if "cost" in events:
-        text += f" ({fitted['gestures']} gestures in {60 * fitted['hours']:.0f} min of streams): an event's cost "
-        text += f"{figure(events['cost_before'])} with the defaults, "
+        text += f" ({fitted['gestures']} gestures in {60 * fitted['hours']:.0f} min of streams): mean cost of errors "
+        text += f"per gesture {figure(events['cost_before'])} with the defaults, "
         text += f"{figure(events['cost'])} now" if events["moved"] else "and no settings are reliably better"
     else:
         text += "; they have no streams, so events keep the defaults"
@@ -93,9 +93,12 @@ def decided(decision: Mapping[str, Any]) -> list[str]:
     if gate:
         out.append(_gate(gate))
     if answers:
-        line = f"Sets of {answers['classes_in_set']:.1f} classes hold the true one in {100 * answers['coverage']:g} %"
+        line = f"If the toy may name several gestures: {answers['classes_in_set']:.1f} on average, "
+        line += f"with the true one among them in {100 * answers['coverage']:g} %"
         if answers["coverage_left_out"] is not None:
-            line += f" (person by person, with the others' threshold: {100 * answers['coverage_left_out']:.1f} %)"
+            line += (
+                f" ({100 * answers['coverage_left_out']:.1f} % of each person, with a threshold fitted on the others)"
+            )
         out.append(line + f" of the {answers['on']}.")
     return out
 
@@ -103,7 +106,7 @@ def decided(decision: Mapping[str, Any]) -> list[str]:
 def _gate(gate: Mapping[str, Any]) -> str:
     """Format the scores of the fitted gate as text, or the reason why there is no gate."""
     if "reason" in gate:
-        return f"No gate for energetic gestures: {gate['reason']}."
+        return f"No gate (threshold rules that detect energetic gestures, such as hits, at once): {gate['reason']}."
     false = gate["false_alarms_per_hour"]
     alarms = "" if false is None else f", with {false:.1f} false alarms an hour"
     return (

@@ -43,7 +43,8 @@ def audit_leakage(train: WindowSet, score: WindowSet, folds: Sequence[Fold]) -> 
     """Count the scored windows of all folds that have something in common with the windows trained on in their fold.
 
     Validation windows count as trained on. Nobody (recordings at rest) is no person. Windows that rarely change are
-    neither copies nor near-duplicates: a toy at rest is equal to itself, and so are presses of a switch.
+    neither copies nor near-duplicates: a toy at rest is equal to itself, and so are presses of a switch. Windows that
+    share rows of a stream are not, either: they are counted as overlapping.
 
     Args:
         train, score: the windows that the indices of ``folds`` refer to.
@@ -108,6 +109,16 @@ def _overlapping(train: WindowSet, known: Index, score: WindowSet, test: Index) 
     return shared
 
 
+def _sharing_rows(score: WindowSet, mine: Index, train: WindowSet, theirs: Index) -> Mask:
+    """Return which pairs (n,) of a scored and a training window share rows of a stream."""
+    a, b = score.window_rows[mine], train.window_rows[theirs]
+    located = (
+        (score.stream[mine] == train.stream[theirs]) & (score.stream[mine] != "") & (a[:, 0] >= 0) & (b[:, 0] >= 0)
+    )
+    shared: Mask = located & (a[:, 0] < b[:, 1]) & (b[:, 0] < a[:, 1])
+    return shared
+
+
 class _Signatures:
     """Sorted values of windows, in which a window and its slightly shifted copy differ little."""
 
@@ -131,6 +142,7 @@ class _Signatures:
             for index in candidates.T:
                 mine, theirs = test[at], known[index]
                 other = _ids(self._score, mine) != _ids(self._train, theirs)
+                other &= ~_sharing_rows(self._score, mine, self._train, theirs)
                 pick = np.flatnonzero(other & ~near[at] & self._similar(mine, theirs))
                 x, y = self._scaled(self._score, mine[pick]), self._scaled(self._train, theirs[pick])
                 same = (x == y).all(axis=(1, 2))

@@ -138,6 +138,13 @@ def with_accuracy(history: Iterable[Mapping[str, Any]], apart: bool) -> list[dic
     return [{**row, "accuracy": row.get(key)} for row in history]
 
 
+def votes_by_person(predictions: Predictions) -> dict[str, dict[str, Any]]:
+    """Return for each person the scores of the vote over each recording's windows, and the number of recordings."""
+    scorer = _Scorer(predictions)
+    people = sorted(set(predictions.subject.tolist()) - {NOBODY})
+    return {person: scorer.by_recording(predictions.subject == person) for person in people}
+
+
 Mask = NDArray[np.bool_]
 
 

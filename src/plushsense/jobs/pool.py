@@ -258,8 +258,11 @@ def _start(threads: int) -> _Worker:
 
 @contextmanager
 def _inherited(threads: int) -> Iterator[None]:
-    """Make processes that are started in this context use ``threads`` threads and ignore Ctrl-C."""
-    settings = thread_settings(threads)
+    """Make Python processes that are started in this context use ``threads`` threads and ignore Ctrl-C.
+
+    They import nothing from the working folder, which may be a data set of somebody else.
+    """
+    settings = {**thread_settings(threads), "PYTHONSAFEPATH": "1"}
     before = {name: os.environ.get(name) for name in settings}
     # Only the main thread may set a signal's handler.
     ours = threading.current_thread() is threading.main_thread()
@@ -304,9 +307,9 @@ def _conduct(pool: list[_Worker], take: Take, setup: bytes, threads: int) -> Eng
                 code = worker.process.exitcode
                 if job is None or not worker.ready:
                     raise PlushSenseError(
-                        f"A worker process ended unexpectedly while it started (exit code {code}), perhaps for lack of "
-                        "memory: run again, finished jobs are kept; try fewer workers. In a script of your own, more "
-                        "than one worker needs the code under  if __name__ == '__main__':"
+                        f"A worker process ended unexpectedly while it started (exit code {code}). In a script of your "
+                        "own, put the code under  if __name__ == '__main__':  or use workers=1. Otherwise, it may lack "
+                        "memory: run again, finished jobs are kept; try fewer workers."
                     ) from None
                 worker.pipe.close()
                 # Put the new worker into the pool, so that it is ended with the others.

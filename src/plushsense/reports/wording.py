@@ -14,6 +14,10 @@ CONTEXT_WORDS: dict[str, str] = _TEXTS["contexts"]
 CONTEXT_SHORT: dict[str, str] = _TEXTS["contexts_short"]
 
 _NO_LEAK = "No training or validation window overlaps a recording that is scored."
+_PAST_SHARED = (
+    "No training or validation window overlaps a recording that is scored, but {share} of the scored windows contain "
+    "samples that were trained on, from before the recording."
+)
 # The two ways to count of `plushsense.evaluation.scores`, where recordings at rest are scored apart.
 REST_APART = "without recordings at rest"
 MEAN = f"mean over people, {REST_APART}"
@@ -81,7 +85,9 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
         )
         answers.append(("More people", more))
     if not evaluation.get("leaky"):
-        answers.insert(2, ("Leak", _NO_LEAK))
+        audit = evaluation.get("leakage") or {}
+        shared = audit.get("overlapping", 0) / max(audit.get("windows", 0), 1)
+        answers.insert(2, ("Leak", _PAST_SHARED.format(share=percent(shared)) if shared else _NO_LEAK))
     if evaluation.get("self_calibration"):
         how = "Offset and scale of accelerometers: causal, from the readings of the session so far, without labels."
         answers.append(("Self-calibration", how))

@@ -107,7 +107,8 @@ def parse_split(text: str) -> Split:
         raise ConfigError(
             f"Split '{text}' needs a number of folds from 2 to 1000 after the colon: for example {kind}:5"
         )
-    raise ConfigError(f"Unknown split '{text}': accepted are {', '.join(EXAMPLES)}.{nearest(text, EXAMPLES)}")
+    similar = nearest(text.replace("person", "subject"), EXAMPLES)
+    raise ConfigError(f"Unknown split '{text}': accepted are {', '.join(EXAMPLES)}.{similar}")
 
 
 def make_folds(

@@ -129,7 +129,7 @@ def fit_gate(
     figures = {"people": len(set(subjects)), "false_alarms_per_hour_allowed": spec.false_alarms_per_hour}
     names = [g.label for g in gestures.gestures if g.energetic]
     if not names:
-        return GateFit(GateSettings(), {**figures, "reason": f"no gesture of '{gestures.name}' is energetic"})
+        return GateFit(GateSettings(), {**figures, "reason": f"no gesture of '{gestures.name}' is marked as energetic"})
     material = material_of(dataset, gestures, subjects)
     if not any(label in names for _, label in material.trials):
         return GateFit(GateSettings(), {**figures, "reason": f"nobody here recorded {', '.join(names)}"})

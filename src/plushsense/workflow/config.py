@@ -185,6 +185,21 @@ class RunConfig:
         del values["augment_given"]
         return values
 
+    def changes(self, layout: Layout) -> dict[str, Any]:
+        """Return the settings of windows, network and training that differ from the preset's for this network.
+
+        The symbol of the network, its filters and padding, the context and the seed are left out.
+        """
+        told = ("arch", "filters", "padding", "seed", "context")
+        network = {key: getattr(self.model, key) for key in ("arch", "filters", "padding")}
+        usual = resolve(model=network, training={"preset": self.preset}).for_layout(layout).outcome()
+        return {
+            key: value
+            for table in ("windows", "model", "training")
+            for key, value in self.outcome()[table].items()
+            if value != usual[table].get(key) and key not in told
+        }
+
     def outcome(self) -> dict[str, Any]:
         """Return the settings that an evaluation's scores depend on, as plain values for JSON."""
         evaluation = asdict(self.evaluation) | {"train_context": self.trained_on.context}

@@ -226,7 +226,8 @@ def warn_of_long_windows(
         return
     advice = []
     fitting = dataset.layout.samples(min(window_s, usual_s))
-    if arch.receptive_field > fitting:
+    # By default, a decision averages over what the kernels leave of the window; if that is too little, over all of it.
+    if arch.receptive_field > fitting - arch.step:
         advice.append(f"--arch {symbol_within(arch.symbol, max(1, fitting // 2))}")
     elif reads_s > window_s:
         advice.append("a shorter --pool-s")

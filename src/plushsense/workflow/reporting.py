@@ -12,6 +12,7 @@ from typing import Any
 
 from plushsense.core.errors import BadInput, BundleError, ConfigError
 from plushsense.core.files import write_file
+from plushsense.core.layouts import Layout
 from plushsense.core.version import __version__
 from plushsense.dataset.files import CACHE
 from plushsense.dataset.index import as_dataset
@@ -20,6 +21,7 @@ from plushsense.evaluation.crossval import Evaluation
 from plushsense.jobs.journal import Journal, job_id
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
+from plushsense.reports.table import text
 from plushsense.workflow.config import RunConfig
 
 
@@ -139,7 +141,7 @@ def save_evaluation(result: Evaluation, dataset: Dataset, config: RunConfig, arc
         "id": evaluation_id(config, dataset),
         "simulated": dataset.head.simulated,
         "validation_decides": config.training.patience is not None,
-        "title": evaluation_title(result, arch, config),
+        "title": evaluation_title(result, arch, config, dataset.layout),
         "model": card(arch, rate_hz=dataset.layout.rate_hz),
         "dataset": dataset.summary(),
         "config": config.to_dict(),
@@ -150,12 +152,15 @@ def save_evaluation(result: Evaluation, dataset: Dataset, config: RunConfig, arc
     return path
 
 
-def evaluation_title(result: Evaluation, arch: Arch, config: RunConfig) -> str:
-    """Return a title that distinguishes evaluations of different settings."""
+def evaluation_title(result: Evaluation, arch: Arch, config: RunConfig, layout: Layout) -> str:
+    """Return a title with network, split, contexts, preset, seed, and the settings that differ from the preset's."""
     context = f"{result.context} context"
     if result.train_context != result.context:
         context += f", trained on {result.train_context}"
-    training = f"{config.preset} training, seed {config.training.seed}"
+    training = ", ".join(
+        [f"{config.preset} training, seed {config.training.seed}"]
+        + [f"{key} {text(value)}" for key, value in config.changes(layout).items()]
+    )
     return f"{arch.title} {arch.padding}, {result.split.text}, {context}, {training}"
 
 

@@ -73,7 +73,7 @@ def test_what_cannot_be_added_is_refused(tmp_path: Path, session_writer: Writer)
     put(tmp_path / "src" / "ana", "Shake", 1)
     import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3")
     before = raw(tmp_path / "DS")
-    with pytest.raises(DatasetError, match="already holds something"):
+    with pytest.raises(DatasetError, match="is a data set already"):
         import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3")
     with pytest.raises(DatasetError, match="has the layout 'accel-3', not 'plush-15'"):
         import_recordings(tmp_path / "src", tmp_path / "DS", layout="plush-15", add_to=True)
@@ -82,7 +82,7 @@ def test_what_cannot_be_added_is_refused(tmp_path: Path, session_writer: Writer)
         import_recordings(tmp_path / "out", tmp_path / "DS", add_to=True)
     with pytest.raises(DatasetError, match="real toy, the source those of a virtual one"):
         import_recordings(tmp_path / "src", tmp_path / "DS", add_to=True, simulated=True)
-    with pytest.raises(ConfigError, match="--add keeps the name"):
+    with pytest.raises(ConfigError, match="--add keeps the layout, name"):
         import_recordings(tmp_path / "src", tmp_path / "DS", add_to=True, name="new")
     with pytest.raises(DatasetError, match="There is no folder"):
         import_recordings(tmp_path / "src", tmp_path / "nowhere", add_to=True)

@@ -94,7 +94,20 @@ def test_evaluations_are_compared_person_by_person(cli: Cli, dataset: Dataset, t
     assert all(0 < row["p"] <= row["p_holm"] <= 1 for row in found["pairs"]["macro_f1"])
     assert len(found["people"]) == 5 and sum(m["rank"]["accuracy"] for m in found["models"]) == pytest.approx(6)
     assert "Critical-difference" in (tmp_path / "cmp" / "comparison.html").read_text(encoding="utf-8")
-    assert "Holm" in cli("compare", tmp_path / "A", tmp_path / "B").out
+    assert found["scored"] == "windows"
+    text = cli("compare", tmp_path / "A", tmp_path / "B").out
+    assert "Holm" in text and "95 % interval" in text and f"M1: {tmp_path / 'A'}" in text
+    titles = {m["title"].rpartition("seed 0")[2] for m in found["models"]}
+    assert titles == {", epochs 1", ", epochs 8", ", epochs 2"}
+    (tmp_path / "short.toml").write_text("[windows]\nwindow_s = 1.5\n")
+    assert cli(*words, "--epochs", 1, "--config", tmp_path / "short.toml", "--out", tmp_path / "E").status == 0
+    ran = cli("compare", tmp_path / "A", tmp_path / "E", "--json")
+    assert ran.status == 0, ran.err
+    shorter = ran.json
+    votes = json.loads((tmp_path / "A" / "evaluation.json").read_text())["subjects"]
+    assert shorter["scored"] == "recordings"
+    assert [p["M1"]["accuracy"] for p in shorter["people"]] == [s["by_recording_accuracy"] for s in votes]
+    assert "recordings are compared" in cli("compare", tmp_path / "A", tmp_path / "E").out
 
     alone = cli("compare", tmp_path / "A")
     assert alone.status == 2 and "at least two evaluations" in alone.err

@@ -436,6 +436,22 @@ def preview_import(source: str | Path, **given: Any) -> ImportPreview:
         return preview(scan_source(Path(source), _options(folder, **given)))
 
 
+def _check_layout(dest: Path, own: Layout, given: Layout | None, named: bool) -> None:
+    """Raise DatasetError if a data set with the layout ``own`` cannot take recordings of the layout ``given``.
+
+    Args:
+        named: whether the user named the layout; otherwise it is that of a pattern.
+    """
+    if named and given is not None and given.to_dict() != own.to_dict():
+        raise DatasetError(f"'{dest}' has the layout '{own.name}', not '{given.name}': leave --layout out.")
+    # The rate, gap and offsets may have been adopted from the recordings.
+    if not named and given is not None and _grid(given) != _grid(own):
+        raise DatasetError(
+            f"'{dest}' has the channels {', '.join(own.names)}, but the pattern has {', '.join(given.names)}, or other "
+            "steps: a data set has one layout, so import them apart."
+        )
+
+
 def import_recordings(
     source: str | Path,
     dest: str | Path,
@@ -492,27 +508,25 @@ def import_recordings(
     people_info = {} if people is None else read_people(Path(people))
     if source.is_dir() and dest.resolve() != source.resolve() and dest.resolve().is_relative_to(source.resolve()):
         raise ConfigError(f"'{dest}' lies in '{source}', which is only read: give a folder outside of it.")
+    if not add_to and (dest / HEAD).is_file():
+        raise DatasetError(
+            f"'{dest}' is a data set already: add to it with --add (Python: add_to=True), or give another folder; "
+            "nothing is overwritten.",
+            reason="name_exists",
+            name=dest.name,
+        )
     with _temporary_folders(dest) as new_folder:
         options = _options(new_folder, layout, gestures, subjects, columns, limits, person, guess_layout, pattern)
-        given, known, head = options.layout, options.gestures, None
+        known, head = options.gestures, None
         generation = Generation.of(dest)
         if add_to:
-            head = DatasetHead.read(dest)
-            if adopt_proposals:
-                raise ConfigError("--add keeps the layout of the data set: leave --adopt out.")
-            if layout is not None and given is not None and given.to_dict() != head.layout.to_dict():
-                own = head.layout.name
-                raise DatasetError(f"'{dest}' has the layout '{own}', not '{given.name}': leave --layout out.")
-            # The rate, gap and offsets may have been adopted from the recordings.
-            if layout is None and given is not None and _grid(given) != _grid(head.layout):
-                raise DatasetError(
-                    f"'{dest}' has the channels {', '.join(head.layout.names)}, but the pattern has "
-                    f"{', '.join(given.names)}, or other steps: a data set has one layout, so import them apart."
-                )
-            if name or licence or consent:
+            if adopt_proposals or name or licence or consent:
                 raise ConfigError(
-                    "--add keeps the name, licence and consent statement of the data set: leave them out."
+                    "--add keeps the layout, name, licence and consent statement of the data set: leave --adopt, "
+                    "--name, --licence and --consent out."
                 )
+            head = DatasetHead.read(dest)
+            _check_layout(dest, head.layout, options.layout, named=layout is not None)
             # An inferred set cannot decide which markers of an XDF file are gestures.
             of_set = known if head.gestures.inferred else head.gestures
             options = replace(options, layout=head.layout, gestures=of_set, layout_origin="that of the data set")

@@ -1,1 +1,1 @@
-"""How well networks read people they never met: splits side by side, comparisons, merges of gestures, explanations."""
+"""Scores on people left out: splits side by side, comparisons, merges of gestures, explanations."""

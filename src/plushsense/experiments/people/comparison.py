@@ -14,7 +14,7 @@ from plushsense.core.errors import BadInput
 from plushsense.core.files import write_file
 from plushsense.core.version import __version__
 from plushsense.dataset.store import writing_around
-from plushsense.evaluation.scores import read_predictions
+from plushsense.evaluation.scores import Predictions, read_predictions, votes_by_person
 from plushsense.experiments.people.lens import calibration_of
 from plushsense.jobs.journal import job_id
 from plushsense.scoring.comparison import average_ranks, cliques, compare_pairs
@@ -32,7 +32,7 @@ def compare(
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Compare saved evaluations person by person.
+    """Compare saved evaluations person by person: their windows, or if these are not the same ones, their recordings.
 
     Args:
         evaluations: at least two folders that `evaluate` wrote, of the same data, split, context and gestures.
@@ -42,7 +42,8 @@ def compare(
     Returns:
         ``models``: {name, title, parameters, folder, accuracy {mean, sd, ci95}, macro_f1 {…}, rank, calibration} of
         each, the best rank first; ``pairs``: the results of `compare_pairs` for each metric; ``cliques``: for each
-        metric, models that do not differ significantly; ``people``: the scores of each person by model.
+        metric, models that do not differ significantly; ``people``: the scores of each person by model; ``scored``:
+        "windows", or "recordings" if those are compared, each classified by the vote of its windows.
 
     Raises:
         BadInput: for folders without an evaluation or its predictions, or evaluations that cannot be compared.
@@ -54,7 +55,12 @@ def compare(
     tables = [load_evaluation(folder) for folder in folders]
     _require_same(folders, tables)
     names = [f"M{i}" for i in range(1, len(tables) + 1)]
-    of = [{row["subject"]: row for row in table["subjects"]} for table in tables]
+    predictions = [read_predictions(folder / PREDICTIONS) for folder in folders]
+    same = len({_scored_windows(each) for each in predictions}) == 1
+    if same:
+        of = [{row["subject"]: row for row in table["subjects"]} for table in tables]
+    else:
+        of = [votes_by_person(each) for each in _same_recordings(folders, predictions)]
     people = sorted(set.intersection(*(set(rows) for rows in of)))
     if len(people) < 2:
         raise BadInput("The evaluations have fewer than two people in common, so nothing can be paired.")
@@ -73,7 +79,7 @@ def compare(
             "seeds": table["seeds"],
             **{key: summary(scores[key][:, i]) for key in keys},
             "rank": {key: float(ranks[key][i]) for key in keys},
-            "calibration": calibration_of(read_predictions(folder / PREDICTIONS)),
+            "calibration": calibration_of(predictions[i]),
         }
         for i, (name, table, folder) in enumerate(zip(names, tables, folders, strict=True))
     ]
@@ -88,6 +94,7 @@ def compare(
             {"subject": p, **{n: {key: float(scores[key][i, j]) for key in keys} for j, n in enumerate(names)}}
             for i, p in enumerate(people)
         ],
+        "scored": "windows" if same else "recordings",
         "split": tables[0]["split"],
         "leaky": tables[0]["leaky"],
         "context": tables[0]["context"],
@@ -107,6 +114,23 @@ def compare(
     return result
 
 
+def _scored_windows(predictions: Predictions) -> tuple[tuple[str, int], ...]:
+    """Return recording and number of each scored window, sorted."""
+    return tuple(sorted(zip(predictions.recording.tolist(), predictions.window.tolist(), strict=True)))
+
+
+def _same_recordings(folders: Sequence[Path], predictions: Sequence[Predictions]) -> Sequence[Predictions]:
+    """Return the predictions if all have the same recordings; else raise BadInput."""
+    recordings = [set(each.recording.tolist()) for each in predictions]
+    for folder, other in zip(folders, recordings, strict=True):
+        if other != recordings[0]:
+            raise BadInput(
+                f"'{folders[0]}' and '{folder}' scored different recordings ({len(recordings[0])} and {len(other)}): "
+                "only evaluations of the same recordings can be compared."
+            )
+    return predictions
+
+
 def _require_same(folders: Sequence[Path], tables: Sequence[dict[str, Any]]) -> None:
     """Raise BadInput if the evaluations differ in what a comparison holds constant."""
     found = []
@@ -118,7 +142,9 @@ def _require_same(folders: Sequence[Path], tables: Sequence[dict[str, Any]]) -> 
             raise BadInput(f"'{folder}' is an evaluation of an older kind: evaluate again.") from None
     for key, noun in _SHARED:
         for folder, table in zip(folders[1:], found[1:], strict=True):
-            if table.get(key) != found[0].get(key):
+            values = (found[0].get(key), table.get(key))
+            # The context is "inside" if all windows lie in their recordings: such scores can be compared with any.
+            if values[0] != values[1] and "inside" not in values:
                 raise BadInput(
                     f"'{folders[0]}' and '{folder}' are evaluations of different {noun}: only evaluations of the same "
                     "data, split, context and gestures can be compared."

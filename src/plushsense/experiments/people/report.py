@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 # Okabe and Ito's blue and vermillion; markers show the same difference without colour.
 _HONEST, _LEAKY = "#0072b2", "#d55e00"
 _GREY = "#999999"
+OTHER_WINDOWS = "The evaluations scored different windows: recordings are compared, each by the vote of its windows."
 _DIGITS = {"tempo": 2, "strength": 2, "orientation_deg": 0, "rate_hz": 0}
 
 
@@ -98,7 +99,7 @@ def trait_table(result: Mapping[str, Any]) -> Table:
         Column("title", "Trait, as its distance from the median"),
         Column("people", "People", "count"),
         Column("rho", "Spearman's ρ\nwith accuracy", "share"),
-        Column("chance", "Chance, 95 %", "share"),
+        Column("chance", "|ρ| of 5 %\nof chance results", "share"),
     )
     return Table("traits", "What goes with a low accuracy", columns, tuple(result["traits"]))
 
@@ -145,7 +146,10 @@ def model_table(result: Mapping[str, Any]) -> Table:
         Column("title", "Evaluation"),
         Column("parameters", "Parameters", "count"),
         *(Column(key, metric.title, "right") for key, metric in column_metrics().items()),
-        *(Column(f"rank {key}", f"Mean rank,\n{metric.name}", "share") for key, metric in column_metrics().items()),
+        *(
+            Column(f"rank {key}", f"Mean rank (1: best),\n{metric.name}", "share")
+            for key, metric in column_metrics().items()
+        ),
         Column("ece", "Calibration\nerror (ECE)", "share"),
         Column("temperature", "Temper-\nature", "share"),
         Column("ece after", "ECE after\nscaling", "share"),
@@ -159,14 +163,16 @@ def pair_table(result: Mapping[str, Any], key: str) -> Table:
         {
             **row,
             "pair": f"{row['first']} − {row['second']}",
-            "difference": (mean_sd(row["difference"]), interval(row["difference"])),
+            "difference": mean_sd(row["difference"]),
+            "interval": interval(row["difference"]),
             **{p: "< 0.001" if row[p] < 0.001 else number(row[p]) for p in ("p", "p_holm")},
         }
         for row in result["pairs"][key]
     ]
     columns = (
         Column("pair", "Pair"),
-        Column("difference", "Mean difference ± sd\nand 95 % interval", "right"),
+        Column("difference", "Mean difference\n± sd", "right"),
+        Column("interval", "95 % interval\nof the mean", "right"),
         Column("better", "People\nbetter", "count"),
         Column("worse", "People\nworse", "count"),
         Column("effect", "Effect\n(rank-biserial)", "share"),
@@ -187,6 +193,7 @@ def comparison_page(result: Mapping[str, Any]) -> str:
         leaky=result["leaky"],
         split=result["split"],
         context=result["context"],
+        scored=OTHER_WINDOWS if result["scored"] == "recordings" else "",
         n=len(result["people"]),
         models=model_table(result),
         pairs=[pair_table(result, key) for key in column_metrics()],

@@ -183,8 +183,9 @@ class Jobs:
         try:
             # Store the job first, so that it is found after a crash.
             self._store(job)
+            # -P: nothing is imported from the working folder, which may be a data set of somebody else.
             process = subprocess.Popen(
-                [sys.executable, "-m", "plushsense.studio.tasks"],
+                [sys.executable, "-P", "-m", "plushsense.studio.tasks"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
