@@ -202,6 +202,17 @@ BAD = [
     (["report", "{half}", "--dataset", "{ds}"], "does not end in .html"),
     (["report", "{thesis}", "--dataset", "{ds}"], "is not a report of PlushSense"),
     (["evaluate", "{ds}", "--out", "{thesis_folder}"], "is not a report of PlushSense"),
+    (["train", "{ds}", "--out", "{recording}", "--force"], "is not a bundle"),
+    (["train", "{ds}", "--out", "{tmp}", "--force"], "is a folder: give a file"),
+    (["adapt", "{bundle}", "{ds}", "--out", "{recording}", "--force"], "is not a bundle"),
+    (["label", "{ds}", "--export", "{recording}"], "is not a file of labels"),
+    (["stream-eval", "{ds}", "--model", "{bundle}", "--events", "{recording}"], "is not a file of events"),
+    (["merge", "{ds}", "{ds}", "--merges", "1", "--out", "{recording}"], "is not a gesture set"),
+    (["merge", "{ds}", "{ds}", "--out", "{tmp}/set.toml"], "give --merges or --groups"),
+    (["toy", "--tcp", "0", "--truth", "{recording}"], "is not a file of truth"),
+    (["train", "{ds}", "--seed", "4294967296"], "accepted are whole numbers from 0 to 4294967295"),
+    (["sweep", "{ds}", "--seeds", "1001", "--dry-run"], "accepted are 1 to 1000"),
+    (["abstain", "{ds}", "--coverage", "nan"], "accepted is between 0 and 1"),
     (["trian"], "Did you mean 'train'?"),
     (["import", "{recordings}", "{tmp}/x", "--layout", "plush-15"], "has 5 columns, but a file of layout 'plush-15'"),
     (["import", "{recordings}", "{tmp}/x", "--layout", "accel3"], "Did you mean 'accel-3'?"),
@@ -235,13 +246,16 @@ def test_bad_input_is_one_sentence_and_status_2(
     thesis.parent.mkdir()
     thesis.write_text("my thesis")
     places = {"recordings": recordings, "tmp": empty, "ds": dataset.path, "half": half, "bundle": bundle}
-    places |= {"thesis": thesis, "thesis_folder": thesis.parent}
+    recording = next(iter(sorted(dataset.path.glob("recordings/*/*.csv"))))
+    before = recording.read_bytes()
+    places |= {"thesis": thesis, "thesis_folder": thesis.parent, "recording": recording}
     ran = cli(*(word.format(**places) for word in words), "--json")
     assert ran.status == 2
     assert said in ran.err
     assert ran.out == ""
     assert "Traceback" not in ran.err
     assert thesis.read_text() == "my thesis"
+    assert recording.read_bytes() == before
     assert half.is_file()
 
 

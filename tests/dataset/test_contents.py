@@ -1,9 +1,11 @@
+import os
 import sys
 from pathlib import Path
 
 import pytest
 
-from plushsense.dataset.files import list_files, match_code, person_folders
+from plushsense.core.errors import DatasetError
+from plushsense.dataset.files import list_files, match_code, person_folders, raw_files
 
 
 def test_every_file_has_a_kind_and_its_person(tmp_path: Path) -> None:
@@ -37,6 +39,32 @@ def test_links_are_named_and_not_followed(tmp_path: Path) -> None:
     (tmp_path / "loop").symlink_to(tmp_path, target_is_directory=True)
     (tmp_path / "nowhere.csv").symlink_to(tmp_path / "gone")
     assert [(str(c.path), c.kind) for c in list_files(tmp_path)] == [("loop", "link"), ("nowhere.csv", "link")]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs links and pipes")
+def test_raw_files_are_files_of_the_data_set(tmp_path: Path) -> None:
+    folder, outside = tmp_path / "DS", tmp_path / "passwd.csv"
+    person = folder / "recordings" / "P1"
+    person.mkdir(parents=True)
+    outside.write_text("x")
+    (folder / "kept.csv").write_text("x")
+    (person / "a_1_2.csv").symlink_to(folder / "kept.csv")
+    assert raw_files(folder) == [("recordings", person / "a_1_2.csv")]
+    for number, make in enumerate(
+        (
+            lambda path: path.symlink_to(outside),
+            lambda path: path.symlink_to("/dev/zero"),
+            lambda path: path.symlink_to(tmp_path / "nowhere"),
+            lambda path: path.symlink_to(tmp_path, target_is_directory=True),
+            os.mkfifo,
+        )
+    ):
+        bad = person / f"b_{number}_2.csv"
+        make(bad)
+        with pytest.raises(DatasetError, match=f"b_{number}_2.csv' is a link that leads out of the data set"):
+            raw_files(folder)
+        assert [c.kind for c in list_files(folder) if c.path.name == bad.name] == ["link"]
+        bad.unlink()
 
 
 def test_one_code_in_two_spellings() -> None:

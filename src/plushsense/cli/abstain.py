@@ -15,7 +15,7 @@ def run(args: argparse.Namespace) -> int:
     from plushsense.experiments.abstention import abstaining
 
     config = settings(args, workers=args.workers)
-    out = Path(args.out) if args.out else Path(args.dataset) / "abstaining"
+    out = Path(args.out) if args.out else Path(args.dataset) / "evaluations" / "abstaining"
     result = abstaining(
         args.dataset,
         config,

@@ -26,7 +26,9 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.out is None:
         raise ConfigError("--out is missing: give the bundle to write; the given bundle is never changed.")
-    out = Path(args.out)
+    from plushsense.models.bundle import check_bundle_path
+
+    out = check_bundle_path(args.out)
     if out.exists() and Path(args.bundle).exists() and out.samefile(args.bundle):
         raise ConfigError(f"'{out}' is the bundle to adapt, which is never changed: choose another --out.")
     if out.exists() and not args.force:

@@ -11,6 +11,7 @@ from plushsense.cli.options import options
 from plushsense.cli.output import emit, say, table
 from plushsense.cli.settings import listed, report_stages
 from plushsense.core.errors import ConfigError
+from plushsense.core.files import check_replaceable
 
 if TYPE_CHECKING:
     from plushsense.devices.virtual.stream import ToySpec
@@ -60,6 +61,8 @@ def run_toy(args: argparse.Namespace) -> int:
     spec = _toy_spec(args)
     if args.out is not None:
         return _play_to_folder(args, spec)
+    if args.truth:
+        check_replaceable(Path(args.truth), '{"label": ', "a file of truth", ConfigError)
     try:
         truth = Path(args.truth).open("a", encoding="utf-8") if args.truth else None
     except OSError as error:

@@ -15,10 +15,12 @@ _LINES = 40
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.dataset.labelling import decide_labels, write_stretches
+    from plushsense.dataset.labelling import check_labels_path, decide_labels, write_stretches
 
     if args.recording:
         return _relabel(args)
+    if args.export:
+        check_labels_path(args.export)
     done = decide_labels(
         args.dataset,
         args.stream,

@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from plushsense.core.errors import ConfigError, check_seed
+
 # Placeholders for lists of names in help texts: each maps to a module and a collection (or function returning one).
 _LISTS = {
     "checks": ("plushsense.dataset.quality.checking", "CHECKS"),
@@ -17,7 +19,19 @@ _LISTS = {
     "merges": ("plushsense.core.gestures", "merge_names"),
     "targets": ("plushsense.deploy.targets", "TARGETS"),
 }
-_TYPES = {"int": int, "float": float}
+
+
+def seed(text: str) -> int:
+    """Convert the text of a seed; raise ValueError or ArgumentTypeError if it is none."""
+    value = int(text)
+    try:
+        check_seed(value)
+    except ConfigError as cause:
+        raise argparse.ArgumentTypeError(str(cause).rstrip(".")) from None
+    return value
+
+
+_TYPES = {"int": int, "float": float, "seed": seed}
 
 
 class _Words(dict[str, str]):

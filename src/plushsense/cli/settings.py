@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
+from plushsense.core.errors import ConfigError
 from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
@@ -21,11 +22,14 @@ def listed(*values: str) -> list[str]:
     return [word.strip() for value in values for word in value.split(",") if word.strip()]
 
 
+_MOST_SEEDS = 1000
 _GRID_OPTIONS = ("architectures", "filters", "batches", "padding", "norm", "context", "classes", "device", "threads")
 
 
 def grid_changes(args: argparse.Namespace, *more: str) -> dict[str, Any]:
     """Return the values of the options that change a grid, and of the options ``more``."""
+    if args.seeds is not None and args.seeds > _MOST_SEEDS:
+        raise ConfigError(f"--seeds is {args.seeds}: accepted are 1 to {_MOST_SEEDS} seeds.")
     # ``--seeds 0`` gives an empty tuple, which is reported with the other problems of the grid.
     return options(args, *_GRID_OPTIONS, *more) | {"seeds": None if args.seeds is None else tuple(range(args.seeds))}
 

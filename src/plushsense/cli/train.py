@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
@@ -17,9 +16,10 @@ if TYPE_CHECKING:
 
 
 def run(args: argparse.Namespace) -> int:
+    from plushsense.models.bundle import check_bundle_path
     from plushsense.workflow.api import train, unfinished
 
-    if Path(args.out).exists() and not args.force:
+    if check_bundle_path(args.out).exists() and not args.force:
         raise ConfigError(f"'{args.out}' is already there: choose another --out, or replace it with --force.")
     done = train(
         args.dataset,

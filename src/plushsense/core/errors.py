@@ -161,6 +161,16 @@ def check_known(value: object, known: Iterable[str], kind: str, error: type[BadI
         raise error(f"Unknown {kind} '{value}': accepted are {', '.join(known)}.{nearest(str(value), known)}")
 
 
+# That of NumPy's older generators, which scikit-learn uses.
+_MOST_SEED = 2**32 - 1
+
+
+def check_seed(seed: int) -> None:
+    """Raise ConfigError for a seed that not every random generator accepts."""
+    if not 0 <= seed <= _MOST_SEED:
+        raise ConfigError(f"seed is {seed}: accepted are whole numbers from 0 to {_MOST_SEED}.")
+
+
 def need(module: str, extra: str) -> ModuleType:
     """Import ``module``, which the optional dependency group ``extra`` provides.
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import BinaryIO
 
 from filelock import FileLock, Timeout
 
@@ -24,6 +25,7 @@ PART = ".part"
 _UNFINISHED = "-unfinished-"
 _OWNER = "owner.lock"
 _TEMPORARY = "plushsense"
+_HEAD_BYTES = 4096
 _STARTED_S = 3600.0  # after which a work folder with nothing in it is taken for abandoned
 
 
@@ -113,11 +115,43 @@ def read_bytes(path: Path, most: int) -> bytes:
     Raises:
         OSError: if the file cannot be read, or is longer.
     """
-    with path.open("rb") as file:
+    with _open_regular(path) as file:
         data = file.read(most + 1)
     if len(data) > most:
         raise OSError(errno.EFBIG, f"it has more than {most:,} bytes", str(path))
     return data
+
+
+def _open_regular(path: Path) -> BinaryIO:
+    """Open a file for reading; raise OSError for a pipe or device, which may never end."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(errno.EINVAL, "it is no regular file", str(path))
+    return path.open("rb")
+
+
+def check_replaceable(path: Path, mark: str, noun: str, error: type[BadInput]) -> None:
+    """Check before the work that its result can be written to the file ``path``, and replaces no other kind of file.
+
+    Args:
+        mark: text that each such file has among its first bytes. An empty file may also be replaced.
+        noun: what such a file is, as in "a report of PlushSense".
+
+    Raises:
+        error: for a folder, a device, a file without ``mark``, and where nothing may be written.
+    """
+    place = next(p for p in path.absolute().parents if p.exists())
+    if path.is_dir():
+        raise error(f"'{path}' is a folder: give a file.")
+    if path.exists() or path.is_symlink():
+        try:
+            with _open_regular(path) as file:
+                head = file.read(_HEAD_BYTES)
+        except OSError as cause:
+            raise error(f"'{path}' exists and cannot be read ({cause.strerror}): give another file.") from None
+        if head and mark.encode() not in head:
+            raise error(f"'{path}' exists and is not {noun}: give another file, nothing else is replaced.")
+    if not place.is_dir() or not os.access(place, os.W_OK | os.X_OK):
+        raise error(f"'{path}' cannot be written: '{place}' is no folder in which you may write; give another file.")
 
 
 def write_file(path: Path, content: str | bytes, *, private: bool = False) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from plushsense.core.errors import DatasetError
 from plushsense.core.files import PART, write_file
 from plushsense.dataset.marks import MARKS
 from plushsense.dataset.store import HEAD, PEOPLE, RECORDINGS, STREAMS
@@ -21,13 +22,35 @@ STAMP_VERSION = 4
 
 
 def raw_files(folder: Path) -> list[tuple[str, Path]]:
-    """Return every raw file (``.csv`` in any case) of a data set with its kind, streams or recordings."""
-    return [
-        (kind, path)
-        for kind in (STREAMS, RECORDINGS)
-        for path in walk_files(folder / kind)
-        if path.name.lower().endswith(".csv")
-    ]
+    """Return every raw file (``.csv`` in any case) of a data set with its kind, streams or recordings.
+
+    Raises:
+        DatasetError: for a link that leads elsewhere, and for what is neither a file nor a folder.
+    """
+    found = []
+    for kind in (STREAMS, RECORDINGS):
+        # The folder itself may be a link, such as to another disk.
+        inside = (folder / kind).resolve()
+        for place, folders, names in os.walk(folder / kind):
+            linked = [path for path in map(Path(place).joinpath, folders) if path.is_symlink()]
+            raw = [Path(place, name) for name in names if name.lower().endswith(".csv")]
+            for path in (*linked, *raw):
+                if not is_own_file(path, inside, folder.resolve()):
+                    raise DatasetError(
+                        f"'{path}' is a link that leads out of the data set, or neither a file nor a folder: put what "
+                        "it leads to in its place, or remove it.",
+                        reason="foreign_link",
+                        file=path.relative_to(folder).as_posix(),
+                    )
+                found.append((kind, path))
+    return sorted(found, key=lambda one: (one[0] != STREAMS, one[1]))
+
+
+def is_own_file(path: Path, *folders: Path) -> bool:
+    """Return whether a path is a regular file, or a link to one that lies in one of the resolved ``folders``."""
+    if not path.is_file():
+        return False
+    return not path.is_symlink() or any(path.resolve().is_relative_to(folder) for folder in folders)
 
 
 def walk_files(folder: Path) -> list[Path]:
@@ -165,7 +188,7 @@ def _kind(path: PurePosixPath) -> str:
 
 
 def list_files(folder: Path) -> list[DatasetFile]:
-    """List every file below ``folder``, sorted by path; links to folders are listed but not followed.
+    """List every file below ``folder``, sorted by path; links to folders, or out of it, are listed but not followed.
 
     Files in ``<any folder>/<person>/``, except in ``cache/`` and ``evaluations/``, belong to the person if
     ``recordings/`` or ``streams/`` has a folder of that name.
@@ -178,12 +201,13 @@ def list_files(folder: Path) -> list[DatasetFile]:
         raise cause
 
     paths: list[tuple[PurePosixPath, bool]] = []
+    inside = folder.resolve()
     for place, folders, names in os.walk(folder, onerror=refuse, followlinks=False):
         here = Path(place)
         links = [f for f in folders if (here / f).is_symlink()]
         for name in names + links:
             path = PurePosixPath((here / name).relative_to(folder).as_posix())
-            paths.append((path, name not in links and (here / name).is_file()))
+            paths.append((path, name not in links and is_own_file(here / name, inside)))
     known = set(person_folders(folder))
     out = []
     for path, plain in sorted(paths):

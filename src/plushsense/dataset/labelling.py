@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
-from plushsense.core.files import write_file
+from plushsense.core.files import check_replaceable, write_file
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.marks import (
     HANDLING,
@@ -239,8 +239,18 @@ def _seconds(text: str) -> float:
         raise DatasetError(f"'{text}' is no time: seconds are accepted, such as 12.5.") from None
 
 
+def check_labels_path(path: str | os.PathLike[str]) -> None:
+    """Raise DatasetError if labels cannot be written to a file, or would replace another kind of file."""
+    check_replaceable(Path(path), ",".join(COLUMNS), "a file of labels", DatasetError)
+
+
 def write_stretches(path: str | os.PathLike[str], stretches: Sequence[TimedStretch]) -> None:
-    """Write stretches as CSV with the columns `COLUMNS`, as `read_stretches` reads it."""
+    """Write stretches as CSV with the columns `COLUMNS`, as `read_stretches` reads it.
+
+    Raises:
+        DatasetError: if the file exists and has no labels.
+    """
+    check_labels_path(path)
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(COLUMNS)

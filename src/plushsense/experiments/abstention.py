@@ -54,7 +54,7 @@ from plushsense.workflow.preparation import (
     python_warning,
     windows_for,
 )
-from plushsense.workflow.reporting import journal_of
+from plushsense.workflow.reporting import check_folder, journal_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -400,9 +400,15 @@ def abstaining(
         progress: called when a training is done.
 
     Raises:
-        ConfigError: for a split of windows or recordings; DatasetError: for a data set without streams.
+        ConfigError: for a split of windows or recordings, a share that is not between 0 and 1, or where ``out`` cannot
+            be written; DatasetError: for a data set without streams.
         BadInput: when the test or the validation people have no recordings in streams.
     """
+    for name, share in (("coverage", coverage), ("known_share", known_share)):
+        if not 0.0 < share < 1.0:
+            raise ConfigError(f"{name} is {share}: accepted is between 0 and 1, such as 0.9.")
+    if out is not None:
+        check_folder(Path(out), "An evaluation of abstention")
     dataset, config = network_inputs_of(as_dataset(dataset), config or from_settings(**settings))
     parsed = parse_split(split)
     if not parsed.apart:

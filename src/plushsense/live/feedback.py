@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from plushsense.core.errors import BadInput, BundleError, DatasetError, nearest
-from plushsense.core.files import write_file
+from plushsense.core.files import check_replaceable, write_file
 from plushsense.core.recorder_csv import Frames
 from plushsense.core.toml import loads_json
 from plushsense.live.adaptation import DENSE, Examples, Floats, judge, with_one
@@ -150,8 +150,9 @@ def append_corrections(path: str | os.PathLike[str], corrections: Sequence[Corre
     """Append corrections to a file, which is created if it is missing, readable by its owner only.
 
     Raises:
-        BadInput: if the file cannot be written.
+        BadInput: if the file cannot be written, or has no corrections.
     """
+    check_replaceable(Path(path), '{"subject": ', "a file of corrections", BadInput)
     lines = "".join(c.to_line() for c in corrections)
     try:
         with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600), "r+b") as file:

@@ -22,7 +22,7 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from plushsense.core.errors import BadInput, BundleError
-from plushsense.core.files import read_bytes, write_file
+from plushsense.core.files import check_replaceable, read_bytes, write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.core.toml import check_table
@@ -44,6 +44,7 @@ _DENSE = ("dense.weight", "dense.bias")
 _MOST_WEIGHT = 1e20
 _MOST = {"calibration": 1e30, "windowing": 1e6}
 _MOST_BYTES = 256 << 20
+_FILE_BEGIN = '{"__metadata__":{"plushsense"'
 _DEEPEST = 32  # tables within tables
 # What a network may take to run: numbers kept or computed at once (512 MiB of floats), multiply-accumulates of a
 # decision, and of those that are due at once after a gap.
@@ -178,12 +179,12 @@ class Bundle:
         return replace(self, provenance=_without_people(self.provenance), personal=personal)
 
     def save(self, path: str | Path) -> Path:
-        """Write the bundle atomically, creating missing folders; return the path.
+        """Write the bundle atomically, creating missing folders; return the path. An earlier bundle is replaced.
 
         Raises:
-            BundleError: if the file cannot be written.
+            BundleError: if the file cannot be written, or exists and is not a bundle.
         """
-        path = Path(path)
+        path = check_bundle_path(path)
         data = self.to_bytes()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -316,6 +317,12 @@ class Bundle:
             "content": content,
         }
         return bytes(save_tensors(weights, metadata={"plushsense": _canonical(head)}))
+
+
+def check_bundle_path(path: str | Path) -> Path:
+    """Return the path; raise BundleError if a bundle cannot be written there, or would replace another kind of file."""
+    check_replaceable(Path(path), _FILE_BEGIN, "a bundle", BundleError)
+    return Path(path)
 
 
 def known_people(provenance: Mapping[str, Any], keys: Sequence[str] = _PEOPLE) -> set[str]:

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import ConfigError
-from plushsense.core.files import write_file
+from plushsense.core.files import check_replaceable, write_file
 from plushsense.core.templates import fill_html
 
 ENDINGS = (".html", ".htm")
 _PACKAGE = "plushsense.reports"
 # Tag that the base template contains; an existing file is replaced only if it has this tag.
 GENERATOR = '<meta name="generator" content="PlushSense">'
-_HEAD_BYTES = 4096
 
 
 def render_page(template: str, **values: Any) -> str:
@@ -42,16 +41,7 @@ def check_page_path(path: str | Path) -> Path:
     target = Path(path)
     if target.suffix.lower() not in ENDINGS:
         raise ConfigError(f"'{target}' does not end in .html or .htm, and a report is an HTML page: change the name.")
-    if target.is_dir():
-        raise ConfigError(f"'{target}' is a folder: give a file in it for the report.")
-    if target.exists():
-        try:
-            with target.open("rb") as file:
-                ours = GENERATOR.encode() in file.read(_HEAD_BYTES)
-        except OSError as cause:
-            raise ConfigError(f"'{target}' exists and cannot be read ({cause.strerror}): give another file.") from cause
-        if not ours:
-            raise ConfigError(f"'{target}' exists and is not a report of PlushSense: give another file.")
+    check_replaceable(target, GENERATOR, "a report of PlushSense", ConfigError)
     return target
 
 

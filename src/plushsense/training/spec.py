@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from plushsense.core.errors import ConfigError, check_known
+from plushsense.core.errors import ConfigError, check_known, check_seed
 from plushsense.training.augment import parse_augmentation
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -65,6 +65,7 @@ class TrainSpec:
         _at_least("epochs", self.epochs, 1)
         _at_least("batch", self.batch, 2)
         _at_least("seed", self.seed, 0)
+        check_seed(self.seed)
         _at_least("threads", self.threads, 1)
         for name in ("halve_every", "patience"):
             if getattr(self, name) is not None:

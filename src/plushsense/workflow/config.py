@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import ArchError, ConfigError, check_known
+from plushsense.core.errors import ArchError, ConfigError, check_known, check_seed
 from plushsense.core.layouts import Layout
 from plushsense.core.toml import check_table, read_toml, refuse_unknown
 from plushsense.models.arch import (
@@ -118,6 +118,7 @@ class EvaluationSpec:
         for name, value in (("workers", self.workers), ("seed", self.seed)):
             if value < 0:
                 raise ConfigError(f"{name} is {value}: accepted are whole numbers from 0 up.")
+        check_seed(self.seed)
         if self.train_context is not None:
             check_known(self.train_context, TRAIN_CONTEXTS, "train_context", ConfigError)
 

@@ -46,6 +46,16 @@ def test_runs_of_a_label_are_recordings(tmp_path: Path) -> None:
     assert done.dataset.head.source == "table"
 
 
+def test_labels_that_become_one_are_told(tmp_path: Path) -> None:
+    lines = [
+        line for n, label in enumerate(("swipe <", "swipe >", "Tap", "tap")) for line in rows("ana", label, 50 * n, 50)
+    ]
+    done = import_recordings(table(tmp_path / "all.csv", lines), tmp_path / "DS", layout="accel-3")
+    assert {gesture for _, _, gesture, _ in got(done)} == {"swipe _", "Tap"}
+    (said,) = done.to_dict()["warnings"]
+    assert "'swipe >' and 'swipe <' become one gesture, 'swipe _'" in said
+
+
 def test_people_may_take_turns_row_by_row(tmp_path: Path) -> None:
     pairs = zip(rows("ana", "Shake", 0, 50), rows("ben", "Wave", 0, 50), strict=True)
     path = table(tmp_path / "all.csv", [line for pair in pairs for line in pair])

@@ -30,6 +30,7 @@ from plushsense.core.recorder_csv import (
     Frames,
     format_header,
     format_rows,
+    parse_name,
     recording_filename,
 )
 from plushsense.core.sentences import Sentence
@@ -208,6 +209,7 @@ class TableImport:
     pattern: ImportPattern
     _taken: dict[tuple[str, str], set[str]] = field(default_factory=dict)
     _origins: dict[tuple[str, str], list[dict[str, Any]]] = field(default_factory=dict)
+    _spellings: dict[str, list[str]] = field(default_factory=dict)
     _written: int = 0
 
     def convert(
@@ -296,7 +298,7 @@ class TableImport:
 
     def _write(
         self, table: TableFile, original: ConvertedSource, samples: _TableSamples, mine: NDArray[np.int64], apart: bool
-    ) -> Iterator[SourceFile]:
+    ) -> Iterator[SourceFile | Sentence]:
         """Write the session whose rows are ``mine``; ``apart``: the file itself tells its recordings apart."""
         every = samples.frames
         assert every.host_ms is not None
@@ -322,9 +324,24 @@ class TableImport:
             write_session(folder, *key, frames, cuts, self.layout, original, with_stream=not named.all(), taken=taken)
         )
         yield from files
+        yield from self._merged(table.display_name, sorted({cut.label for cut in cuts}))
         if taken is not None:
             made = {f.source.name: f.origin for f in files if f.kind == RECORDINGS}
             self._origins.setdefault(key, []).append(original.table | {"recordings": made})
+
+    def _merged(self, source: str, labels: Sequence[str]) -> Iterator[Sentence]:
+        """Yield a note for each label that becomes the same as another one, for want of characters in file names."""
+        for label in labels:
+            name = parse_name(recording_filename(label, 0, 0))
+            assert name is not None
+            others = self._spellings.setdefault(plain_label(name.label), [label])
+            if plain_label(label) not in map(plain_label, others):
+                others.append(label)
+                note = (
+                    f"'{label}' and '{others[0]}' become one gesture, '{name.label}', as names of files have no "
+                    '\\ / : * ? " < > | ( ): if they are two, rename one in the source, or give aliases in a --pattern'
+                )
+                yield about_file(source, note)
 
     def _factor(self, columns: ImportedColumns, times: NDArray[np.float64]) -> tuple[float, str]:
         """Return the milliseconds per unit of the time column, and a note if the unit is stated nowhere."""

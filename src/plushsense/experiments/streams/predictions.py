@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from plushsense.core.errors import BadInput, FileFormatError, nearest
-from plushsense.core.files import write_file
+from plushsense.core.files import check_replaceable, write_file
 from plushsense.core.gestures import GestureSet
 from plushsense.dataset.store import StreamInfo, read_csv_rows
 from plushsense.experiments.streams.replay import StreamEvents, StreamTruth
@@ -285,15 +285,24 @@ def _number(
     return value
 
 
+_EVENT_COLUMNS = ("stream", "t", "stop", "label", "named", "affect")
+
+
+def check_events_path(path: str | os.PathLike[str]) -> None:
+    """Raise BadInput if events cannot be written to a file, or would replace another kind of file."""
+    check_replaceable(Path(path), ",".join(_EVENT_COLUMNS), "a file of events", BadInput)
+
+
 def write_events(path: str | os.PathLike[str], streams: Iterable[StreamEvents], gestures: GestureSet) -> None:
     """Write the events of streams as a file that `read_predictions` reads; a stream without events has one empty row.
 
     Raises:
-        BadInput: if the file cannot be written.
+        BadInput: if the file cannot be written, or is one of another kind.
     """
+    check_events_path(path)
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(("stream", "t", "stop", "label", "named", "affect"))
+    writer.writerow(_EVENT_COLUMNS)
     for truth, events in streams:
         for e in events:
             label = "" if e.gesture == NO_GESTURE else gestures.labels[e.gesture]

@@ -30,7 +30,7 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import HEAD, Dataset
 from plushsense.deploy.quantize import calibration
-from plushsense.experiments.streams.predictions import read_predictions, shortened, write_events
+from plushsense.experiments.streams.predictions import check_events_path, read_predictions, shortened, write_events
 from plushsense.experiments.streams.replay import (
     EventCounts,
     StreamEvents,
@@ -284,6 +284,8 @@ def stream_eval(
         DatasetError: where no stream has a recording in it; BundleError: where the model has other inputs.
         BadInput: for a person without a stream, or if nobody is left to score.
     """
+    if events is not None:
+        check_events_path(events)
     bundle = model if isinstance(model, Bundle) else Bundle.load(Path(model))
     with streams_at(path, bundle) as dataset:
         dataset = dataset if labels else dataset.without_stretches()
