@@ -90,7 +90,7 @@ def test_windows_are_stratified_over_classes() -> None:
     label = rng.choice(CLASSES, size=1000, p=[0.7, 0.15, 0.1, 0.05]).astype(np.int64)
     subject = np.full(1000, "P01")
     split = parse_split("windows:5")
-    assert split.leaky and not split.apart
+    assert split.leaky and not split.separates_people
     folds = make_folds(split, subject, label)
     check_partition(folds, 1000)
     share = np.bincount(label) / 5
@@ -220,7 +220,7 @@ def test_a_splitter_keeps_people_and_recordings_apart_and_says_what_it_lacks() -
 def test_a_split_knows_what_it_splits_and_what_it_needs() -> None:
     assert [parse_split(text).unit for text in ("windows:5", "by-recording:5")] == ["window", "recording"]
     assert [len(make_folds(Split(kind), *study(6))) for kind in ("by-subject", "by-recording")] == [5, 5]
-    assert [parse_split(text).apart for text in EXAMPLES] == [True, True, *[False] * 5]
+    assert [parse_split(text).separates_people for text in EXAMPLES] == [True, True, *[False] * 5]
     assert parse_split("by-subject:2").k == 2 and parse_split("windows:1000").k == 1000
     with pytest.raises(ConfigError, match="from 2 to 1000"):
         parse_split("windows:1001")

@@ -271,13 +271,13 @@ def evaluate(
     ]
     tested = [(fold.name, fold.test) for fold in folds]
     predictions = gather_predictions(score_windows, tested, [outcome["probabilities"] for outcome in outcomes])
-    table = compute_scores(predictions, records, score_windows.affects, parsed.apart)
+    table = compute_scores(predictions, records, score_windows.affects, parsed.separates_people)
     table["leakage"] = audit_leakage(train_windows, score_windows, folds)
     if score_windows.self_calibration:
         table["self_calibration"] = score_windows.self_calibration
     if all("deployed" in outcome for outcome in outcomes):
         deployed = gather_predictions(score_windows, tested, [outcome["deployed"] for outcome in outcomes])
-        after = compute_scores(deployed, records, score_windows.affects, parsed.apart)
+        after = compute_scores(deployed, records, score_windows.affects, parsed.separates_people)
         table["int8"] = compare_deployed(table, after, predictions, deployed)
     return Evaluation(
         split=parsed,
@@ -285,7 +285,7 @@ def evaluate(
         train_context=context_of(train_windows),
         seeds=[seed],
         table=table,
-        histories=[with_accuracy(outcome["history"], parsed.apart) for outcome in outcomes],
+        histories=[with_accuracy(outcome["history"], parsed.separates_people) for outcome in outcomes],
         predictions=predictions,
     )
 

@@ -32,7 +32,7 @@ from plushsense.reports.figures import new_figure, png
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import ONE
 from plushsense.runtime.fixed import smoothing_weight
-from plushsense.scoring.metrics import RelativeMahalanobis, RiskCoverage, auroc, confidences, risk_coverage
+from plushsense.scoring.confidence import RelativeMahalanobis, RiskCoverage, auroc, confidences, risk_coverage
 from plushsense.scoring.splits import Fold, parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.tuning.decisions import (
@@ -411,7 +411,7 @@ def abstaining(
         check_folder(Path(out), "An evaluation of abstention")
     dataset, config = network_inputs_of(as_dataset(dataset), config or from_settings(**settings))
     parsed = parse_split(split)
-    if not parsed.apart:
+    if not parsed.separates_people:
         raise ConfigError(
             f"The split '{split}' does not keep people apart: accepted are by-subject:K and leave-one-subject-out."
         )

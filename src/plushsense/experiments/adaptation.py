@@ -465,7 +465,7 @@ def evaluate_adapting(
     if use < spec.least or random < 0:
         raise ConfigError(f"--use {use}, --choices {random}: accepted are {spec.least} and more, 0 and more.")
     division = parse_split(split)
-    if not division.apart:
+    if not division.separates_people:
         raise ConfigError(f"The split {split} does not keep people apart: use leave-one-subject-out or by-subject:5.")
     gestures = choose_classes(dataset, config.evaluation.classes, warn)
     arch = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)

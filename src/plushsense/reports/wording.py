@@ -58,7 +58,7 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
         str(evaluation.get("split", DASH)), len(folds) or None, evaluation.get("validation_decides")
     )
     if folds and not any(fold.get("validation_windows", 1) for fold in folds):
-        who = "Nobody: nothing depends on validation, so all others are trained on."
+        who = "Nobody: every training runs its full length, so all others are trained on."
     trained, scored = describe_contexts(evaluation)
     seeds = evaluation.get("seeds")
     runs = f"{len(seeds)} runs averaged" if isinstance(seeds, list) and len(seeds) > 1 else "one run"

@@ -71,7 +71,7 @@ class Split:
         return "window" if self.leaky else "recording"
 
     @property
-    def apart(self) -> bool:
+    def separates_people(self) -> bool:
         """Whether no person is in both training and test."""
         return self.kind in ("leave-one-subject-out", "by-subject")
 
@@ -183,7 +183,7 @@ class Splitter:
         for name, values in (("groups", subject), ("recordings", units)):
             if values.shape != (n,):
                 raise ArrayError(f"{name} has the shape {values.shape}: expected ({n},), one a window.")
-        together = not self.kind.apart or NOBODY in subject
+        together = not self.kind.separates_people or NOBODY in subject
         if self.recordings is None and together and not self.kind.leaky:
             raise ArrayError(
                 f"The split {self.kind.text} must know which windows are of one recording: give recordings, such as "
@@ -320,12 +320,12 @@ def _by_people(subject: NDArray[np.str_], groups: list[tuple[str, ...]], people:
     for i, group in enumerate(groups):
         rng = np.random.default_rng([seed, 4, i])
         others = [person for person in people if person not in group]
-        watching = rng.permutation(others)[: max(1, round(VALIDATION_SHARE * len(others)))]
+        held_back = rng.permutation(others)[: max(1, round(VALIDATION_SHARE * len(others)))]
         at_rest = dealt[i :: len(groups)]
         rest = rng.permutation(np.setdiff1d(nobody, at_rest))
         resting = rest[: round(VALIDATION_SHARE * len(rest)) or int(len(rest) > 1)]
         test = np.union1d(np.flatnonzero(np.isin(subject, group)), at_rest)
-        validation = np.union1d(np.flatnonzero(np.isin(subject, watching)), resting)
+        validation = np.union1d(np.flatnonzero(np.isin(subject, held_back)), resting)
         name = group[0] if len(group) == 1 else f"fold {i + 1}"
         train = np.setdiff1d(np.arange(len(subject)), np.union1d(test, validation))
         folds.append(Fold(name, group, train, validation, test))

@@ -171,7 +171,7 @@ def _cut(dataset: Dataset, grid: GridSpec, unreadable: Sequence[str], warn: Warn
 
 
 def _warn_of_rare(dataset: Dataset, cut: _Cut, warn: Warn) -> None:
-    if cut.split.apart and cut.grid.classes == ALL:
+    if cut.split.separates_people and cut.grid.classes == ALL:
         rare = set(cut.gestures.labels) - set(shared_gestures(dataset)[0].labels)
         if rare:
             sentence = (
@@ -409,7 +409,9 @@ def outcome(plan: Plan, run: PlannedRun, result: Mapping[str, Any]) -> TrainingO
     """Score the probabilities of a training; in splits by person, recordings of `NOBODY` are not scored."""
     windows, fold = plan.sets[run.span], plan.folds[run.span][run.fold_index]
     truth, classes = windows.y[fold.test], len(windows.labels)
-    counted = windows.subject[fold.test] != NOBODY if plan.split.apart else np.ones(len(truth), dtype=np.bool_)
+    counted = (
+        windows.subject[fold.test] != NOBODY if plan.split.separates_people else np.ones(len(truth), dtype=np.bool_)
+    )
     scored, before, seconds = dict[int, Scored](), 0, float(result["seconds"])
     for i, epochs in enumerate(result["epochs"]):
         read = np.argmax(result["probabilities"][i], axis=1).astype(np.int64)

@@ -190,12 +190,12 @@ def train(
     dataset, config, scored, division = made.dataset, made.config, made.scored, made.division
     trainer = NetworkTrainer(
         dataset, config, made.network, made.gestures, made.windows, division.kind == WHOLE_PEOPLE, quantize_aware,
-        journal, _reporting(progress, division.split.apart),
+        journal, _reporting(progress, division.split.separates_people),
     )  # fmt: skip
-    checked = trainer.train(division.train, scored.take(division.watch), division.fold.subjects)
+    checked = trainer.train(division.train, scored.take(division.validation), division.fold.subjects)
     final = checked
     if division.refit:
-        final = trainer.train(np.arange(len(made.windows)), scored.take(division.watch[:0]), what=REFIT)
+        final = trainer.train(np.arange(len(made.windows)), scored.take(division.validation[:0]), what=REFIT)
     fitted = checked.fitted
     predictions, scores = _validated(made, checked, warn)
     bundle = Bundle(
@@ -211,7 +211,7 @@ def train(
             "dataset_hash": dataset.hash,
             "simulated": dataset.head.simulated,
             "subjects": sorted({str(s) for s in made.windows.subject[final.at]}),
-            "validation_subjects": sorted({str(s) for s in scored.subject[division.watch]}),
+            "validation_subjects": sorted({str(s) for s in scored.subject[division.validation]}),
             "split": division.kind,
             "refit": division.refit,
             "context": dict(sorted(Counter(made.windows.context.tolist()).items())),
@@ -231,7 +231,7 @@ def train(
     trainer.discard()
     # `forget` cannot find an unsaved bundle: raise an error if a person was removed during the training.
     dataset.generation.check()
-    history = with_accuracy(fitted.history, division.split.apart)
+    history = with_accuracy(fitted.history, division.split.separates_people)
     seconds = checked.seconds + (final.seconds if division.refit else 0.0)
     return Trained(bundle, history, scores, seconds, dataset.generation)
 
@@ -245,12 +245,12 @@ def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> t
 
     division, fitted, config = made.division, trained.fitted, made.config
     test = made.scored.take(division.fold.test)
-    sizes = (len(trained.at), len(division.watch), len(test))
+    sizes = (len(trained.at), len(division.validation), len(test))
     record = FoldRecord(division.fold.name, division.fold.subjects, sizes, len(fitted.history), fitted.seconds)
 
     def score(probabilities: NDArray[np.float32]) -> tuple[Predictions, dict[str, Any], dict[str, Any]]:
         predictions = gather_predictions(made.scored, [(division.fold.name, division.fold.test)], [probabilities])
-        found = score_predictions(predictions, [record], made.scored.affects, division.split.apart)
+        found = score_predictions(predictions, [record], made.scored.affects, division.split.separates_people)
         return predictions, {name: found[name]["mean"] for name in ("accuracy", "macro_f1")}, found["nobody"]
 
     answers = predict(made.network, trained.weights, fitted.scaler, test, config.training.device)
@@ -369,7 +369,7 @@ def evaluate(
         refuse_undeployable(network)
     warn_of_files_twice(dataset, gestures, warn)
     score = fit_on = windows_for(dataset, network, config.scored_on, gestures, warn)
-    if parse_split(config.evaluation.split).apart:
+    if parse_split(config.evaluation.split).separates_people:
         warn_of_single_people(score, warn)
     if config.trained_on != config.scored_on:
         fit_on = windows_for(dataset, network, config.trained_on, gestures, anywhere=config.anywhere)

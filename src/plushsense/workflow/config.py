@@ -154,7 +154,7 @@ class RunConfig:
     @property
     def holds_back(self) -> bool:
         """Whether an evaluation holds people back for validation: not if nothing depends on them."""
-        return self.training.patience is not None or not parse_split(self.evaluation.split).apart
+        return self.training.patience is not None or not parse_split(self.evaluation.split).separates_people
 
     @property
     def padding(self) -> str:

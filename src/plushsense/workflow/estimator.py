@@ -133,7 +133,7 @@ def in_own_order(x: NDArray[Any], *others: NDArray[Any]) -> NDArray[np.int64]:
     return np.array(sorted(range(len(x)), key=lambda i: (*(o[i] for o in others), keys[i])), dtype=np.int64)
 
 
-def watching_of(people: NDArray[np.str_], seed: int) -> NDArray[np.bool_]:
+def validation_mask(people: NDArray[np.str_], seed: int) -> NDArray[np.bool_]:
     """Return a mask (N,) of the windows of the people held out for early stopping; all False if there is one person."""
     names = np.unique(people)
     if len(names) < 2:
@@ -428,12 +428,12 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
         x, index, weights = x[order], index[order], weights[order]
         people = people[order] if named else people_of(None, len(x))
         windows = windows_of(x, index.astype(np.int64), people, layout, gestures)
-        watching = watching_of(people, spec.seed) if spec.patience is not None else np.zeros(len(x), dtype=bool)
-        trained = weights[~watching]
+        held_back = validation_mask(people, spec.seed) if spec.patience is not None else np.zeros(len(x), dtype=bool)
+        trained = weights[~held_back]
         scaling = np.clip(trained.mean(), 1.0, _MOST_REPEATS) / trained.mean()
         fitted = fit(
-            windows.take(np.flatnonzero(~watching)),
-            windows.take(np.flatnonzero(watching)) if watching.any() else None,
+            windows.take(np.flatnonzero(~held_back)),
+            windows.take(np.flatnonzero(held_back)) if held_back.any() else None,
             arch,
             spec,
             weights=None if (trained == 1.0).all() else trained * scaling,
@@ -452,14 +452,14 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
                 "estimator": {"settings": self._settings(), **labels_table(classes)},
                 "windows": len(x),
                 "weighted": bool((trained != 1.0).any()),
-                "subjects": sorted(set(people[~watching].tolist())) if named else [],
-                "validation_subjects": sorted(set(people[watching].tolist())) if named else [],
+                "subjects": sorted(set(people[~held_back].tolist())) if named else [],
+                "validation_subjects": sorted(set(people[held_back].tolist())) if named else [],
                 "split": "none",
                 "preset": self.preset,
                 "training": spec.to_dict(),
                 "code_version": __version__,
             },
-            calibration=calibration(arch, fitted.weights, fitted.scaler, windows.x[~watching]),
+            calibration=calibration(arch, fitted.weights, fitted.scaler, windows.x[~held_back]),
         )
         return self
 

@@ -259,7 +259,7 @@ _FEWEST_APART = 3  # people; with fewer, recordings are held out for validation
 
 @dataclass(frozen=True)
 class TrainValidationSplit:
-    """The train/validation split of a single training; ``train`` and ``watch`` are indices of the windows of each.
+    """The train/validation split of a single training; ``train`` and ``validation`` are indices of the windows of each.
 
     ``refit``: whether a second network, which is the one to keep, is trained on everybody in the same way after the
     first was scored.
@@ -270,7 +270,7 @@ class TrainValidationSplit:
     description: str
     fold: Fold
     train: NDArray[np.int64]
-    watch: NDArray[np.int64]
+    validation: NDArray[np.int64]
     refit: bool
 
 
@@ -287,13 +287,13 @@ def refits(config: RunConfig, people: int) -> bool:
     return people >= _FEWEST_APART and config.training.patience is None and config.preset != "search"
 
 
-def divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = None) -> TrainValidationSplit:
+def split_validation(windows: WindowSet, config: RunConfig, scored: WindowSet | None = None) -> TrainValidationSplit:
     """Hold out people for validation; with fewer than three, recordings; with the preset ``search``, windows.
 
     Where the validation windows do not determine when to stop, ``refit`` asks for a second training on everybody.
 
-    ``watch`` and the fold's ``test`` are indices into ``scored``, windows of the same recordings that may be cut with
-    other settings (default: ``windows``). Except with ``search``, no scored recording is trained on.
+    ``validation`` and the fold's ``test`` are indices into ``scored``, windows of the same recordings that may be cut
+    with other settings (default: ``windows``). Except with ``search``, no scored recording is trained on.
     """
     scored = windows if scored is None else scored
     seed = config.evaluation.seed
@@ -315,7 +315,7 @@ def divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = Non
         kind = "validation-recordings"
         description = f"recordings that were not trained on{stops}; of people who were, so the scores are too high"
     fold = fold_windows(windows, scored, split, seed)[0]
-    if split.apart:
+    if split.separates_people:
         description += ", ".join(fold.subjects)
     rest = np.sort(np.concatenate([fold.train, fold.validation]))
     return TrainValidationSplit(split, kind, description, fold, rest, fold.test, refits(config, len(people)))
@@ -323,7 +323,7 @@ def divide(windows: WindowSet, config: RunConfig, scored: WindowSet | None = Non
 
 @dataclass(frozen=True)
 class PreparedTraining:
-    """All that a single training starts from; ``scored`` are the windows of validation, cut as `divide` says."""
+    """All that a single training starts from; ``scored`` are the windows of validation (see `split_validation`)."""
 
     dataset: Dataset
     config: RunConfig
@@ -352,7 +352,7 @@ def prepare_training(
     scored = windows
     if config.scored_on != config.windows:
         scored = windows_for(dataset, network, config.scored_on, gestures)
-    division = divide(windows, config, scored)
+    division = split_validation(windows, config, scored)
     if config.windows.context == ANYWHERE and config.anywhere.hard_share and division.kind != WHOLE_PEOPLE:
         warn("no hard negatives are added, as whole people must be held out for that: record three people or more")
     return PreparedTraining(dataset, config, gestures, network, windows, scored, division)

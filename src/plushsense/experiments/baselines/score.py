@@ -242,7 +242,7 @@ def _row(
         for f, o in zip(folds, outcomes, strict=True)
     ]
     predictions = gather_predictions(windows, [(f.name, f.test) for f in folds], [o["probabilities"] for o in outcomes])
-    table = compute_scores(predictions, records, windows.affects, split.apart)
+    table = compute_scores(predictions, records, windows.affects, split.separates_people)
 
     def middle(name: str) -> float:
         return float(np.median([o[name] for o in outcomes]))
@@ -255,7 +255,7 @@ def _row(
         "span_s": (contender.samples or windows.x.shape[2]) / windows.rate_hz,
         "split": split.text,
         "leaky": split.leaky,
-        "apart": split.apart,
+        "apart": split.separates_people,
         "over": table["over"],
         "folds": len(folds),
         **{name: table[name] for name in (*column_metrics(), "pooled")},

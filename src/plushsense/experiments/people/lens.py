@@ -78,7 +78,7 @@ def lens(
         run = replace(config, evaluation=replace(config.evaluation, split=split.text))
         done = evaluate(dataset, run, cluster=cluster, progress=progress, warn=silent if number else warn)
         rows.append(_split_row(done))
-        honest = done if split.apart else honest
+        honest = done if split.separates_people else honest
     result: dict[str, Any] = {
         "splits": rows,
         "by_person": None if honest is None else honest.split.text,
@@ -125,7 +125,7 @@ def _split_row(done: Evaluation) -> dict[str, Any]:
     return {
         "split": done.split.text,
         "leaky": done.split.leaky,
-        "apart": done.split.apart,
+        "apart": done.split.separates_people,
         "folds": len(table["folds"]),
         "train_windows": round(np.mean([f["train_windows"] for f in table["folds"]])),
         "people": len(people),

@@ -127,12 +127,12 @@ class TrainStreams:
         # Recordings at rest belong to no person and are used for training in every fold.
         mine = np.isin(cut.subject, [*fold.train, NOBODY])
         train = cut.take(np.flatnonzero(mine & outside_streams(cut, dataset, {*fold.validation, *fold.test})))
-        watch = scored.take(np.flatnonzero(np.isin(scored.subject, fold.validation)))
+        validation = scored.take(np.flatnonzero(np.isin(scored.subject, fold.validation)))
         train = add_hard_negatives(
             train, dataset, arch, recipe.windows, recipe.anywhere, gestures, recipe.training,
             {*fold.validation, *fold.test}, progress,
         )  # fmt: skip
-        fitted = fit(train, watch, arch, recipe.training, progress)
+        fitted = fit(train, validation, arch, recipe.training, progress)
         calibrated = calibration(arch, fitted.weights, fitted.scaler, train.x)
         people = {"subjects": list(fold.train), "validation_subjects": list(fold.validation)}
         origin = {"dataset": dataset.head.name, "dataset_hash": dataset.hash, "code_version": __version__, **people}

@@ -97,7 +97,7 @@ def people_folds(dataset: Dataset, split: str, seed: int = 0) -> list[PeopleFold
         BadInput: where there are too few people, or nobody has a stream.
     """
     asked = parse_split(split)
-    if not asked.apart:
+    if not asked.separates_people:
         raise ConfigError(
             f"Split '{split}' does not keep people apart, and a stream is one person's: accepted are by-subject:5 and "
             "leave-one-subject-out."

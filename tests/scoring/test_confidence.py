@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import BadInput
-from plushsense.scoring.metrics import RelativeMahalanobis, auroc, confidences, risk_coverage
+from plushsense.scoring.confidence import RelativeMahalanobis, auroc, confidences, risk_coverage
 
 
 def test_a_curve_by_hand():
