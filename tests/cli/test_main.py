@@ -207,6 +207,7 @@ BAD = [
     (["adapt", "{bundle}", "{ds}", "--out", "{recording}", "--force"], "is not a bundle"),
     (["label", "{ds}", "--export", "{recording}"], "is not a file of labels"),
     (["stream-eval", "{ds}", "--model", "{bundle}", "--events", "{recording}"], "is not a file of events"),
+    (["stream-eval", "{ds}", "--model", "{bundle}", "--subjects", ",,"], "names nobody"),
     (["merge", "{ds}", "{ds}", "--merges", "1", "--out", "{recording}"], "is not a gesture set"),
     (["merge", "{ds}", "{ds}", "--out", "{tmp}/set.toml"], "give --merges or --groups"),
     (["toy", "--tcp", "0", "--truth", "{recording}"], "is not a file of truth"),

@@ -337,7 +337,7 @@ def adapt(
         adapting, test = _divide(windows, next(_choices(windows, times, use, 0, 0), everything))
         if not len(test):
             raise BadInput(
-                f"No recording of {person} is left to test on: there are at most {use} of each gesture; use fewer."
+                f"No recording of {person} is left to test on: {use} of each gesture are used to adapt; use fewer."
             )
     done = personalise(given, adapting.x, adapting.y, adapting.recording, subject=person, spec=spec)
     for label in done.without:

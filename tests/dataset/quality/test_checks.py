@@ -293,6 +293,13 @@ def never_stopped(folder: Path) -> str:
     return path.relative_to(folder / "recordings").with_suffix("").as_posix()
 
 
+def one_row(folder: Path) -> str:
+    path = recording(folder)
+    change(path, lambda f: f.slice(0, 1))
+    path = renamed(path, 1)
+    return path.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
 def too_long(folder: Path) -> str:
     path = recording(folder)
     change(path, lambda f: join(f, *[f.slice(0, 50)] * 4))
@@ -397,6 +404,7 @@ PLANTS: list[tuple[str, Callable[[Path], str]]] = [
     ("several-gestures", two_in_one),
     ("no-onset", nothing_happens),
     ("never-stopped", never_stopped),
+    ("too-short", one_row),
     ("duration", too_long),
     ("duration", too_short),
     ("rows", other_rows),

@@ -52,6 +52,7 @@ _LEFT_OUT = "nothing: that line is left out"
 
 CHECKS: dict[str, Check] = {
     "never-stopped": Check(recordings.never_stopped, (_R,), "error", "trim it to the gesture, or exclude it", True),
+    "too-short": Check(recordings.too_short, (_R,), "error", "exclude it, or record it again"),
     "duration": Check(comparisons.duration, (_R,), "warning", _LOOK),
     "no-onset": Check(comparisons.no_onset, (_R,), "warning", "look whether the gesture was made; exclude it if not"),
     "several-gestures": Check(comparisons.several_gestures, (_R,), "warning", _TO_ONE),

@@ -23,6 +23,8 @@ class CheckLimits:
 
     duration: float = 0.4
     """Largest difference of a recording's duration from the mean of its gesture, as a share of it (the paper: 0.4)."""
+    short_s: float = 0.1
+    """Duration below which a recording is too short for a gesture."""
     rate: float = 0.2
     """Largest difference of the measured frame rate from the layout's, as a share of the latter."""
     jitter: float = 0.3

@@ -53,6 +53,13 @@ def never_stopped(s: Examination) -> Iterator[Issue]:
         )
 
 
+def too_short(s: Examination) -> Iterator[Issue]:
+    rows, seconds = len(s.frames), len(s.frames) / s.layout.rate_hz
+    if seconds < s.limits.short_s:
+        message = f"holds {_plural(rows, 'row')} ({seconds:.2f} s): too short for a gesture"
+        yield Issue(Sentence(message, "too_short", rows=rows, seconds=round(seconds, 3)))
+
+
 def garbage(s: Examination) -> Iterator[Issue]:
     """Find values outside the valid range."""
     values = s.frames.values

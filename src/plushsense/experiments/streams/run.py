@@ -240,7 +240,9 @@ def streams_at(path: str | os.PathLike[str], bundle: Bundle | None = None) -> It
 
 
 def _people_of(dataset: Dataset, path: str | os.PathLike[str], subjects: Sequence[str] | None) -> list[str]:
-    """Return the people who have a stream, and raise for one of ``subjects`` who has none."""
+    """Return the people who have a stream, and raise for one of ``subjects`` who has none, or if they are nobody."""
+    if subjects is not None and not subjects:
+        raise BadInput("--subjects names nobody: name people, or leave it out for all whom the model does not know.")
     there = people_with_streams(dataset)
     if not there:
         raise DatasetError(

@@ -81,7 +81,7 @@ class ReviewedRecording:
         return self.state in DECIDED or (self.state == LABELLED and not self.open)
 
 
-ODD = ("never-stopped", "duration", "no-onset", "several-gestures", "stuck", "flat")
+ODD = ("never-stopped", "too-short", "duration", "no-onset", "several-gestures", "stuck", "flat")
 """Checks whose findings make a recording stand out among the others of its gesture."""
 _MAX_SIGNALS = 48
 
