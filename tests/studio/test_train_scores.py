@@ -94,7 +94,7 @@ def test_an_evaluation_has_the_same_figure_everywhere(home: Path, capsys: pytest
     assert pooled > accuracy + 0.02, "recordings at rest are easy"
     text = "\n".join(lines(printed))
     assert f"accuracy        {accuracy:.3f} ± " in text
-    assert f"pooled, with recordings at rest: accuracy {pooled:.3f}" in text
+    assert f"pooled windows, with recordings at rest: accuracy {pooled:.3f}" in text
     assert f"without recordings at rest: {printed['nobody']['recordings']} recordings, accuracy {rest:.3f}" in text
     report = Path(printed["report"]).read_text(encoding="utf-8")
     assert f"{accuracy:.3f} ± {printed['accuracy']['sd']:.3f}" in report
