@@ -172,7 +172,7 @@ def test_gestures_without_affect_give_rules_without_one(virtual: Dataset) -> Non
 def test_where_nothing_is_energetic_there_is_no_gate(virtual: Dataset) -> None:
     quiet = GestureSet("quiet", tuple(dataclasses.replace(g, energetic=False) for g in virtual.gestures.gestures))
     fit = fit_gate(virtual, quiet, virtual.subjects)
-    assert fit.settings == GateSettings() and "no gesture of 'quiet' is energetic" in fit.report["reason"]
+    assert fit.settings == GateSettings() and "no gesture of 'quiet' is marked as energetic" in fit.report["reason"]
     unknown = GestureSet("other", (*quiet.gestures, Gesture("Kick", energetic=True)))
     assert "nobody here recorded Kick" in fit_gate(virtual, unknown, virtual.subjects).report["reason"]
 
