@@ -260,6 +260,19 @@ def test_bad_input_is_one_sentence_and_status_2(
     assert half.is_file()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="needs links and pipes")
+def test_links_to_themselves_and_pipes_are_refused(cli: Cli, recordings: Path, tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    os.mkfifo(tmp_path / "pipe")
+    for words, said in (
+        (("import", recordings, tmp_path / "loop", "--layout", "accel-3"), "link"),
+        (("restore", tmp_path / "pipe", tmp_path / "DS"), "is no file: give a backup"),
+        (("export", tmp_path / "pipe", tmp_path / "C"), "no regular file"),
+    ):
+        ran = cli(*words)
+        assert ran.status == 2 and said in ran.err and ran.err.count("\n") == 1
+
+
 def test_a_layout_key_misspelt(cli: Cli, recordings: Path, tmp_path: Path) -> None:
     layout = tmp_path / "own.toml"
     layout.write_text('name = "own"\nrate_hertz = 100.0\nchannels = []\nwire = []\n')

@@ -86,6 +86,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         say(f"plushsense: {printable(_sentence(error))}")
         return 2
+    except RuntimeError as error:
+        # Path.resolve, before Python 3.13.
+        if "Symlink loop" not in str(error):
+            raise
+        say(f"plushsense: A path is a link that leads back to itself: {printable(str(error))}; give another path.")
+        return 2
     finally:
         close_active()
 

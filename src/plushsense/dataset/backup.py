@@ -215,6 +215,8 @@ def _damaged(path: Path, why: object) -> DatasetError:
 @contextmanager
 def _open_backup(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]:
     """Open a backup and check that its members are those of its manifest."""
+    if path.exists() and not path.is_file():
+        raise DatasetError(f"'{path}' is no file: give a backup.", reason="backup_damaged", name=path.name)
     try:
         archive = zipfile.ZipFile(path)
     except FileNotFoundError:
