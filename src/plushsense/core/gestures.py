@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -17,8 +18,11 @@ FAMILY, AFFECT = "family", "affect"
 
 
 def plain_label(label: str) -> str:
-    """Normalise a label for comparison: fold case, and turn ``_`` and runs of white space into one space."""
-    return " ".join(label.replace("_", " ").split()).casefold()
+    """Normalise a label for comparison: fold case, and turn ``_`` and runs of white space into one space.
+
+    Accents are composed (NFC): macOS stores them apart from their letters in names of files.
+    """
+    return unicodedata.normalize("NFC", " ".join(label.replace("_", " ").split()).casefold())
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import unicodedata
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -52,6 +53,10 @@ def test_labels_that_become_one_are_told(tmp_path: Path) -> None:
     ]
     done = import_recordings(table(tmp_path / "all.csv", lines), tmp_path / "DS", layout="accel-3")
     assert {gesture for _, _, gesture, _ in got(done)} == {"swipe _", "Tap"}
+    composed, apart = "glāsts", unicodedata.normalize("NFD", "glāsts")
+    lines = rows("ana", composed, 0, 50) + rows("ana", apart, 50, 50)
+    same = import_recordings(table(tmp_path / "accents.csv", lines), tmp_path / "DS2", layout="accel-3")
+    assert {gesture for _, _, gesture, _ in got(same)} == {composed} and same.to_dict()["warnings"] == []
     (said,) = done.to_dict()["warnings"]
     assert "'swipe >' and 'swipe <' become one gesture, 'swipe _'" in said
 
