@@ -148,8 +148,9 @@ def test_a_taken_port_is_one_sentence() -> None:
             ToyServer().serve_tcp(port)
     with pytest.raises(ConfigError, match="65535"):
         ToyServer().serve_tcp(70_000)
-    with pytest.raises(ConfigError, match="speed"):
-        ToyServer(speed=-1).serve_tcp(0)
+    for speed in (-1, float("inf"), float("nan")):
+        with pytest.raises(ConfigError, match="speed"):
+            ToyServer(speed=speed).serve_tcp(0)
 
 
 def test_a_broken_connection() -> None:

@@ -309,8 +309,8 @@ def forget(dataset: str | Path, subject: str) -> RemovalPlan:
         ) from None
     except OSError as cause:
         raise DatasetError(
-            f"'{cause.filename or folder}' cannot be removed ({cause.strerror or cause}): close the programs that use "
-            "it, then give the same command again to finish.",
+            f"'{cause.filename or folder}' cannot be changed ({cause.strerror or cause}): close the programs that use "
+            "it, check that you may write there, then give the same command again to finish.",
             reason="forget_locked",
             file=cause.filename or folder.name,
         ) from None

@@ -121,8 +121,8 @@ class ToyServer:
         """
         if not 0 <= port <= 65535:
             raise ConfigError(f"The port is {port}; a whole number from 0 (a free one) to 65535 is accepted.")
-        if not self.speed >= 0.0:
-            raise ConfigError(f"The toy's speed is {self.speed}; it must be 0 (as fast as possible) or above.")
+        if not 0.0 <= self.speed < float("inf"):
+            raise ConfigError(f"The toy's speed is {self.speed}; it must be 0 (as fast as possible) or a finite number above.")
         stream = ToyStream(self.spec, self.layout, self.prompts)
         counters = ToyCounters()
         listening = _listen(port)
@@ -188,8 +188,8 @@ class ToyServer:
         import pty
         import tty
 
-        if not self.speed > 0.0:
-            raise ConfigError(f"The toy's speed on a pseudo terminal is {self.speed:g}; it must be above 0.")
+        if not 0.0 < self.speed < float("inf"):
+            raise ConfigError(f"The toy's speed on a pseudo terminal is {self.speed:g}; it must be a finite number above 0.")
         stream = ToyStream(self.spec, self.layout, self.prompts)
         counters = ToyCounters()
         fast = self.speed > 1.0
