@@ -122,7 +122,9 @@ class ToyServer:
         if not 0 <= port <= 65535:
             raise ConfigError(f"The port is {port}; a whole number from 0 (a free one) to 65535 is accepted.")
         if not 0.0 <= self.speed < float("inf"):
-            raise ConfigError(f"The toy's speed is {self.speed}; it must be 0 (as fast as possible) or a finite number above.")
+            raise ConfigError(
+                f"The toy's speed is {self.speed}: accepted is 0 (as fast as possible) and finite numbers above."
+            )
         stream = ToyStream(self.spec, self.layout, self.prompts)
         counters = ToyCounters()
         listening = _listen(port)
@@ -189,7 +191,9 @@ class ToyServer:
         import tty
 
         if not 0.0 < self.speed < float("inf"):
-            raise ConfigError(f"The toy's speed on a pseudo terminal is {self.speed:g}; it must be a finite number above 0.")
+            raise ConfigError(
+                f"The toy's speed on a pseudo terminal is {self.speed:g}: accepted are finite numbers above 0."
+            )
         stream = ToyStream(self.spec, self.layout, self.prompts)
         counters = ToyCounters()
         fast = self.speed > 1.0
