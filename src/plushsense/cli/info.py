@@ -55,7 +55,7 @@ def _bundle(args: argparse.Namespace) -> int:
         *((key.capitalize(), value) for key, value in result.get("adapted", {}).items()),
     ]
     # A name from the file must not look like a line of this program.
-    emit(args, result, [f"{name:<31}{printable(str(value))}" for name, value in rows])
+    emit(args, result, [f"{printable(name):<31}{printable(str(value))}" for name, value in rows])
     return 0
 
 

@@ -139,19 +139,19 @@ def check_replaceable(path: Path, mark: str, noun: str, error: type[BadInput]) -
     Raises:
         error: for a folder, a device, a file without ``mark``, and where nothing may be written.
     """
-    place = next(p for p in path.absolute().parents if p.exists())
     if path.is_dir():
         raise error(f"'{path}' is a folder: give a file.")
-    if path.exists() or path.is_symlink():
-        try:
+    try:
+        if path.exists():
             with _open_regular(path) as file:
                 head = file.read(_HEAD_BYTES)
-        except OSError as cause:
-            raise error(f"'{path}' exists and cannot be read ({cause.strerror}): give another file.") from None
-        if head and mark.encode() not in head:
-            raise error(f"'{path}' exists and is not {noun}: give another file, nothing else is replaced.")
-    if not place.is_dir() or not os.access(place, os.W_OK | os.X_OK):
-        raise error(f"'{path}' cannot be written: '{place}' is no folder in which you may write; give another file.")
+            if head and mark.encode() not in head:
+                raise error(f"'{path}' exists and is not {noun}: give another file, nothing else is replaced.")
+        place = next((p for p in path.absolute().parents if p.exists()), None)
+    except OSError as cause:
+        raise error(f"'{path}' cannot be used ({cause.strerror}): give another file.") from None
+    if place is None or not place.is_dir() or not os.access(place, os.W_OK | os.X_OK):
+        raise error(f"'{path}' cannot be written: '{place or path}' is no folder in which you may write; give another.")
 
 
 def write_file(path: Path, content: str | bytes, *, private: bool = False) -> None:

@@ -37,7 +37,7 @@ def raw_files(folder: Path) -> list[tuple[str, Path]]:
             for path in (*linked, *raw):
                 if not is_own_file(path, inside, folder.resolve()):
                     raise DatasetError(
-                        f"'{path}' is a link that leads out of the data set, or neither a file nor a folder: put what "
+                        f"'{path}' is a link to a folder or out of the data set, or no file: put what "
                         "it leads to in its place, or remove it.",
                         reason="foreign_link",
                         file=path.relative_to(folder).as_posix(),

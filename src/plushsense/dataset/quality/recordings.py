@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.quality.findings import CheckLimits, Issue, Severity
-from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, Examination
+from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, Examination, duration_s
 
 _FEW = 0.01
 _SPIKE_ROWS = 20
@@ -54,7 +54,8 @@ def never_stopped(s: Examination) -> Iterator[Issue]:
 
 
 def too_short(s: Examination) -> Iterator[Issue]:
-    rows, seconds = len(s.frames), len(s.frames) / s.layout.rate_hz
+    rows = len(s.frames)
+    seconds = duration_s(s.frames) * rows / max(1, rows - 1)
     if seconds < s.limits.short_s:
         message = f"holds {_plural(rows, 'row')} ({seconds:.2f} s): too short for a gesture"
         yield Issue(Sentence(message, "too_short", rows=rows, seconds=round(seconds, 3)))

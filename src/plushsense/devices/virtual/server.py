@@ -122,9 +122,7 @@ class ToyServer:
         if not 0 <= port <= 65535:
             raise ConfigError(f"The port is {port}; a whole number from 0 (a free one) to 65535 is accepted.")
         if not 0.0 <= self.speed < float("inf"):
-            raise ConfigError(
-                f"The toy's speed is {self.speed}: accepted is 0 (as fast as possible) and finite numbers above."
-            )
+            raise ConfigError(f"The toy's speed is {self.speed}: accepted are 0 (fastest) and finite numbers above.")
         stream = ToyStream(self.spec, self.layout, self.prompts)
         counters = ToyCounters()
         listening = _listen(port)
@@ -191,9 +189,7 @@ class ToyServer:
         import tty
 
         if not 0.0 < self.speed < float("inf"):
-            raise ConfigError(
-                f"The toy's speed on a pseudo terminal is {self.speed:g}: accepted are finite numbers above 0."
-            )
+            raise ConfigError(f"The toy's speed on a terminal is {self.speed:g}: accepted are finite numbers above 0.")
         stream = ToyStream(self.spec, self.layout, self.prompts)
         counters = ToyCounters()
         fast = self.speed > 1.0

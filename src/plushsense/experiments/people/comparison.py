@@ -141,10 +141,10 @@ def _require_same(folders: Sequence[Path], tables: Sequence[dict[str, Any]]) -> 
         except (KeyError, TypeError):
             raise BadInput(f"'{folder}' is an evaluation of an older kind: evaluate again.") from None
     for key, noun in _SHARED:
+        # The context is "inside" if all windows lie in their recordings: such scores can be compared with any.
+        first = next((table.get(key) for table in found if table.get(key) != "inside"), "inside")
         for folder, table in zip(folders[1:], found[1:], strict=True):
-            values = (found[0].get(key), table.get(key))
-            # The context is "inside" if all windows lie in their recordings: such scores can be compared with any.
-            if values[0] != values[1] and "inside" not in values:
+            if table.get(key) not in (first, "inside"):
                 raise BadInput(
                     f"'{folders[0]}' and '{folder}' are evaluations of different {noun}: only evaluations of the same "
                     "data, split, context and gestures can be compared."
