@@ -202,15 +202,9 @@ BAD = [
     (["report", "{half}", "--dataset", "{ds}"], "does not end in .html"),
     (["report", "{thesis}", "--dataset", "{ds}"], "is not a report of PlushSense"),
     (["evaluate", "{ds}", "--out", "{thesis_folder}"], "is not a report of PlushSense"),
-    (["train", "{ds}", "--out", "{recording}", "--force"], "is not a bundle"),
     (["train", "{ds}", "--out", "{tmp}", "--force"], "is a folder: give a file"),
-    (["adapt", "{bundle}", "{ds}", "--out", "{recording}", "--force"], "is not a bundle"),
-    (["label", "{ds}", "--export", "{recording}"], "is not a file of labels"),
-    (["stream-eval", "{ds}", "--model", "{bundle}", "--events", "{recording}"], "is not a file of events"),
     (["stream-eval", "{ds}", "--model", "{bundle}", "--subjects", ",,"], "names nobody"),
-    (["merge", "{ds}", "{ds}", "--merges", "1", "--out", "{recording}"], "is not a gesture set"),
     (["merge", "{ds}", "{ds}", "--out", "{tmp}/set.toml"], "give --merges or --groups"),
-    (["toy", "--tcp", "0", "--truth", "{recording}"], "is not a file of truth"),
     (["train", "{ds}", "--seed", "4294967296"], "accepted are whole numbers from 0 to 4294967295"),
     (["sweep", "{ds}", "--seeds", "1001", "--dry-run"], "accepted are 1 to 1000"),
     (["abstain", "{ds}", "--coverage", "nan"], "accepted is between 0 and 1"),
@@ -247,17 +241,47 @@ def test_bad_input_is_one_sentence_and_status_2(
     thesis.parent.mkdir()
     thesis.write_text("my thesis")
     places = {"recordings": recordings, "tmp": empty, "ds": dataset.path, "half": half, "bundle": bundle}
-    recording = next(iter(sorted(dataset.path.glob("recordings/*/*.csv"))))
-    before = recording.read_bytes()
-    places |= {"thesis": thesis, "thesis_folder": thesis.parent, "recording": recording}
+    places |= {"thesis": thesis, "thesis_folder": thesis.parent}
     ran = cli(*(word.format(**places) for word in words), "--json")
     assert ran.status == 2
     assert said in ran.err
     assert ran.out == ""
     assert "Traceback" not in ran.err
     assert thesis.read_text() == "my thesis"
-    assert recording.read_bytes() == before
     assert half.is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "work", "said"),
+    [
+        (["train", "DS", "--out", "FILE", "--force"], "workflow.api.train", "is not a bundle"),
+        (["adapt", "BUNDLE", "DS", "--out", "FILE", "--force"], "experiments.adaptation.adapt", "is not a bundle"),
+        (["label", "DS", "--export", "FILE"], "dataset.labelling.decide_labels", "is not a file of labels"),
+        (
+            ["stream-eval", "DS", "--model", "BUNDLE", "--events", "FILE"],
+            "experiments.streams.run.streams_at",
+            "is not a file of events",
+        ),
+        (
+            ["merge", "DS", "DS", "--merges", "1", "--out", "FILE"],
+            "experiments.people.merging.load_evaluation",
+            "is not a gesture set",
+        ),
+        (["feedback", "BUNDLE", "DS", "--out", "FILE"], "live.feedback.events_of", "is not a file of corrections"),
+        (["toy", "--tcp", "0", "--truth", "FILE"], "devices.virtual.server.ToyServer", "is not a file of truth"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_a_file_of_another_kind_is_refused_before_the_work(
+    words: list[str], work: str, said: str, cli: Cli, dataset: Dataset, bundle: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = min(dataset.path.glob("recordings/*/*.csv"))
+    before = recording.read_bytes()
+    monkeypatch.setattr(f"plushsense.{work}", lambda *_args, **_more: pytest.fail("the work began"))
+    places = {"DS": dataset.path, "BUNDLE": bundle, "FILE": recording}
+    ran = cli(*(places.get(word, word) for word in words))
+    assert ran.status == 2 and said in ran.err
+    assert recording.read_bytes() == before
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs links and pipes")
@@ -268,6 +292,7 @@ def test_links_to_themselves_and_pipes_are_refused(cli: Cli, recordings: Path, t
         (("import", recordings, tmp_path / "loop", "--layout", "accel-3"), "link"),
         (("restore", tmp_path / "pipe", tmp_path / "DS"), "is no file: give a backup"),
         (("export", tmp_path / "pipe", tmp_path / "C"), "no regular file"),
+        (("train", tmp_path, "--config", tmp_path / "pipe"), "no regular file"),
     ):
         ran = cli(*words)
         assert ran.status == 2 and said in ran.err and ran.err.count("\n") == 1

@@ -12,7 +12,7 @@ import pytest
 from plushsense.core.errors import DatasetError
 from plushsense.core.files import (
     PART,
-    check_replaceable,
+    check_output_file,
     new_folder,
     read_bytes,
     replacing_file,
@@ -123,15 +123,18 @@ def test_a_failed_folder_does_not_appear(tmp_path: Path, failure: BaseException)
 def test_only_files_of_ones_own_kind_are_replaced(tmp_path: Path) -> None:
     def refused(path: Path) -> str:
         with pytest.raises(DatasetError) as said:
-            check_replaceable(path, "mark", "a letter", DatasetError)
+            check_output_file(path, "mark", "a letter", DatasetError)
         return str(said.value)
 
     for name, content in (("new", None), ("empty", ""), ("mine", "a mark of mine")):
         if content is not None:
             (tmp_path / name).write_text(content)
-        check_replaceable(tmp_path / name, "mark", "a letter", DatasetError)
+        check_output_file(tmp_path / name, "mark", "a letter", DatasetError)
     (tmp_path / "other").write_text("x" * 5000 + "mark")
     assert "is not a letter" in refused(tmp_path / "other")
+    with pytest.raises(DatasetError, match="is not a letter"):
+        check_output_file(tmp_path / "other", "mark", "a letter", DatasetError, append=True)
+    assert "is a folder" in refused(Path("/"))
     assert "is a folder" in refused(tmp_path)
     assert "is no folder in which you may write" in refused(tmp_path / "other" / "new")
 
@@ -144,7 +147,8 @@ def test_nothing_is_read_from_a_pipe_or_a_device(tmp_path: Path) -> None:
         with pytest.raises(OSError, match="no regular file"):
             read_bytes(tmp_path / name, 100)
         with pytest.raises(DatasetError, match="no regular file"):
-            check_replaceable(tmp_path / name, "mark", "a letter", DatasetError)
+            check_output_file(tmp_path / name, "mark", "a letter", DatasetError)
+        check_output_file(tmp_path / name, "mark", "a letter", DatasetError, append=True)
 
 
 def test_a_folder_is_filled_where_it_is_empty_and_refused_where_it_is_not(tmp_path: Path) -> None:

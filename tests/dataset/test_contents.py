@@ -61,10 +61,13 @@ def test_raw_files_are_files_of_the_data_set(tmp_path: Path) -> None:
     ):
         bad = person / f"b_{number}_2.csv"
         make(bad)
-        with pytest.raises(DatasetError, match=f"b_{number}_2.csv' is a link to a folder or out of the data set"):
+        with pytest.raises(DatasetError, match=f"b_{number}_2.csv' is a link to another place, or neither"):
             raw_files(folder)
         assert [c.kind for c in list_files(folder) if c.path.name == bad.name] == ["link"]
         bad.unlink()
+    (folder / "streams").symlink_to(folder / "recordings", target_is_directory=True)
+    with pytest.raises(DatasetError, match="streams' is a link to another place"):
+        raw_files(folder)
 
 
 def test_one_code_in_two_spellings() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,6 +48,17 @@ def refuse(*args: object) -> None:
 def test_nothing_is_read_again_when_nothing_changed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(index, "build_index", refuse)
     assert len(open_dataset(folder).recordings) == 2
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs pipes and links")
+@pytest.mark.parametrize("name", ["marks.jsonl", "index.json", "anything"])
+def test_a_pipe_or_a_device_among_the_files_is_refused(folder: Path, name: str) -> None:
+    (folder / name).unlink(missing_ok=True)
+    for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
+        make(folder / name)
+        with pytest.raises(DatasetError, match=f"{name}' is a link to another place, or neither"):
+            open_dataset(folder)
+        (folder / name).unlink()
 
 
 def test_a_new_a_changed_and_a_removed_raw_file_are_noticed(folder: Path) -> None:

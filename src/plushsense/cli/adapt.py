@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 
 def run(args: argparse.Namespace) -> int:
+    from plushsense.models.bundle import check_bundle_path
+
     if args.evaluate is not None:
         return _evaluate(args)
     given = sum((args.recordings is not None or args.feedback is not None, args.undo))
@@ -26,8 +28,6 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.out is None:
         raise ConfigError("--out is missing: give the bundle to write; the given bundle is never changed.")
-    from plushsense.models.bundle import check_bundle_path
-
     out = check_bundle_path(args.out)
     if out.exists() and Path(args.bundle).exists() and out.samefile(args.bundle):
         raise ConfigError(f"'{out}' is the bundle to adapt, which is never changed: choose another --out.")
@@ -68,9 +68,11 @@ def _correction_lines(done: Corrected, out: str) -> list[str]:
 
 def run_feedback(args: argparse.Namespace) -> int:
     from plushsense.core.recorder_csv import STREAM_NAME, read_stream
-    from plushsense.live.feedback import append_corrections, correction_of, events_of
+    from plushsense.live.feedback import append_corrections, check_corrections_path, correction_of, events_of
     from plushsense.models.bundle import Bundle
 
+    if args.out is not None:
+        check_corrections_path(args.out)
     bundle, path = Bundle.load(args.bundle), Path(args.stream)
     frames = read_stream(path / STREAM_NAME if path.is_dir() else path, bundle.layout).frames
     events = events_of(bundle, frames)

@@ -11,7 +11,7 @@ from plushsense.cli.options import options
 from plushsense.cli.output import emit, say, table
 from plushsense.cli.settings import listed, report_stages
 from plushsense.core.errors import ConfigError
-from plushsense.core.files import check_replaceable
+from plushsense.core.files import check_output_file
 
 if TYPE_CHECKING:
     from plushsense.devices.virtual.stream import ToySpec
@@ -62,7 +62,7 @@ def run_toy(args: argparse.Namespace) -> int:
     if args.out is not None:
         return _play_to_folder(args, spec)
     if args.truth:
-        check_replaceable(Path(args.truth), '{"label": ', "a file of truth", ConfigError)
+        check_output_file(Path(args.truth), '{"label": ', "a file of truth", ConfigError, append=True)
     try:
         truth = Path(args.truth).open("a", encoding="utf-8") if args.truth else None
     except OSError as error:

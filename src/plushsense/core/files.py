@@ -129,24 +129,44 @@ def _open_regular(path: Path) -> BinaryIO:
     return path.open("rb")
 
 
-def check_replaceable(path: Path, mark: str, noun: str, error: type[BadInput]) -> None:
-    """Check before the work that its result can be written to the file ``path``, and replaces no other kind of file.
+def foreign_link(folder: Path, entry: Path, error: type[BadInput]) -> BadInput:
+    """Return the error for an entry of ``folder`` that is neither one of its files nor one of its folders."""
+    return error(
+        f"'{entry}' is a link to another place, or neither a file nor a folder: put what it leads to in its place, or "
+        "remove it.",
+        reason="foreign_link",
+        file=entry.relative_to(folder).as_posix(),
+    )
+
+
+def refuse_special_files(folder: Path, error: type[BadInput]) -> None:
+    """Raise ``error`` for a pipe or a device in a folder, since reading it in place of a file may never end."""
+    for entry in folder.iterdir():
+        if entry.exists() and not (entry.is_file() or entry.is_dir()):
+            raise foreign_link(folder, entry, error)
+
+
+def check_output_file(path: Path, mark: str, noun: str, error: type[BadInput], *, append: bool = False) -> None:
+    """Check before the work that its result can be written to the file ``path``, and changes no other kind of file.
 
     Args:
-        mark: text that each such file has among its first bytes. An empty file may also be replaced.
+        mark: text that each such file has among its first bytes. An empty file is accepted, too.
         noun: what such a file is, as in "a report of PlushSense".
+        append: whether the result is added to an existing file, which then may also be a pipe or a device.
 
     Raises:
-        error: for a folder, a device, a file without ``mark``, and where nothing may be written.
+        error: for a folder, a file without ``mark``, and where nothing may be written; unless ``append``, for a device.
     """
     if path.is_dir():
         raise error(f"'{path}' is a folder: give a file.")
     try:
-        if path.exists():
+        if path.exists() and (path.is_file() or not append):
             with _open_regular(path) as file:
                 head = file.read(_HEAD_BYTES)
             if head and mark.encode() not in head:
-                raise error(f"'{path}' exists and is not {noun}: give another file, nothing else is replaced.")
+                raise error(f"'{path}' exists and is not {noun}: give another file, no other kind is changed.")
+        if append and path.exists():
+            return
         place = next((p for p in path.absolute().parents if p.exists()), None)
     except OSError as cause:
         raise error(f"'{path}' cannot be used ({cause.strerror}): give another file.") from None

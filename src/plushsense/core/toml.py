@@ -20,11 +20,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from plushsense.core.errors import BadInput, nearest
+from plushsense.core.files import read_bytes
 
 if TYPE_CHECKING:
     from cattrs import Converter
 
 T = TypeVar("T")
+_MOST_BYTES = 64 << 20
 Steps = tuple[str | int, ...]
 """Path from a table to a value in it: keys and indices."""
 
@@ -78,7 +80,7 @@ def _whole_characters(value: Any) -> Any:
 def read_toml(path: Path, kind: str, error: type[BadInput]) -> dict[str, Any]:
     """Read the TOML file at ``path``; ``kind`` names its content in messages. Raise ``error`` if that fails."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return tomllib.loads(read_bytes(path, _MOST_BYTES).decode("utf-8-sig"))
     except FileNotFoundError:
         raise error(f"There is no {kind} file '{path}': check the path.", reason="no_file", name=path.name) from None
     except (OSError, UnicodeDecodeError) as cause:

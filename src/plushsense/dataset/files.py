@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from plushsense.core.errors import DatasetError
-from plushsense.core.files import PART, write_file
+from plushsense.core.files import PART, foreign_link, write_file
 from plushsense.dataset.marks import MARKS
 from plushsense.dataset.store import HEAD, PEOPLE, RECORDINGS, STREAMS
 
@@ -25,32 +25,24 @@ def raw_files(folder: Path) -> list[tuple[str, Path]]:
     """Return every raw file (``.csv`` in any case) of a data set with its kind, streams or recordings.
 
     Raises:
-        DatasetError: for a link that leads elsewhere, and for what is neither a file nor a folder.
+        DatasetError: for a link to a folder or out of the data set, and for a pipe or device.
     """
-    found = []
+    found, inside = [], folder.resolve()
     for kind in (STREAMS, RECORDINGS):
-        # The folder itself may be a link, such as to another disk.
-        inside = (folder / kind).resolve()
         for place, folders, names in os.walk(folder / kind):
-            linked = [path for path in map(Path(place).joinpath, folders) if path.is_symlink()]
-            raw = [Path(place, name) for name in names if name.lower().endswith(".csv")]
-            for path in (*linked, *raw):
-                if not is_own_file(path, inside, folder.resolve()):
-                    raise DatasetError(
-                        f"'{path}' is a link to a folder or out of the data set, or no file: put what "
-                        "it leads to in its place, or remove it.",
-                        reason="foreign_link",
-                        file=path.relative_to(folder).as_posix(),
-                    )
+            here = Path(place)
+            if link := next((path for path in (here, *map(here.joinpath, folders)) if path.is_symlink()), None):
+                raise foreign_link(folder, link, DatasetError)
+            for path in (here / name for name in names if name.lower().endswith(".csv")):
+                if not is_own_file(path, inside):
+                    raise foreign_link(folder, path, DatasetError)
                 found.append((kind, path))
     return sorted(found, key=lambda one: (one[0] != STREAMS, one[1]))
 
 
-def is_own_file(path: Path, *folders: Path) -> bool:
-    """Return whether a path is a regular file, or a link to one that lies in one of the resolved ``folders``."""
-    if not path.is_file():
-        return False
-    return not path.is_symlink() or any(path.resolve().is_relative_to(folder) for folder in folders)
+def is_own_file(path: Path, folder: Path) -> bool:
+    """Return whether a path is a regular file, or a link to one that lies in the resolved ``folder``."""
+    return path.is_file() and (not path.is_symlink() or path.resolve().is_relative_to(folder))
 
 
 def walk_files(folder: Path) -> list[Path]:

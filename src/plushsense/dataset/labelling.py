@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
-from plushsense.core.files import check_replaceable, write_file
+from plushsense.core.files import check_output_file, write_file
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.marks import (
     HANDLING,
@@ -241,7 +241,7 @@ def _seconds(text: str) -> float:
 
 def check_labels_path(path: str | os.PathLike[str]) -> None:
     """Raise DatasetError if labels cannot be written to a file, or would replace another kind of file."""
-    check_replaceable(Path(path), ",".join(COLUMNS), "a file of labels", DatasetError)
+    check_output_file(Path(path), ",".join(COLUMNS), "a file of labels", DatasetError)
 
 
 def write_stretches(path: str | os.PathLike[str], stretches: Sequence[TimedStretch]) -> None:

@@ -29,7 +29,7 @@ from typing import Any, Self, TypeVar
 import tomli_w
 
 from plushsense.core.errors import DatasetError, FileFormatError, ForgottenError
-from plushsense.core.files import write_file
+from plushsense.core.files import refuse_special_files, write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames, ReadResult, read_bytes, read_recording, read_stream
@@ -282,6 +282,7 @@ class DatasetHead:
                 reason="not_a_dataset",
                 folder=folder.name,
             )
+        refuse_special_files(folder, DatasetError)
         table = read_toml(path, "data set", DatasetError)
         version = table.pop("format", None)
         if version != FORMAT_VERSION:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from plushsense.core.errors import BadInput, BundleError, DatasetError, nearest
-from plushsense.core.files import check_replaceable, write_file
+from plushsense.core.files import check_output_file, write_file
 from plushsense.core.recorder_csv import Frames
 from plushsense.core.toml import loads_json
 from plushsense.live.adaptation import DENSE, Examples, Floats, judge, with_one
@@ -146,13 +146,18 @@ def cut_correction(
     )
 
 
+def check_corrections_path(path: str | os.PathLike[str]) -> None:
+    """Raise BadInput if corrections cannot be appended to a file, or it is one of another kind."""
+    check_output_file(Path(path), '{"subject": ', "a file of corrections", BadInput, append=True)
+
+
 def append_corrections(path: str | os.PathLike[str], corrections: Sequence[Correction]) -> None:
     """Append corrections to a file, which is created if it is missing, readable by its owner only.
 
     Raises:
-        BadInput: if the file cannot be written, or has no corrections.
+        BadInput: if the file cannot be written, or is one of another kind.
     """
-    check_replaceable(Path(path), '{"subject": ', "a file of corrections", BadInput)
+    check_corrections_path(path)
     lines = "".join(c.to_line() for c in corrections)
     try:
         with os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600), "r+b") as file:

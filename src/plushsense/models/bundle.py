@@ -22,7 +22,7 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from plushsense.core.errors import BadInput, BundleError
-from plushsense.core.files import check_replaceable, read_bytes, write_file
+from plushsense.core.files import check_output_file, read_bytes, write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.core.toml import check_table
@@ -321,7 +321,7 @@ class Bundle:
 
 def check_bundle_path(path: str | Path) -> Path:
     """Return the path; raise BundleError if a bundle cannot be written there, or would replace another kind of file."""
-    check_replaceable(Path(path), _FILE_BEGIN, "a bundle", BundleError)
+    check_output_file(Path(path), _FILE_BEGIN, "a bundle", BundleError)
     return Path(path)
 
 

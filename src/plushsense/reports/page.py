@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import ConfigError
-from plushsense.core.files import check_replaceable, write_file
+from plushsense.core.files import check_output_file, write_file
 from plushsense.core.templates import fill_html
 
 ENDINGS = (".html", ".htm")
@@ -41,7 +41,7 @@ def check_page_path(path: str | Path) -> Path:
     target = Path(path)
     if target.suffix.lower() not in ENDINGS:
         raise ConfigError(f"'{target}' does not end in .html or .htm, and a report is an HTML page: change the name.")
-    check_replaceable(target, GENERATOR, "a report of PlushSense", ConfigError)
+    check_output_file(target, GENERATOR, "a report of PlushSense", ConfigError)
     return target
 
 

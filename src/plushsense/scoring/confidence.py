@@ -41,9 +41,9 @@ def confidences(logits: ArrayLike, smoothed: ArrayLike, known: ArrayLike, sure: 
 
 @dataclass(frozen=True)
 class RelativeMahalanobis:
-    """How typical features (N, F) are of the classes of a training set, by the relative Mahalanobis distance.
+    """Score of how typical features (N, F) are of the training classes, by the relative Mahalanobis distance.
 
-    The score is the squared Mahalanobis distance from the mean of all training features, less that from the nearest
+    It is the squared Mahalanobis distance from the mean of all training features, less that from the nearest
     class mean, with the covariance within classes; higher is more typical. Ren et al. 2021, *A Simple Fix to
     Mahalanobis Distance for Improving Near-OOD Detection*, arXiv 2106.09022.
 

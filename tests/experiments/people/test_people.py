@@ -107,6 +107,15 @@ def test_evaluations_are_compared_person_by_person(cli: Cli, dataset: Dataset, t
     votes = json.loads((tmp_path / "A" / "evaluation.json").read_text())["subjects"]
     assert shorter["scored"] == "recordings"
     assert [p["M1"]["accuracy"] for p in shorter["people"]] == [s["by_recording_accuracy"] for s in votes]
+    for name, context in (("A", "stream"), ("C", "loop")):
+        table = json.loads((tmp_path / name / "evaluation.json").read_text())
+        (tmp_path / name / "evaluation.json").write_text(json.dumps({**table, "context": context}))
+    table = json.loads((tmp_path / "E" / "evaluation.json").read_text())
+    assert table["context"] == "inside"
+    for order in ("EAC", "ACE", "CEA"):
+        mixed = cli("compare", *(tmp_path / n for n in order))
+        assert mixed.status == 2 and "different context" in mixed.err
+    assert cli("compare", tmp_path / "E", tmp_path / "A", "--json").json["context"] == "stream"
     assert "recordings are compared" in cli("compare", tmp_path / "A", tmp_path / "E").out
 
     alone = cli("compare", tmp_path / "A")

@@ -339,7 +339,8 @@ class TableImport:
                 others.append(label)
                 note = (
                     f"'{label}' and '{others[0]}' become one gesture, '{name.label}', as names of files have no "
-                    '\\ / : * ? " < > | ( ): if they are two, rename one in the source, or give aliases in a --pattern'
+                    '\\ / : * ? " < > | ( ), and no full stop at the end: if they are two, rename one in the source, '
+                    "or give aliases in a --pattern"
                 )
                 yield about_file(source, note)
 

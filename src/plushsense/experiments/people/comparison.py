@@ -24,6 +24,8 @@ from plushsense.workflow.reporting import PREDICTIONS, check_results, load_evalu
 TABLE, PAGE = "comparison.json", "comparison.html"
 # What all evaluations must have in common, as a key of evaluation.json and in words.
 _SHARED = (("data", "data"), ("split", "split"), ("context", "context"), ("labels", "gestures"))
+# The context of an evaluation of which all windows lie in their recordings; it can be compared with any other.
+_INSIDE = "inside"
 
 
 def compare(
@@ -60,7 +62,8 @@ def compare(
     if same:
         of = [{row["subject"]: row for row in table["subjects"]} for table in tables]
     else:
-        of = [votes_by_person(each) for each in _same_recordings(folders, predictions)]
+        _require_same_recordings(folders, predictions)
+        of = [votes_by_person(each) for each in predictions]
     people = sorted(set.intersection(*(set(rows) for rows in of)))
     if len(people) < 2:
         raise BadInput("The evaluations have fewer than two people in common, so nothing can be paired.")
@@ -97,7 +100,7 @@ def compare(
         "scored": "windows" if same else "recordings",
         "split": tables[0]["split"],
         "leaky": tables[0]["leaky"],
-        "context": tables[0]["context"],
+        "context": next((table["context"] for table in tables if table["context"] != _INSIDE), _INSIDE),
         "simulated": any(table["simulated"] for table in tables),
         "dataset": tables[0]["dataset"]["name"],
         "id": identity,
@@ -119,8 +122,8 @@ def _scored_windows(predictions: Predictions) -> tuple[tuple[str, int], ...]:
     return tuple(sorted(zip(predictions.recording.tolist(), predictions.window.tolist(), strict=True)))
 
 
-def _same_recordings(folders: Sequence[Path], predictions: Sequence[Predictions]) -> Sequence[Predictions]:
-    """Return the predictions if all have the same recordings; else raise BadInput."""
+def _require_same_recordings(folders: Sequence[Path], predictions: Sequence[Predictions]) -> None:
+    """Raise BadInput if the evaluations scored different recordings."""
     recordings = [set(each.recording.tolist()) for each in predictions]
     for folder, other in zip(folders, recordings, strict=True):
         if other != recordings[0]:
@@ -128,7 +131,6 @@ def _same_recordings(folders: Sequence[Path], predictions: Sequence[Predictions]
                 f"'{folders[0]}' and '{folder}' scored different recordings ({len(recordings[0])} and {len(other)}): "
                 "only evaluations of the same recordings can be compared."
             )
-    return predictions
 
 
 def _require_same(folders: Sequence[Path], tables: Sequence[dict[str, Any]]) -> None:
@@ -141,10 +143,9 @@ def _require_same(folders: Sequence[Path], tables: Sequence[dict[str, Any]]) -> 
         except (KeyError, TypeError):
             raise BadInput(f"'{folder}' is an evaluation of an older kind: evaluate again.") from None
     for key, noun in _SHARED:
-        # The context is "inside" if all windows lie in their recordings: such scores can be compared with any.
-        first = next((table.get(key) for table in found if table.get(key) != "inside"), "inside")
-        for folder, table in zip(folders[1:], found[1:], strict=True):
-            if table.get(key) not in (first, "inside"):
+        first = next((table.get(key) for table in found if table.get(key) != _INSIDE), _INSIDE)
+        for folder, table in zip(folders, found, strict=True):
+            if table.get(key) not in (first, _INSIDE):
                 raise BadInput(
                     f"'{folders[0]}' and '{folder}' are evaluations of different {noun}: only evaluations of the same "
                     "data, split, context and gestures can be compared."

@@ -20,7 +20,7 @@ import tomli_w
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ConfigError
-from plushsense.core.files import check_replaceable, write_file
+from plushsense.core.files import check_output_file, write_file
 from plushsense.core.gestures import AFFECT, NOBODY, Gesture, GestureSet, merge_names
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
@@ -68,7 +68,7 @@ def propose_merges(
             of merges that is not possible, or ``groups`` that merge nothing.
     """
     if out is not None:
-        check_replaceable(Path(out), "[[gestures]]", "a gesture set", ConfigError)
+        check_output_file(Path(out), "[[gestures]]", "a gesture set", ConfigError)
         if merges is None and groups is None:
             raise ConfigError(
                 "A gesture set is written for a number of merges, or for named ones: give --merges or --groups."

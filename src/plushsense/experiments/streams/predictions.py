@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from plushsense.core.errors import BadInput, FileFormatError, nearest
-from plushsense.core.files import check_replaceable, write_file
+from plushsense.core.files import check_output_file, write_file
 from plushsense.core.gestures import GestureSet
 from plushsense.dataset.store import StreamInfo, read_csv_rows
 from plushsense.experiments.streams.replay import StreamEvents, StreamTruth
@@ -290,7 +290,7 @@ _EVENT_COLUMNS = ("stream", "t", "stop", "label", "named", "affect")
 
 def check_events_path(path: str | os.PathLike[str]) -> None:
     """Raise BadInput if events cannot be written to a file, or would replace another kind of file."""
-    check_replaceable(Path(path), ",".join(_EVENT_COLUMNS), "a file of events", BadInput)
+    check_output_file(Path(path), ",".join(_EVENT_COLUMNS), "a file of events", BadInput)
 
 
 def write_events(path: str | os.PathLike[str], streams: Iterable[StreamEvents], gestures: GestureSet) -> None:
