@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SRC = ROOT / "src" / "plushsense"
 MODULES = sorted(SRC.rglob("*.py"))
 
-LONGEST = 600
+LONGEST = 800
 SHORT = 80
 BANNED = re.compile(r"(^|_)(said|told|heard|shown|wanted|felt)(_|$)")
 NOT_IMPERATIVE = re.compile(r"(What|How|Whether|Who|Whose|Where|Of|One|All|Those|That|The|A|An|Every|Each)\b")
@@ -43,7 +43,7 @@ def definitions() -> list[tuple[Path, Definition]]:
     return [(module, node) for module in MODULES for node in ast.walk(tree(module)) if isinstance(node, kinds)]
 
 
-def test_no_module_is_longer_than_600_lines() -> None:
+def test_no_module_is_longer_than_800_lines() -> None:
     lines = {name(module): len(module.read_text(encoding="utf-8").splitlines()) for module in MODULES}
     assert {module: n for module, n in lines.items() if n > LONGEST} == {}
 
