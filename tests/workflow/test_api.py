@@ -19,6 +19,7 @@ from plushsense.workflow.api import simulate, validation_predictions
 from plushsense.workflow.datasets import trained_on
 from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import count_people
+from support.small_dataset import Cli
 
 
 def test_the_public_api_is_small_and_all_of_its_names_load() -> None:
@@ -185,6 +186,26 @@ def test_notebook_faces(dataset: Dataset, bundle: Path) -> None:
     assert "<table>" in dataset._repr_html_()
     assert "30 recordings" in repr(ps.cut_windows(dataset))
     assert "v14_17d2_19d4" in repr(ps.load(bundle))
+
+
+@pytest.mark.parametrize("scaling", ["z-score", "none"])
+@pytest.mark.parametrize("padding", ["mirror", "causal", "stream"])
+@pytest.mark.parametrize("norm", ["batch", "layer", "none"])
+def test_a_network_of_any_kind_is_written_and_read(
+    norm: str, padding: str, scaling: str, dataset: Dataset, tmp_path: Path, cli: Cli
+) -> None:
+    kind: dict[str, Any] = {"arch": "9", "filters": "4", "norm": norm, "padding": padding, "scaling": scaling}
+    trained = ps.train(dataset, epochs=1, patience=9, **kind)
+    path = trained.save(tmp_path / "m.plush")
+    assert np.array_equal(ps.load(path).weights["dense.weight"], trained.bundle.weights["dense.weight"])
+    assert cli("info", path, "--json").json["provenance"]["scores"]["accuracy"] == trained.scores["accuracy"]
+    stream = next(iter(dataset.path.glob("streams/*/*.csv")))
+    live = cli("live", "--device", f"replay:{stream}?speed=0", "--model", path)
+    assert live.status == 0, live.err
+    assert '"cnn"' in live.out
+    options = [word for key, value in kind.items() for word in (f"--{key}", value)]
+    found = cli("evaluate", dataset.path, "--split", "by-subject:2", "--epochs", 1, "--workers", 1, "--json", *options)
+    assert found.status == 0, found.err
 
 
 def long_recordings(folder: Path, people: int, recordings: int) -> Dataset:

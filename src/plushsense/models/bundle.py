@@ -78,7 +78,7 @@ class _Scores:
     split: str | None = None
     leaky: bool | None = None
     nobody: dict[str, Any] | None = None
-    int8: dict[str, Any] = field(default_factory=dict)
+    int8: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -294,7 +294,11 @@ class Bundle:
         }
 
     def to_bytes(self) -> bytes:
-        """Return the bytes of the file that `save` writes."""
+        """Return the bytes of the file that `save` writes.
+
+        Raises:
+            BundleError: for content that `from_bytes` refuses.
+        """
         content: dict[str, Any] = _plain(
             {
                 "arch": self.arch.to_dict(),
@@ -309,6 +313,8 @@ class Bundle:
                 **self._implied(),
             }
         )
+        _check_numbers(content)
+        _check_tables(content)
         weights = {n: np.ascontiguousarray(w, dtype=np.float32) for n, w in sorted(self.weights.items())}
         head = {
             "format": FORMAT,
