@@ -217,6 +217,15 @@ def real_data() -> Path:
 
 
 @pytest.fixture(scope="session")
+def authors_run(real_data: Path) -> Path:
+    """Files that the authors' own scripts and recorder wrote, beside the real recordings."""
+    folder = real_data.parent / "authors-run"
+    if not folder.is_dir():
+        missing("data", f"no files of the authors' scripts at {folder}")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def imported_study(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """The import of all real recordings of gestures; never to be changed by a test."""
     from plushsense.dataset.importing.importers import import_recordings

@@ -15,7 +15,7 @@ from plushsense.reports import wording
         ("by-subject:5", "5 folds"),
         ("by-recording:4", "people are known"),
         ("windows:3", "at random"),
-        ("holdout", "70 %"),
+        ("windows:holdout", "70 %"),
         ("something-new", "“something-new”"),
     ],
 )

@@ -76,6 +76,45 @@ def test_adam_follows_its_formula(fused: bool | None) -> None:
     assert parameter.grad is None
 
 
+@pytest.mark.parametrize("padding", ["mirror", "stream"])
+@pytest.mark.parametrize("norm", ["batch", "layer", "none"])
+def test_weight_decay_is_that_of_pytorch_on_all_but_biases(norm: str, padding: str) -> None:
+    import torch
+
+    from plushsense.models.net import Net
+    from plushsense.training.engine import Fast, Plain, Windows
+
+    network = arch(norm=norm, padding=padding)
+    torch.manual_seed(3)
+    initial, x, y = Net(network), torch.randn(16, network.channels, network.span), torch.randint(network.classes, (16,))
+    results = []
+    for kind in (Fast, Plain) if norm == "batch" else (Plain,):
+        net = Net(network)
+        net.import_weights(initial.export_weights())
+        engine = Fast(net, 16, 1) if kind is Fast else Plain(net, torch.device("cpu"))
+        adam = Adam(engine.parameters, fused=True, weight_decay=0.5, decayed=engine.decayed)
+        windows = Windows(x.numpy(), network, torch.device("cpu"))
+        for _ in range(3):
+            engine.step(windows, torch.arange(16), y, None, torch.Generator())
+            adam.step(0.01)
+        results.append(engine.export_weights())
+        engine.close()
+    net = Net(network)
+    net.import_weights(initial.export_weights())
+    biases, others = [], []
+    for name, parameter in net.named_parameters():
+        (biases if name.endswith("bias") else others).append(parameter)
+    groups = [{"params": biases, "weight_decay": 0.0}, {"params": others, "weight_decay": 0.5}]
+    theirs = torch.optim.Adam(groups, lr=0.01)
+    for _ in range(3):
+        theirs.zero_grad()
+        torch.nn.functional.cross_entropy(net(x), y).backward()
+        theirs.step()
+    for name, tensor in net.export_weights().items():
+        for mine in results:
+            np.testing.assert_allclose(mine[name], tensor, rtol=2e-4, atol=2e-5, err_msg=name)
+
+
 @pytest.mark.parametrize("norm", ["batch", "layer"])
 def test_training_does_not_import_the_compiler_of_pytorch(
     made: Make, norm: str, monkeypatch: pytest.MonkeyPatch

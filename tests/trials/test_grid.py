@@ -30,6 +30,15 @@ def test_the_papers_grid_is_468_trials_in_156_trainings() -> None:
     assert (spec.learning_rate, spec.halve_every, spec.patience) == (0.001, None, None)
 
 
+def test_the_scripts_grid_trains_as_the_authors_do() -> None:
+    grid = GRIDS["scripts"]
+    assert problems(grid, PLUSH, past=0, windows=3936) == []
+    assert len(trainings(grid, PLUSH, 18)) == 156
+    spec = grid.training
+    assert (spec.learning_rate, spec.halve_every, spec.patience) == (0.001, None, None)
+    assert (spec.scaling, spec.weight_decay, grid.norm, grid.split) == ("none", 1e-4, "layer", "windows:file-order")
+
+
 def test_only_where_validation_stops_are_trials_trained_apart() -> None:
     epochs = (2, 4)
     assert len(trainings(replace(SMALL, epochs=epochs, halve_every=1), PLUSH, 18)) == 1

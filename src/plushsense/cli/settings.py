@@ -23,7 +23,10 @@ def listed(*values: str) -> list[str]:
 
 
 _MOST_SEEDS = 1000
-_GRID_OPTIONS = ("architectures", "filters", "batches", "padding", "norm", "context", "classes", "device", "threads")
+_GRID_OPTIONS = (
+    *("architectures", "filters", "batches", "padding", "norm", "scaling", "weight_decay", "context", "classes"),
+    *("device", "threads"),
+)
 
 
 def grid_changes(args: argparse.Namespace, *more: str) -> dict[str, Any]:
@@ -57,7 +60,7 @@ def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:
         args.config,
         windows=options(args, "context"),
         model=options(args, "arch", "filters", "padding", "norm", "pool_s"),
-        training=options(args, "preset", "epochs", "batch", "seed", "device", "scaling"),
+        training=options(args, "preset", "epochs", "batch", "seed", "device", "scaling", "weight_decay"),
         evaluation={"classes": args.classes, "seed": args.seed, **evaluation},
     )
 

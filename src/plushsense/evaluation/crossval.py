@@ -53,11 +53,11 @@ def fold_windows(train: WindowSet, score: WindowSet, split: Split, seed: int = 0
                 f"The split {split.text} divides windows, so it scores the very windows it drew from: "
                 "cut both with the same context, or use by-recording:5."
             )
-        return make_folds(split, score.subject, score.y, seed)
+        return make_folds(split, score.subject, score.y, seed, _ids(score))
     recordings = _Recordings.of(train, score)
     of_train, of_score = recordings.place(train), recordings.place(score)
     divided = []
-    for fold in make_folds(split, recordings.subject, recordings.y, seed, recordings.file_names):
+    for fold in make_folds(split, recordings.subject, recordings.y, seed, recordings.ids):
         keep = purge(train.stream, train.window_rows, *recordings.rows(fold.test))
         windows = Fold(
             fold.name,
@@ -98,11 +98,6 @@ class _Recordings:
         unique, first = np.unique(ids[order], return_index=True)
         pick = order[first]
         return cls(unique, subject[pick], y[pick], stream[pick], rows[pick])
-
-    @property
-    def file_names(self) -> NDArray[np.str_]:
-        """Names of the files (R,), without their folders."""
-        return np.array([identity.rpartition("/")[2] for identity in self.ids.tolist()], dtype=np.str_)
 
     def place(self, windows: WindowSet) -> Index:
         """Return the index of each window's recording, (N,)."""
@@ -223,8 +218,8 @@ def evaluate(
 
     Args:
         train_windows, score_windows: the same recordings, possibly cut with another context; one set for both is fine.
-        split: "leave-one-subject-out", "by-subject:5", "by-recording:5", "recordings:holdout",
-            "recordings:random", "windows:5", "windows:holdout".
+        split: "leave-one-subject-out", "by-subject:5", "by-recording:5", "windows:5",
+            "recordings:holdout", "recordings:random", "windows:holdout", "windows:file-order".
         journal: where finished folds are stored, and looked up first.
         key: with a journal, everything that ``fit_predict`` depends on besides windows and folds (network, schedule,
             its seed).

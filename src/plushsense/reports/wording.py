@@ -32,10 +32,8 @@ def describe_split(split: str, folds: int | None = None, decides: bool | None = 
     ``decides`` tells whether validation ends the training (early stopping); None: unknown.
     """
     kind, _, given_folds = split.partition(":")
-    if split == "windows:holdout":
-        kind = "holdout"
-    if kind == "recordings":
-        kind = f"recordings-{given_folds}"
+    if f"{kind}-{given_folds}" in _TEXTS["splits"]:
+        kind = f"{kind}-{given_folds}"
     if kind not in _TEXTS["splits"]:
         return f"Split “{split}”.", "Who validates is not recorded."
     sentences = _TEXTS["splits"][kind]

@@ -7,6 +7,7 @@ training apart. Units of nobody (subject "none": the toy at rest) are spread ove
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -16,14 +17,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from plushsense.core.errors import ArrayError, BadInput, ConfigError, nearest
 from plushsense.core.gestures import NOBODY
+from plushsense.core.recorder_csv import parse_name
 
 Index = NDArray[np.int64]
 
 UNKNOWN = "unknown"
 VALIDATION_SHARE = 0.15
 # The paper trains on 70 %, validates on 15 % and tests on 15 % of the windows (section 3.6.1). The authors' script
-# takes these shares of each gesture in the order of the files, so that whole recordings stay together.
+# takes these shares of each gesture in the order of the files, which is random, as it has renamed them.
 HOLDOUT_SHARE = 0.15
+_FIRST_SHARES = (0.7, 0.85)
+# Their names are numbers of seven digits; the recorder's are milliseconds since 1970.
+_MOST_RANDOM_NUMBER = 10**8
 
 
 @dataclass(frozen=True)
@@ -44,20 +49,19 @@ class Fold:
 class Split:
     """A method of splitting: ``by-subject:5`` has the kind "by-subject" and ``k`` = 5 folds.
 
-    The kind "windows" without ``k`` is the hold-out split that the paper describes (``windows:holdout``), and the kind
-    "recordings" that of the authors' script: in the order of the files (``recordings:holdout``) or, if ``shuffled``, in
-    a random order (``recordings:random``).
+    A split without ``k`` has one fold: 70 % of each gesture for training, 15 % for validation and 15 % for test. Its
+    ``order`` is random or that of the files.
     """
 
     kind: str
     k: int | None = None
-    shuffled: bool = False
+    order: str = ""
 
     @property
     def text(self) -> str:
         """Name of the split, as on the command line."""
-        if self.kind in _HOLDOUTS and self.k is None:
-            return f"{self.kind}:{'random' if self.shuffled else 'holdout'}"
+        if self in _HOLDOUTS.values():
+            return next(name for name, split in _HOLDOUTS.items() if split == self)
         return self.kind if self.k is None else f"{self.kind}:{self.k}"
 
     @property
@@ -76,15 +80,19 @@ class Split:
         return self.kind in ("leave-one-subject-out", "by-subject")
 
 
-_HOLDOUTS = ("windows", "recordings")
+_FILES, _RANDOM = "files", "random"
+_HOLDOUTS = {
+    "recordings:holdout": Split("recordings", order=_FILES),
+    "recordings:random": Split("recordings", order=_RANDOM),
+    "windows:holdout": Split("windows", order=_RANDOM),
+    "windows:file-order": Split("windows", order=_FILES),
+}
 EXAMPLES = (
     "leave-one-subject-out",
     "by-subject:5",
     "by-recording:5",
-    "recordings:holdout",
-    "recordings:random",
     "windows:5",
-    "windows:holdout",
+    *_HOLDOUTS,
 )
 
 
@@ -97,10 +105,8 @@ def parse_split(text: str) -> Split:
     kind, colon, number = text.strip().partition(":")
     if kind == "leave-one-subject-out" and not colon:
         return Split(kind)
-    if kind in _HOLDOUTS and number == "holdout":
-        return Split(kind)
-    if kind == "recordings" and number == "random":
-        return Split(kind, shuffled=True)
+    if text.strip() in _HOLDOUTS:
+        return _HOLDOUTS[text.strip()]
     if kind in ("by-subject", "by-recording", "windows"):
         if number.isascii() and number.isdigit() and 2 <= int(number) <= 1000:
             return Split(kind, int(number))
@@ -112,12 +118,13 @@ def parse_split(text: str) -> Split:
 
 
 def make_folds(
-    split: Split, subject: NDArray[np.str_], label: Index, seed: int = 0, names: NDArray[np.str_] | None = None
+    split: Split, subject: NDArray[np.str_], label: Index, seed: int = 0, names: NDArray[Any] | None = None
 ) -> list[Fold]:
     """Return the folds of ``split`` for units with these people and classes, both (n,). Deterministic for a ``seed``.
 
     Args:
-        names: file names (n,) of recordings, by which ``recordings:holdout`` sorts; by default the units' order.
+        names: the recording of each unit (n,), for splits in the order of the files (see `file_order`); by default the
+            order of the units.
 
     Raises:
         BadInput: if there are too few people or units for the split, or, when splitting by people, unknown ones.
@@ -132,12 +139,16 @@ def make_folds(
         return by_subject(subject, split.k or 5, seed)
     if split.kind == "by-recording":
         return by_recording(subject, label, split.k or 5, seed)
+    if split.k is not None:
+        return windows(subject, label, split.k, seed)
+    _enough(len(label), 3, split.text, f"{split.unit}s")
+    if split.order == _FILES:
+        ranks, name = (np.arange(len(label)), "holdout") if names is None else file_order(names, seed)
+        return [_first_shares(subject, label, ranks, name)]
     if split.kind == "recordings":
-        order = np.random.default_rng([seed, 7]).permutation(len(label)) if split.shuffled else None
-        return recordings(subject, label, names if order is None else order)
-    if split.k is None:
-        return holdout(subject, label, seed)
-    return windows(subject, label, split.k, seed)
+        order = np.random.default_rng([seed, 7]).permutation(len(label))
+        return [_first_shares(subject, label, order, "holdout")]
+    return [_random_holdout(subject, label, seed)]
 
 
 class Splitter:
@@ -148,7 +159,7 @@ class Splitter:
 
     The people whom `evaluate` holds out for validation are among those to train on. Windows that overlap a test
     recording in its stream, which `evaluate` leaves out, are not known here: with splits by recording, use windows of
-    the context ``loop``. ``recordings:holdout`` takes the recordings in the order of ``recordings``.
+    the context ``loop``. ``recordings:holdout`` and ``windows:file-order`` take ``recordings`` for the names of files.
 
     Args:
         split: the name of a split (see `parse_split`).
@@ -193,7 +204,8 @@ class Splitter:
             units = np.arange(n)
         first = np.unique(units, return_index=True)[1]
         label = np.zeros(n, dtype=np.int64) if y is None else np.unique(y, return_inverse=True)[1]
-        for fold in make_folds(self.kind, subject[first], label[first], self.seed):
+        names = None if self.recordings is None else np.asarray(self.recordings)[first]
+        for fold in make_folds(self.kind, subject[first], label[first], self.seed, names):
             tested = np.isin(units, fold.test)
             yield np.flatnonzero(~tested), np.flatnonzero(tested)
 
@@ -230,35 +242,47 @@ def windows(subject: NDArray[np.str_], label: Index, k: int, seed: int = 0) -> l
     return _stratified(subject, label, k, seed, strata=np.full(len(label), ""))
 
 
-def holdout(subject: NDArray[np.str_], label: Index, seed: int = 0) -> list[Fold]:
+def _random_holdout(subject: NDArray[np.str_], label: Index, seed: int = 0) -> Fold:
     """Return the paper's split: 70 % of the windows for training, 15 % validation, 15 % test, by class. Leaky."""
     everything = np.arange(len(label), dtype=np.int64)
-    _enough(len(label), 3, "windows:holdout", "windows")
     rng = np.random.default_rng([seed, 3])
     test = _stratified_share(everything, label, HOLDOUT_SHARE, rng)
     rest = np.setdiff1d(everything, test)
     validation = _stratified_share(rest, label, VALIDATION_SHARE / (1.0 - HOLDOUT_SHARE), rng)
-    return [Fold("holdout", _named(subject[test]), np.setdiff1d(rest, validation), validation, test)]
+    return Fold("holdout", _named(subject[test]), np.setdiff1d(rest, validation), validation, test)
 
 
-def recordings(subject: NDArray[np.str_], label: Index, order: NDArray[Any] | None = None) -> list[Fold]:
-    """Return the split of the authors' script, by recording: of each class the first 70 % of the recordings are for
-    training, the next 15 % for validation and the last 15 % for test. A person can be on both sides.
+def file_order(names: NDArray[Any], seed: int = 0) -> tuple[Index, str]:
+    """Return the ranks (n,) of recordings in the order of the authors' script, and the name of the fold.
+
+    The script takes the files by name, after it has replaced the time in each name by a random number. Recordings with
+    such names are taken by name; others, whose names sort person by person, in a random order of the ``seed``.
 
     Args:
-        order: sort keys (n,), such as file names; by default the units stay in their order.
+        names: file names of the recordings (n,), with or without folder, or numbers that stand for them; the windows
+            of a recording have the same.
     """
-    _enough(len(label), 3, "recordings:holdout", "recordings")
-    ranks = np.arange(len(label)) if order is None else np.argsort(np.argsort(order, kind="stable"))
+    unique, place = np.unique(names, return_inverse=True)
+    files = [str(name).rpartition("/")[2].removesuffix(".csv") + ".csv" for name in unique.tolist()]
+    parsed = [name for name in map(parse_name, files) if name is not None]
+    if 2 * sum(name.epoch_ms < _MOST_RANDOM_NUMBER for name in parsed) > len(files):
+        order, how = np.argsort(np.array(files), kind="stable"), "holdout, files by name"
+    else:
+        order, how = np.random.default_rng([seed, 7]).permutation(len(files)), "holdout, files shuffled"
+    return np.argsort(order)[place].astype(np.int64), how
+
+
+def _first_shares(subject: NDArray[np.str_], label: Index, ranks: Index, name: str) -> Fold:
+    """Train on the first 70 % of each class, validate on the next 15 % and test on the rest, rounded half up."""
     parts: list[list[Index]] = [[], [], []]
     for one in np.unique(label):
         units = np.flatnonzero(label == one)
-        units = units[np.argsort(ranks[units])]
-        held = max(1, round(HOLDOUT_SHARE * len(units))) if len(units) > 2 else 0
-        for part, of in zip(parts, np.split(units, [len(units) - 2 * held, len(units) - held]), strict=True):
+        units = units[np.argsort(ranks[units], kind="stable")]
+        ends = [math.floor(share * len(units) + 0.5) for share in _FIRST_SHARES]
+        for part, of in zip(parts, np.split(units, ends), strict=True):
             part.append(of)
     train, validation, test = (np.sort(np.concatenate(part)) for part in parts)
-    return [Fold("holdout", _named(subject[test]), train, validation, test)]
+    return Fold(name, _named(subject[test]), train, validation, test)
 
 
 def purge(

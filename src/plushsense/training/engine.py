@@ -170,6 +170,11 @@ class Plain:
         """The tensors that the optimizer updates."""
         return list(self._net.parameters())
 
+    @property
+    def decayed(self) -> Sequence[Tensor]:
+        """The parameters that weight decay makes smaller: all but biases."""
+        return [p for name, p in self._net.named_parameters() if not name.endswith("bias")]
+
     def step(
         self, x: Windows, batch: Tensor, y: Tensor, augment: Transform | None, random: torch.Generator
     ) -> tuple[Tensor, Tensor]:
@@ -228,6 +233,11 @@ class Fast:
     @property
     def parameters(self) -> Sequence[Tensor]:
         return [*([] if self._vectors is None else self._vectors.parameters()), *self._net.parameters]
+
+    @property
+    def decayed(self) -> Sequence[Tensor]:
+        biases = {id(p) for p in self._net.biases}
+        return [p for p in self.parameters if id(p) not in biases]
 
     def step(
         self, x: Windows, batch: Tensor, y: Tensor, augment: Transform | None, random: torch.Generator
@@ -296,11 +306,20 @@ class Adam:
     """Update parameters by Adam (Kingma & Ba 2015) with PyTorch's own step, as `torch.optim.Adam` does.
 
     That class first imports PyTorch's compiler, which takes more than a second and 100 MB. ``means`` and ``squares``
-    are the moments of each parameter; both are empty before the first step.
+    are the moments of each parameter; both are empty before the first step. ``decayed`` are those whose gradients get
+    ``weight_decay`` times the parameter.
     """
 
-    def __init__(self, parameters: Iterable[Tensor], *, fused: bool | None = None) -> None:
+    def __init__(
+        self,
+        parameters: Iterable[Tensor],
+        *,
+        fused: bool | None = None,
+        weight_decay: float = 0.0,
+        decayed: Sequence[Tensor] = (),
+    ) -> None:
         self._parameters, self._fused = list(parameters), fused
+        self._weight_decay, self._decayed = weight_decay, list(decayed) if weight_decay else []
         self.means: list[Tensor] = []
         self.squares: list[Tensor] = []
         self._counts: list[Tensor] = []
@@ -326,6 +345,8 @@ class Adam:
         """Update all parameters by their gradients."""
         if not self._counts:
             self.restore(0, map(torch.zeros_like, self._parameters), map(torch.zeros_like, self._parameters))
+        for p in self._decayed:
+            cast("Tensor", p.grad).add_(p, alpha=self._weight_decay)
         adam(
             self._parameters,
             cast("list[Tensor]", [p.grad for p in self._parameters]),

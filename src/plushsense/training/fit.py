@@ -123,7 +123,7 @@ def fit(
         net = engine(arch, initial, device, min(spec.batch, most), spec.threads)
         order = torch.Generator().manual_seed(spec.seed)
         augment = augmentations(spec.augment, Channels(train.vectors, scaler, device, arch.vector is not None))
-        adam = Adam(net.parameters, fused=True)
+        adam = Adam(net.parameters, fused=True, weight_decay=spec.weight_decay, decayed=net.decayed)
         if start is not None:
             adam.restore(
                 start.steps, *([torch.from_numpy(m.copy()) for m in ms] for ms in (start.means, start.squares))

@@ -44,6 +44,8 @@ class TrainSpec:
             down is not exactly known) and ``random-speed:0.2`` (faster or slower movement) (default: by the preset).
         scaling: ``z-score`` scales each channel by its mean and standard deviation over the training windows; ``none``
             lets the network read the integers, as in the authors' script (one of `SCALINGS`).
+        weight_decay: factor of the L2 regularisation of all parameters but biases, added to the gradient as in MATLAB's
+            ``trainnet``, whose default is 0.0001 (0 to 1).
         seed: number that all random choices of the training are drawn from (from 0).
         device: what computes; ``auto``: a graphics card with CUDA if there is one (one of `DEVICES`).
         threads: threads of the processor for one training (from 1).
@@ -57,6 +59,7 @@ class TrainSpec:
     stop_on: str = "loss"
     augment: tuple[str, ...] = ()
     scaling: str = "z-score"
+    weight_decay: float = 0.0
     seed: int = 0
     device: str = "auto"
     threads: int = 1
@@ -72,6 +75,8 @@ class TrainSpec:
                 _at_least(name, getattr(self, name), 1)
         if not 0.0 < self.learning_rate <= 1.0:
             raise ConfigError(f"learning_rate is {self.learning_rate}: accepted is above 0, up to 1.")
+        if not 0.0 <= self.weight_decay <= 1.0:
+            raise ConfigError(f"weight_decay is {self.weight_decay}: accepted is 0 to 1.")
         for augmentation in self.augment:
             parse_augmentation(augmentation)
         check_known(self.device, DEVICES, "device to train on", ConfigError)
@@ -97,7 +102,7 @@ class TrainSpec:
         return replace(self, **changes)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values, ready for JSON, without ``scaling`` if it is the default.
+        """Return plain values, ready for JSON, without ``scaling`` and ``weight_decay`` where they are the default.
 
         ``augment`` with at most a random rotation is written as ``turn_deg``, as in earlier versions, so that the ids
         of their trainings and evaluations stay the same.
@@ -105,7 +110,7 @@ class TrainSpec:
         parsed = [parse_augmentation(text) for text in self.augment]
         values: dict[str, Any] = {}
         for key, value in asdict(self).items():
-            if key == "scaling" and value == "z-score":
+            if key in ("scaling", "weight_decay") and value == getattr(TrainSpec, key):
                 continue
             if key != "augment":
                 values[key] = value

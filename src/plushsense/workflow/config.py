@@ -97,7 +97,7 @@ class EvaluationSpec:
     Attributes:
         split: which recordings are scored and which are learned from: ``leave-one-subject-out``, ``by-subject:5`` (by
             people), ``by-recording:5``, ``recordings:holdout``, ``recordings:random``; leaky, as in the paper:
-            ``windows:5``, ``windows:holdout``. The numbers are those of the folds.
+            ``windows:5``, ``windows:holdout``, ``windows:file-order``. The numbers are those of the folds.
         classes: ``shared`` (gestures that at least 90 % of the people made, without free choice), ``all``, a list of
             labels, or merged gestures: ``family``, ``affect``, the name of a built-in merge or the path of a gesture
             set file.
@@ -291,7 +291,7 @@ _SETTINGS: dict[str, tuple[str, ...]] = {
     "model": ("arch", "filters", "padding", "norm", "pool_s"),
     "training": (
         *("preset", "epochs", "batch", "learning_rate", "halve_every", "patience", "device"),
-        *("augment", "turn_deg", "scaling"),
+        *("augment", "turn_deg", "scaling", "weight_decay"),
     ),
     "evaluation": ("classes", "train_context", "workers"),
     "live": ("smoothing_s",),

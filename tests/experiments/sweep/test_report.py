@@ -146,11 +146,11 @@ def test_table4_has_maxima_means_and_the_papers_row(tmp_path):
     assert (first["accuracy"], first["mean_accuracy"], first["trials"]) == (0.8, pytest.approx(0.6), 3)
     assert first["acr"] == pytest.approx(0.8 / math.log10(13262)) and first["macro_f1"] == pytest.approx(0.7)
     assert (first["paper_accuracy"], first["paper_mean"], first["paper_acr"]) == (0.75, 0.657, 0.182)
-    assert (first["paper_parameters"], first["paper_split"]) == ("13.2k", "recordings:holdout")
+    assert (first["paper_parameters"], first["paper_split"]) == ("13.2k", "windows:file-order")
     assert [r["paper_accuracy"] for r in table.rows[1:]] == [None] * 3
     papers = [i for i, c in enumerate(table.columns) if c.key.startswith("paper_")]
     assert [[row[i] for i in papers] for row in table.cells()[1:]] == [["—"] * 5] * 3, "not printed there: a dash"
-    assert "recordings:holdout" in " ".join(table.notes) and "75.0 %" in " ".join(table.notes)
+    assert "windows:file-order" in " ".join(table.notes) and "75.0 %" in " ".join(table.notes)
     assert [r["above"] for r in table.rows] == ["yes", "no", "no", "no"], "0.70 is not above 70 %"
     assert [r["above"] for r in sweep_tables.table4(sweep, threshold=0.2).rows] == ["yes"] * 4
     assert len(sweep_tables.table4(sweep, top=1).rows) == 2
@@ -170,7 +170,7 @@ def test_table4_has_every_network_that_the_paper_printed(whole):
     assert len(best) == 12 and all(r["rank"] <= 3 or r["paper_accuracy"] for r in table.rows)
     figure = sweep_figures.size_and_accuracy(sweep)
     assert sum(len(line.get_xdata()) for line in figure.axes[0].lines) == 12
-    with_split = sweep_tables.table4(replace(sweep, head={**sweep.head, "split": "recordings:holdout"}))
+    with_split = sweep_tables.table4(replace(sweep, head={**sweep.head, "split": "windows:file-order"}))
     assert "This sweep has that split." in " ".join(with_split.notes)
     assert "This sweep has that split." not in " ".join(table.notes)
 

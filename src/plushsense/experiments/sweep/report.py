@@ -19,6 +19,8 @@ from plushsense.reports.figures import png, svg, svg_uri
 from plushsense.reports.page import check_page_path, earlier_files, render_page, write_files, write_page
 from plushsense.reports.table import DASH, Row, Table, count, number, text
 from plushsense.scoring.metrics import grouped
+from plushsense.training.spec import PRESETS
+from plushsense.trials.grid import GRID_TRAINING
 from plushsense.trials.tables import SUMMARY
 
 if TYPE_CHECKING:
@@ -364,10 +366,11 @@ def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
         ("Hash (SHA-256)", text(head.get("dataset_hash"))),
         ("Split", f"{how} (“{head.get('split')}”{', leaky' if sweep.leaky else ''})"),
         ("Who validates", who),
-        *([("Beside the paper", tables.PAPERS_SPLIT)] if str(head.get("split")).endswith(":holdout") else []),
+        *([("Beside the paper", tables.PAPERS_SPLIT)] if str(head.get("split")) in tables.HOLDOUTS else []),
         ("Windows scored", count(scored) if scored else DASH),
         ("Context", wording.CONTEXT_WORDS.get(str(head.get("context")), text(head.get("context")))),
         ("Training preset", text(head.get("preset"))),
+        *_settings(sweep),
         ("Padding", ", ".join(sorted({str(t.get("padding")) for t in sweep.trials})) or DASH),
         ("Grid", f"{grid} (the paper's has {tables.PAPER_TRIALS} trials)"),
         ("Seeds and folds", wording.describe_runs(sweep.trials)),
@@ -379,6 +382,27 @@ def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
         ("Time", f"{number(seconds, 0)} s" if number(seconds) != DASH else DASH),
         ("Machine", text(head.get("machine"))),
         ("Code version", text(head.get("code_version"))),
+    ]
+
+
+def _settings(sweep: SweepResults) -> list[tuple[str, str]]:
+    """Return the settings of the networks and their training, with those of the preset filled in."""
+    grid = sweep.head.get("grid") or {}
+    preset = PRESETS.get(str(sweep.head.get("preset")))
+    if preset is None:
+        return []
+    given = {key: grid[key] for key in GRID_TRAINING if grid.get(key) is not None}
+    spec = preset.changed(**given)
+    falls = f", halved every {spec.halve_every} epochs" if spec.halve_every else ", constant"
+    kept = (
+        "the last weights are kept (MATLAB's trainnet, with its own defaults, may return those of the best validation)"
+        if spec.patience is None
+        else f"the best weights are kept, and training stops after {spec.patience} epochs without a better result"
+    )
+    return [
+        ("Optimiser", f"Adam, learning rate {spec.learning_rate:g}{falls}; weight decay {spec.weight_decay:g}; {kept}"),
+        ("Scaling of the inputs", spec.scaling),
+        ("Normalisation", text(grid.get("norm"))),
     ]
 
 

@@ -79,6 +79,7 @@ class FastNet:
         self._edges: list[tuple[int, int]] = []
         self.parameters = [t for one in self._layers for t in (one.w, one.bias, one.gain, one.shift)]
         self.parameters += [self._dense, self._dense_bias]
+        self.biases = [*(one.bias for one in self._layers), self._dense_bias]
 
     def _layer(self, net: Net, i: int) -> _Layer:
         named, planned = net.export_weights(), self.plan.layers[i]
