@@ -234,7 +234,7 @@ class _Scorer:
 
     def by_context(self, mask: Mask) -> dict[str, Any]:
         table = {}
-        for kind in ("stream", "inside", "loop"):
+        for kind in ("stream", "inside", "loop", "rows"):
             selected = mask & (self._all.context == kind)
             if selected.any():
                 table[kind] = self.size(selected) | _plain({"accuracy": self.figures(selected)["accuracy"]})

@@ -143,7 +143,7 @@ VECTOR_AUGMENT = ("random-gain:0.3", "random-tilt:8")
 PADDING: dict[str, str] = {"search": "stream", "loso": "stream", "people": "stream", "paper": "mirror"}
 
 # Default context of the windows to train on and to score for each preset.
-CONTEXT: dict[str, str] = {"search": "loop", "loso": "stream", "people": "stream", "paper": "loop"}
+CONTEXT: dict[str, str] = {"search": "loop", "loso": "stream", "people": "stream", "paper": "rows"}
 
 
 def preset(name: str, **changes: Any) -> TrainSpec:

@@ -143,6 +143,19 @@ def resample(frames: Frames, layout: Layout) -> list[Segment]:
     return segments
 
 
+def whole_recording(frames: Frames, layout: Layout) -> list[Segment]:
+    """Return the rows of a recording as one segment of samples, whatever their times say.
+
+    Values outside their valid range are replaced as in `resample`. The authors' scripts cut windows of such samples.
+    """
+    values, first, invalid = hold_valid(frames.values, layout)
+    rows = np.arange(first, len(values), dtype=np.int64)
+    if not len(rows):
+        return []
+    start_us = int(frames.device_ms[first]) * 1000
+    return [Segment(values[first:], start_us, layout.period_us, first, len(values), rows, invalid)]
+
+
 def hold_valid(values: NDArray[np.int64], layout: Layout) -> tuple[NDArray[np.int64], int, int]:
     """Apply rule 2 to the rows of a segment; return (values, first row not skipped, number of invalid values)."""
     good = (values >= layout.valid_min_int) & (values <= layout.valid_max_int)

@@ -6,8 +6,10 @@ one gives a single window, whose remaining samples depend on the ``context``:
 - ``stream``: they are the samples before the recording in the session's stream. If there is no stream, or it has too
   few samples, the recording is looped, and the window is marked as such.
 - ``loop``: the recording is repeated from its start, as in the paper (never zero-padded).
+- ``rows``: as with ``loop``, but the rows of the recording are taken as even samples, whatever their times, as the
+  authors' scripts do. No recording is left out for its length.
 
-A third context, ``anywhere``, is for training continuous recognition (``windows/anywhere``).
+The context ``anywhere`` is for training continuous recognition (``windows/anywhere``).
 
 A recording that is many times longer than usual for its gesture was not stopped in time; it is left out and listed.
 """
@@ -26,11 +28,12 @@ from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, usual_rows
 from plushsense.dataset.store import RECORDINGS, UNKNOWN_SUBJECT, Dataset, Progress, RecordingInfo
-from plushsense.windows.clock import Segment
+from plushsense.windows.clock import Segment, whole_recording
 from plushsense.windows.features import network_inputs
 from plushsense.windows.sessions import SessionReader
 
-CONTEXTS = ("stream", "loop")
+ROWS = "rows"
+CONTEXTS = ("stream", "loop", ROWS)
 ANYWHERE = "anywhere"
 TRAIN_CONTEXTS = (*CONTEXTS, ANYWHERE)
 
@@ -43,8 +46,9 @@ class WindowSpec:
         window_s: length of the windows (above 0 to 60).
         step_s: time from the start of a window to that of the next one in the same recording (above 0 to 60).
         context: where the samples come from that a recording shorter than a window lacks. ``stream``: from the
-            session before the recording; ``loop``: the recording is repeated; ``anywhere``: for live use, windows are
-            cut all along the sessions, also while nothing happens (one of `TRAIN_CONTEXTS`; default: by the preset).
+            session before the recording; ``loop``: the recording is repeated; ``rows``: the same, and its rows are
+            taken as even samples whatever their times, as by the authors' scripts; ``anywhere``: for live use, windows
+            are cut all along the sessions, also while nothing happens (one of `TRAIN_CONTEXTS`; default: by the preset).
         span_s: Not in a file: it follows from the network. It lengthens windows for networks that need more samples.
         longest_factor: recordings longer than this many times the median of their gesture are left out; 0: none is
             (0 or from 1).
@@ -84,8 +88,8 @@ class WindowSet:
 
     ``x`` (N, F, T): unscaled inputs of the network; ``y`` (N,): class index; ``recording`` (N,): index into
     ``recording_ids``; ``subject`` (N,): code of the person, "none" if nobody; ``context`` (N,): "inside" (wholly in its
-    recording), "stream" (begins before it in the stream), "loop" or "anywhere"; ``stream`` (N,): id of the stream of
-    the recording, or ""; ``window_rows`` and ``recording_rows`` (N, 2): rows of that stream which the window and its
+    recording), "stream" (begins before it in the stream), "loop", "rows" or "anywhere"; ``stream`` (N,): id of the stream
+    of the recording, or ""; ``window_rows`` and ``recording_rows`` (N, 2): rows of that stream which the window and its
     recording cover, −1 if unknown (always for looped windows). ``vectors``: triples of inputs that are the axes of one
     vector; ``left_out``: recordings that gave no window, and gestures of free choice, with the reason.
     ``self_calibration``: "causal" if sensors calibrate themselves (`plushsense.windows.sessions`), else "".
@@ -225,6 +229,11 @@ def cut_windows(
             "Windows anywhere in a stream are cut by plushsense.windows.anywhere.cut_anywhere: call that."
         )
     layout = dataset.layout
+    if spec.context == ROWS and layout.self_calibration:
+        raise ConfigError(
+            f"The layout '{layout.name}' calibrates its sensors in the course of a session, which the context '{ROWS}' "
+            "does not know: use the context loop or stream."
+        )
     window, step = layout.samples(spec.window_s), layout.samples(spec.step_s)
     reach = max(window, layout.samples(spec.span_s) if spec.span_s else 0)
     recordings, too_long = drop_long_recordings([r for r in dataset.used if r.gesture in gestures.labels], spec)
@@ -241,7 +250,10 @@ def cut_windows(
             first = recording.stream_row + recording.start
             last = first + recording.stop - recording.start
             own = _from_stream(segments, first, last, window, reach, step)
-        if not own:
+        if spec.context == ROWS:
+            own = from_recording(whole_recording(dataset.read(recording), layout), dataset, reach, step)
+            own = [replace(cut, context=ROWS) for cut in own]
+        elif not own:
             own = from_recording(sessions.recording(recording), dataset, reach, step)
         if not own:
             left_out.append(Sentence(f"{recording.id}: no valid sample", "no_valid_sample", recording=recording.id))
@@ -265,7 +277,12 @@ def drop_long_recordings(
     in_time, left_out = list[RecordingInfo](), list[Sentence]()
     for r in recordings:
         own_file = r.file.startswith(f"{RECORDINGS}/")
-        if spec.longest_factor and own_file and r.stop - r.start > spec.longest_factor * usual[r.gesture]:
+        if (
+            spec.longest_factor
+            and spec.context != ROWS
+            and own_file
+            and r.stop - r.start > spec.longest_factor * usual[r.gesture]
+        ):
             sentence = f"{r.id}: {r.stop - r.start} rows where {r.gesture} usually has {usual[r.gesture]:.0f}"
             left_out.append(Sentence(sentence, "not_stopped", recording=r.id, gesture=[r.gesture]))
         else:

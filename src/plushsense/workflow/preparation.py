@@ -22,7 +22,7 @@ from plushsense.models.arch import Arch, parse_symbol, symbol_within
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere, idle_candidates
-from plushsense.windows.cut import ANYWHERE, WindowSet, WindowSpec, cut_windows, shared_gestures
+from plushsense.windows.cut import ANYWHERE, ROWS, WindowSet, WindowSpec, cut_windows, shared_gestures
 from plushsense.workflow.config import ALL, SHARED, RunConfig
 
 Warn = Callable[[str], None]
@@ -233,7 +233,7 @@ def warn_of_long_windows(
         advice.append("a shorter --pool-s")
     if window_s > usual_s:
         advice.append(f"window_s = {max(0.5, round(usual_s, 1)):g} in [windows] of a --config file, or in a grid")
-    looped = spec.context == "loop"
+    looped = spec.context in ("loop", ROWS)
     effect = "repeat their gesture" if looped else "begin before their gesture"
     sentence = (
         f"a decision reads {reads_s:.1f} s (kernels {field_s:.1f} s, window {window_s:g} s), but half of the "

@@ -35,7 +35,7 @@ from plushsense.studio.pages.train.results_section import ResultsSection
 from plushsense.studio.pages.train.verdict import FEW_PEOPLE
 from plushsense.studio.widgets.elements import scroll_to
 from plushsense.training.spec import DEVICES, PRESETS
-from plushsense.windows.cut import ANYWHERE, TRAIN_CONTEXTS
+from plushsense.windows.cut import ANYWHERE, CONTEXTS, TRAIN_CONTEXTS
 
 # Budget of *Make a network*, if nothing else is given.
 _MINUTES = 10
@@ -60,7 +60,7 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "padding": PADDINGS,
     "norm": NORMS,
     "device": DEVICES,
-    "context": ("stream", "loop"),
+    "context": CONTEXTS,
     "train_context": TRAIN_CONTEXTS,
 }
 _NUMBERS = (
