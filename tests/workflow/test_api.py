@@ -102,10 +102,10 @@ def test_same_seed_same_weights(dataset: Dataset) -> None:
     assert any(not np.array_equal(one[k], other[k]) for k in one)
 
 
-def test_the_papers_preset_is_mirrored_loops(dataset: Dataset) -> None:
+def test_the_papers_preset_is_mirrored_rows(dataset: Dataset) -> None:
     bundle = ps.train(dataset, preset="paper", epochs=1, filters=(4, 4, 4)).bundle
     assert bundle.arch.padding == "mirror"
-    assert bundle.windowing["context"] == "loop"
+    assert bundle.windowing["context"] == "rows"
 
 
 def test_trained_anywhere_knows_idleness_and_is_scored_on_gestures(dataset: Dataset) -> None:

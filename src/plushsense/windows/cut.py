@@ -47,8 +47,9 @@ class WindowSpec:
         step_s: time from the start of a window to that of the next one in the same recording (above 0 to 60).
         context: where the samples come from that a recording shorter than a window lacks. ``stream``: from the
             session before the recording; ``loop``: the recording is repeated; ``rows``: the same, and its rows are
-            taken as even samples whatever their times, as by the authors' scripts; ``anywhere``: for live use, windows
-            are cut all along the sessions, also while nothing happens (one of `TRAIN_CONTEXTS`; default: by the preset).
+            taken as even samples whatever their times, as by the authors' scripts; ``anywhere``: for live use,
+            windows are cut all along the sessions, also while nothing happens (one of `TRAIN_CONTEXTS`; default: by
+            the preset).
         span_s: Not in a file: it follows from the network. It lengthens windows for networks that need more samples.
         longest_factor: recordings longer than this many times the median of their gesture are left out; 0: none is
             (0 or from 1).
@@ -88,10 +89,10 @@ class WindowSet:
 
     ``x`` (N, F, T): unscaled inputs of the network; ``y`` (N,): class index; ``recording`` (N,): index into
     ``recording_ids``; ``subject`` (N,): code of the person, "none" if nobody; ``context`` (N,): "inside" (wholly in its
-    recording), "stream" (begins before it in the stream), "loop", "rows" or "anywhere"; ``stream`` (N,): id of the stream
-    of the recording, or ""; ``window_rows`` and ``recording_rows`` (N, 2): rows of that stream which the window and its
-    recording cover, −1 if unknown (always for looped windows). ``vectors``: triples of inputs that are the axes of one
-    vector; ``left_out``: recordings that gave no window, and gestures of free choice, with the reason.
+    recording), "stream" (begins before it in the stream), "loop", "rows" or "anywhere"; ``stream`` (N,): id of the
+    stream of the recording, or ""; ``window_rows`` and ``recording_rows`` (N, 2): rows of that stream which the window
+    and its recording cover, −1 if unknown (always for looped windows). ``vectors``: triples of inputs that are the axes
+    of one vector; ``left_out``: recordings that gave no window, and gestures of free choice, with the reason.
     ``self_calibration``: "causal" if sensors calibrate themselves (`plushsense.windows.sessions`), else "".
     """
 
