@@ -42,6 +42,8 @@ def run(args: argparse.Namespace) -> int:
             f"reading {args.device}; {bundle.arch.symbol}, a decision every "
             f"{classifier.step_s * 1000:.0f} ms; Ctrl-C ends"
         )
+        for note in device.notes:
+            say(f"warning: {args.device}: {note}")
         live = run_live(device, classifier, seconds=args.seconds)
         try:
             state: State | None = None

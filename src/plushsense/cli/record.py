@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     folder, known = session_folder(Path(args.out), request, args.session, args.new)
     with open_toy(with_speed(args.device, request.speed), session_layout(request, folder, known)) as device:
         head = session_head(request, folder, known is None, device.layout, software)
-        notices = _notices(request, head, known is None)
+        notices = [*_notices(request, head, known is None), *(f"{args.device}: {note}" for note in device.notes)]
         for notice in notices:
             say(f"warning: {notice}")
         session = OpenSession(folder, head)

@@ -93,6 +93,7 @@ class Device(ABC):
         wait_s: longest wait of `read`; 0 does not wait, for reading many toys in turn.
         arrived_s: time at which the bytes of the last frames arrived, before they were parsed, by `time.perf_counter`;
             for a replay or a virtual toy, the time at which the first of them was due. None if unknown.
+        notes: sentences for the user on what was assumed about the frames.
     """
 
     def __init__(self, url: str, layout: Layout) -> None:
@@ -102,6 +103,7 @@ class Device(ABC):
         self.closed = False
         self.wait_s = 0.1
         self.arrived_s: float | None = None
+        self.notes: tuple[str, ...] = ()
 
     @abstractmethod
     def read(self) -> list[Frame] | None:

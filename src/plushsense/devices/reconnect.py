@@ -82,6 +82,7 @@ class ReconnectingDevice(Device):
         self._waiting_since = 0.0
         self._found: Device | Exception | None = None
         self.inner: Device | None = open_inner()
+        self.notes = self.inner.notes
         self._count()
 
     def read(self) -> list[Frame] | None:

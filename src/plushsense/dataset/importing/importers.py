@@ -28,7 +28,7 @@ from plushsense.dataset.importing.build import (
     folder_name,
     group_flags,
 )
-from plushsense.dataset.importing.pattern import STREAM_ROLE, ImportPattern, check_roles, read_pattern
+from plushsense.dataset.importing.pattern import ImportPattern, check_roles, read_pattern
 from plushsense.dataset.importing.preview import ImportPreview, preview
 from plushsense.dataset.importing.proposals import (
     SELF_CALIBRATION,
@@ -57,7 +57,7 @@ from plushsense.dataset.importing.sources import (
 )
 from plushsense.dataset.importing.tables import TableImport
 from plushsense.dataset.importing.truncation import CHOSEN, choices_of, original_of, split_backups
-from plushsense.dataset.importing.xdf import person_and_session, read_xdf
+from plushsense.dataset.importing.xdf import ENDINGS, is_xdf, person_and_session, read_xdf
 from plushsense.dataset.index import rebuild_index
 from plushsense.dataset.store import (
     HEAD,
@@ -141,7 +141,12 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     gestures = options.known_gestures(layout)
     in_session = [f for f in files if sessions and session_of(f, sessions) is not None]
     rest = sorted(set(files) - set(in_session)) if in_session else files
-    plain = [f for f in rest if f.suffix.lower() != ".xdf"]
+    plain = [f for f in rest if not is_xdf(f)]
+    if options.columns and len(plain) == len(rest):
+        role = next(iter(options.columns))
+        raise ConfigError(
+            f"--column {role}=… is for a table or XDF files; '{source}' is a folder: describe it with --pattern FILE."
+        )
     mapping = None if options.mapping is None else dict(options.mapping)
     shape = "labelled-rows" if layout.is_labelled else "gesture-recorder"
     classified = (
@@ -155,7 +160,7 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     search = SourceScan(
         layout, gestures, shape if rest else "sessions", classified, people, notes=notes, choices=choices
     )
-    for file in (f for f in rest if f.suffix.lower() == ".xdf"):
+    for file in filter(is_xdf, rest):
         name = printable_path(file.relative_to(source))
         person = None if file.parent == around else file.parent.resolve().name
         if file.parent == source and options.person is not None:
@@ -260,9 +265,9 @@ def _add_xdf(path: Path, name: str, person: str | None, options: ImportOptions, 
             "file sub-<code>_ses-<session>.xdf as LabRecorder does",
             reason="person_unknown",
         )
-    folder = options.new_folder("converted") / "xdf"
-    stream = options.columns.get(STREAM_ROLE, "")
-    _add(read_xdf(path, name, folder, subject, session, search.layout, search.gestures, stream), search)
+    folder = options.new_folder("converted")
+    choices, limits = options.columns, options.limits
+    _add(read_xdf(path, name, folder, subject, session, search.layout, search.gestures, choices, limits), search)
 
 
 def scan_table(path: Path, options: ImportOptions) -> SourceScan:
@@ -272,8 +277,8 @@ def scan_table(path: Path, options: ImportOptions) -> SourceScan:
     search = _scan_of_file(path, "table", options)
     check_roles(options.columns, search.layout)
     person = (options.mapping or {}).get(path.name) or options.person or None
-    columns = {role: name for role, name in options.columns.items() if role != STREAM_ROLE}
-    tables = TableImport(options.new_folder("converted"), search.layout, ImportPattern(columns=columns))
+    pattern = ImportPattern(columns=dict(options.columns))
+    tables = TableImport(options.new_folder("converted"), search.layout, pattern)
     _add(tables.convert(path, path.name, person), search)
     return search
 
@@ -299,7 +304,7 @@ def _add(entries: Iterable[SourceFile | str], search: SourceScan) -> None:
 
 FORMATS: dict[str, Callable[[Path, ImportOptions], SourceScan]] = {
     ".zip": scan_zip,
-    ".xdf": scan_xdf,
+    **dict.fromkeys(ENDINGS, scan_xdf),
     ".parquet": scan_table,
     ".csv": scan_table,
     ".mat": scan_windows,
@@ -331,18 +336,15 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
         if options.pattern is not None and source.exists() and source.suffix.lower() != ".zip":
             search = scan_pattern(source, options)
         elif source.is_dir():
-            if unused := sorted(set(options.columns) - {STREAM_ROLE}):
-                raise ConfigError(
-                    f"--column {unused[0]}=… is for a table; '{source}' is a folder: describe it with --pattern FILE."
-                )
             search = scan_folder(source, options)
         elif source.is_file():
-            if source.suffix.lower() not in FORMATS:
+            scan = next((scan for ending, scan in FORMATS.items() if source.name.lower().endswith(ending)), None)
+            if scan is None:
                 raise DatasetError(
                     f"'{source}' cannot be imported: give a folder, or a file that ends in {', '.join(FORMATS)}.",
                     reason="file_no_recording",
                 )
-            search = FORMATS[source.suffix.lower()](source, options)
+            search = scan(source, options)
         else:
             raise DatasetError(
                 f"There is no '{source}': give the recorder's folder, or a file that ends in {', '.join(FORMATS)}."

@@ -28,7 +28,7 @@ ROLES: dict[str, tuple[str, ...]] = {
     "time": (DEVICE_MS, "time", "timestamp", "time_ms", "time_s", "timestamp_ms", "timestamp_s", "t", "t_ms", "t_s"),
     HOST_MS: (HOST_MS,),
 }
-STREAM_ROLE = "stream"
+STREAM_ROLE, MARKERS_ROLE = "stream", "markers"
 UNITS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1000.0}
 ENDINGS = {".parquet": "parquet", ".jsonl": "json", ".ndjson": "json", ".json": "json"}
 """Formats by the ending of a file; any other is a table of text, ``csv``."""
