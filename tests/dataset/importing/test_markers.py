@@ -52,6 +52,10 @@ def places(cuts: MarkerCuts) -> list[tuple[str, int, int]]:
         ),
         (["Tail pull\0\0\x07", "stop\0"], [("Tail pull", 10, 20)]),
         ([["Tail pull", "Hold strong"]], []),
+        (
+            ['{"event": "trial_start", "cue": "Tail pull"}', '{"event": "trial_end", "cue": "Tail pull"}'],
+            [("Tail pull", 10, 20)],
+        ),
     ],
 )
 def test_what_markers_mean(texts: Sequence[Any], expected: list[tuple[str, int, int]]) -> None:
@@ -67,6 +71,8 @@ def test_what_markers_mean(texts: Sequence[Any], expected: list[tuple[str, int, 
         ([["Shake", "left hand"]], []),  # which of the two is the gesture?
         (['{"state": 2, "cue": "Shake"}', '{"cue": "stop"}'], [("Shake", 10, 20)]),
         ([np.array([4]), np.array([0]), np.array([2.5])], [("4", 10, 20), ("2.5", 30, 50)]),
+        (['{"event": "trial_start", "cue": "Shake"}', '{"event": "trial_end", "cue": "Shake"}'], [("Shake", 10, 20)]),
+        (["experiment_start", "Shake_start", "Shake_end", "experiment_end"], [("Shake", 20, 30)]),
         (["{not JSON", "[]", "...", "\0"], [("{not JSON", 10, 30)]),
     ],
 )
@@ -94,6 +100,7 @@ def test_markers_outside_of_the_stream_are_counted() -> None:
     )
     assert places(cuts) == [("Hold strong", 0, 20), ("Tail pull", 30, 50)]
     assert cuts.empty == ["Tail pull", "Tail pull"]
+    assert cut(["Tail pull", "0"]).zeros == ["0"]
     assert cuts.shortened == ["Hold strong", "Tail pull"]
 
 

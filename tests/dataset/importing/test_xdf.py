@@ -110,6 +110,7 @@ def test_files_in_folders_have_the_folders_person(tmp_path: Path, xdf_writer: Wr
     (tmp_path / "src" / "ana" / "bad.xdf").write_bytes(b"XDF?")
     done = import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3")
     assert [(r.subject, r.session) for r in done.dataset.recordings] == [("ana", "one"), ("ana", "two"), ("ben", "1")]
+    assert not any("files are the session" in note for note in done.notes)
     assert [e["file"] for e in done.rejected] == ["ana/bad.xdf"]
     alone = tmp_path / "src" / "ana" / "one.xdf"
     with pytest.raises(FileFormatError, match="the person of 'one.xdf' is not known"):
@@ -228,11 +229,12 @@ def test_numbers_are_gestures_only_if_they_are_chosen_or_named(
     codes = texts(xdf_stream, "codes", (50.5, [3]), (51.0, [0]), (51.5, [7]), (52.0, [0]), format="int32")
     path = xdf_writer(tmp_path / "sub-A.xdf", [toy, codes])
     with pytest.raises(
-        DatasetError, match=r"'codes' \(#2\) of int32: '3', '0', '7': to take them as gestures, give --co"
+        DatasetError, match=r"'codes' \(#2\) of int32: '3', '0', '7': a gesture set .*--column markers=NAME"
     ):
         import_recordings(path, tmp_path / "DS", layout="accel-3")
     done = import_recordings(path, tmp_path / "DS", layout="accel-3", columns={"markers": "codes"})
     assert places(done) == [("3", 50, 50), ("7", 150, 50)]
+    assert (done.left_out, ["2 markers end a recording" in note for note in done.notes]) == ([], [True])
     (tmp_path / "set.toml").write_text(
         'name = "codes"\n[[gestures]]\nlabel = "Shake"\nlabels = ["3"]\n[[gestures]]\nlabel = "Wave"\nlabels = ["7"]\n'
     )
@@ -343,3 +345,15 @@ def test_a_clock_of_float32_is_not_used(tmp_path: Path, xdf_writer: Writer, xdf_
     done = import_recordings(path, tmp_path / "DS", layout="accel-3")
     assert done.dataset.read(done.dataset.recordings[0]).device_ms[:2].tolist() == [200, 210]
     assert "its device_ms is float32" in done.notes[0]
+
+
+def test_two_files_of_one_session_are_named(tmp_path: Path, xdf_writer: Writer, xdf_stream: Any) -> None:
+    streams = [accel(xdf_stream, labels=("x", "y", "z")), markers(xdf_stream, (50.5, "Shake"))]
+    # LabRecorder renames the earlier recording of a run.
+    for name in ("sub-A_ses-1_task-touch_eeg.xdf", "sub-A_ses-1_task-touch_eeg_old1.xdf"):
+        xdf_writer(tmp_path / "in" / name, streams)
+    done = import_recordings(tmp_path / "in", tmp_path / "DS", layout="accel-3")
+    assert (
+        "2 files are the session '1' of 'A': sub-A_ses-1_task-touch_eeg.xdf, sub-A_ses-1_task-touch_eeg_old"
+        in done.notes[0]
+    )

@@ -160,6 +160,7 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     search = SourceScan(
         layout, gestures, shape if rest else "sessions", classified, people, notes=notes, choices=choices
     )
+    files_of: dict[tuple[str, str], list[str]] = {}
     for file in filter(is_xdf, rest):
         name = printable_path(file.relative_to(source))
         person = None if file.parent == around else file.parent.resolve().name
@@ -168,9 +169,14 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
         if mapping is not None:
             person = mapping.get(name, mapping.get(file.name))
         try:
-            _add_xdf(file, name, person, options, search)
+            files_of.setdefault(_add_xdf(file, name, person, options, search), []).append(name)
         except FileFormatError as cause:
             search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
+    for (subject, session), names in files_of.items():
+        if len(names) > 1:
+            message = f"{len(names)} files are the session '{session}' of '{subject}': {', '.join(names[:SHOWN])}"
+            values = {"n": len(names), "session": session, "person": subject, "files": ", ".join(names[:SHOWN])}
+            search.notes.append(Sentence(message, reason="session_shared", **values))
     if mapping is not None:
         present = {name for f in rest for name in (f.name, f.relative_to(source).as_posix())}
         if missing := [name for name in mapping if name not in present]:
@@ -254,8 +260,8 @@ def _scan_of_file(path: Path, shape: str, options: ImportOptions, own: Layout | 
     return SourceScan(layout, options.known_gestures(layout), shape, [], notes=notes, simulated=simulated)
 
 
-def _add_xdf(path: Path, name: str, person: str | None, options: ImportOptions, search: SourceScan) -> None:
-    """Convert an XDF file, and add its recordings and notes to ``search``."""
+def _add_xdf(path: Path, name: str, person: str | None, options: ImportOptions, search: SourceScan) -> tuple[str, str]:
+    """Convert an XDF file, and add its recordings and notes to ``search``; return the person and the session."""
     subject, session = person_and_session(path, person)
     if options.mapping is not None:
         subject = person
@@ -268,6 +274,7 @@ def _add_xdf(path: Path, name: str, person: str | None, options: ImportOptions, 
     folder = options.new_folder("converted")
     choices, limits = options.columns, options.limits
     _add(read_xdf(path, name, folder, subject, session, search.layout, search.gestures, choices, limits), search)
+    return subject, session
 
 
 def scan_table(path: Path, options: ImportOptions) -> SourceScan:

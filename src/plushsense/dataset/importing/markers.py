@@ -1,8 +1,8 @@
 """Understand the markers of a stream, and cut another stream into recordings by them.
 
 A marker that names a gesture begins a recording. ``start Tail pull`` and ``Tail pull/begin`` begin one too; ``end``,
-``stop``, ``end Tail pull`` and the like, and the number 0, only end one. All channels of a marker are read, and the
-values of JSON. Without a gesture set, every other marker is the name of a gesture.
+``stop``, ``end Tail pull`` and the like, and 0 if it is no gesture, only end one. All channels of a marker are read,
+and the values of JSON. Without a gesture set, every other marker is the name of a gesture.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ _RESET_S = 1.0
 _BEGIN_WORDS, _END_WORDS = r"start(?:ed)?|begin|onset", r"end(?:ed)?|stop(?:ped)?|finish(?:ed)?|offset"
 _BEGIN = re.compile(rf"^(?:{_BEGIN_WORDS})[\s_:/-]+(?P<a>.+)$|^(?P<b>.+)[\s_:/-]+(?:{_BEGIN_WORDS})$", re.IGNORECASE)
 _END = re.compile(rf"^(?:{_END_WORDS})(?:[\s_:/-].*)?$|^.*[\s_:/-](?:{_END_WORDS})$", re.IGNORECASE)
-# A word of its own in one of several channels, or in JSON.
-_ON = re.compile(rf"(?:{_BEGIN_WORDS}|on)", re.IGNORECASE)
-_OFF = re.compile(rf"(?:{_END_WORDS}|off)", re.IGNORECASE)
+# Words that say no gesture: in one of several channels or in JSON, and for a whole experiment.
+_PARTS = r"(?:(?:experiment|session|block|task|trial|event|stim(?:ulus)?|cue|gesture|marker)[\s_:/-]*)?"
+_ON = re.compile(rf"{_PARTS}(?:{_BEGIN_WORDS}|on)", re.IGNORECASE)
+_OFF = re.compile(rf"{_PARTS}(?:{_END_WORDS}|off)", re.IGNORECASE)
 _NUMBER = re.compile(r"[+-]?[\d.]+(?:e[+-]?\d+)?", re.IGNORECASE)
 
 
@@ -51,12 +52,14 @@ class MarkerCuts:
     Attributes:
         segments: the recordings, in the order of the rows.
         unknown: markers that neither name a gesture nor end one.
+        zeros: markers 0, which end a recording.
         empty: markers that name a gesture at a time of which the stream has no rows.
         shortened: markers of recordings that begin before the stream or end after it, or that end at an unknown marker.
     """
 
     segments: list[LabelledSegment] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
+    zeros: list[str] = field(default_factory=list)
     empty: list[str] = field(default_factory=list)
     shortened: list[str] = field(default_factory=list)
 
@@ -67,14 +70,11 @@ def read_marker(time_s: float, sample: Sequence[Any], gestures: GestureSet | Non
     if not parts:
         return None
     text = " ".join(parts)
-    number = not any(isinstance(value, str) for value in sample)
     words = [part for part in parts if not _NUMBER.fullmatch(part)] or parts
     several = len(parts) > 1
-    ends = bool(_END.match(text)) or (several and any(map(_OFF.fullmatch, parts)))
-    if number and not np.any(sample):
-        return Marker(time_s, text, ends=True)
+    ends = bool(_END.match(text)) or text == "0" or (several and any(map(_OFF.fullmatch, parts)))
     if gestures is None:
-        names = [part for part in words if not (several and _ON.fullmatch(part))]
+        names = [part for part in words if not _ON.fullmatch(part)]
         name = _without_begin(names[0]) if len(names) == 1 and not ends else ""
         label = name if not _END.match(name) and _is_usable(name) else ""
     else:
@@ -131,6 +131,7 @@ def cut_by_markers(markers: Sequence[Marker], times_s: NDArray[np.float64], tole
         tolerance_s: how far a recording may reach beyond the rows without being shortened.
     """
     cuts = MarkerCuts(unknown=[m.text for m in markers if not m.label and not m.ends])
+    cuts.zeros += [m.text for m in markers if m.ends and m.text == "0"]
     rows, groups = _runs(times_s), _runs(np.array([m.time_s for m in markers]))
     paired = len(rows) == len(groups)
     for at, group in enumerate(groups if paired else [slice(0, len(markers))]):

@@ -356,7 +356,7 @@ def _find_markers(
         )
         message = f"{why} (there are {listed or 'none'}): choose one with --column markers=NAME or markers=#NUMBER"
         raise FileFormatError(message, reason="xdf_marker_streams", streams=listed)
-    others = {s.number: "it is not the stream of markers" for s in events if chosen and s not in chosen}
+    others = {s.number: "" if s in chosen else "it is not the stream of markers" for s in events if chosen}
     markers: list[Marker] = []
     merged = [m for s in chosen for m in read[s.number]]
     for marker in sorted(merged, key=lambda m: m.time_s) if len(chosen) > 1 else merged:
@@ -365,8 +365,9 @@ def _find_markers(
             markers.append(marker)
     hint = ""
     if events and not chosen:
-        where = "" if gestures is None else " and --gestures FILE, a gesture set that has them"
-        hint = f"; there are {listed}: to take them as gestures, give --column markers=NAME{where}"
+        hint = f"; there are {listed}: a gesture set (--gestures FILE) says which are gestures"
+        if gestures is None and not all(s.is_text for s in events):
+            hint += ", or --column markers=NAME takes numbers as gestures"
     return markers, others, hint
 
 
@@ -396,6 +397,7 @@ def _about_cuts(cuts: MarkerCuts, hint: str) -> Iterator[Sentence]:
     """Yield what is to be said about markers that give no recording, or not quite."""
     for texts, reason, message in (
         (cuts.unknown, "xdf_markers", "markers name no gesture and begin no recording"),
+        (cuts.zeros, "xdf_zeros", "markers end a recording; a gesture set can make them a gesture (--gestures FILE)"),
         (cuts.empty, "xdf_empty", "markers name a gesture where the stream has no samples, and give no recording"),
         (
             cuts.shortened,
