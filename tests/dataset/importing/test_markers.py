@@ -111,6 +111,12 @@ def test_rows_and_markers_after_a_reset_of_the_clock_belong_together() -> None:
     # The markers came from another computer, whose clock went on: those after the reset lie nowhere.
     alone = cut(["Tail pull", "end"] * 2, times_s=[100.1, 100.2, 103.1, 103.3], rows_s=rows)
     assert (places(alone), alone.empty) == ([("Tail pull", 10, 20)], ["Tail pull"])
+    # The times were corrected: the recording ends with the reset.
+    markers = [m for m in (read_marker(t, ["Tail pull"], PLUSH) for t in (0.1, 0.3)) if m is not None]
+    cuts = cut_by_markers(markers, np.arange(50) / 100.0, [20])
+    assert (places(cuts), cuts.shortened) == ([("Tail pull", 10, 20), ("Tail pull", 30, 50)], [])
+    cuts = cut_by_markers(markers, np.array([i / 100 + 9 * (i >= 20) for i in range(50)]), [20])
+    assert (places(cuts), cuts.shortened) == ([("Tail pull", 10, 20)], ["Tail pull"])
     # Times that lie in both parts are ambiguous.
     rows = [100 + i / 100 for i in range(500)] + [102 + i / 100 for i in range(50)]
     assert cut(["Tail pull", "end"], times_s=[102.1, 102.2], rows_s=rows).empty == ["Tail pull"]

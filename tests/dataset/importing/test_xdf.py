@@ -250,6 +250,11 @@ def test_streams_with_other_labels_are_not_the_toy(tmp_path: Path, xdf_writer: W
         import_recordings(path, tmp_path / "no", layout="accel-3")
     renamed = {"x": "gx", "y": "gy", "z": "GZ "}
     assert import_recordings(path, tmp_path / "DS", layout="accel-3", columns=renamed).recordings == 1
+    labels = (*"xyz", "gx", "gy", "gz")
+    both = xdf_stream("six", gyroscope.times, [[7, 8, 9, *row] for row in gyroscope.samples], labels=labels)
+    other = xdf_writer(tmp_path / "sub-B.xdf", [both, said])
+    done = import_recordings(other, tmp_path / "six", layout="accel-3", columns=renamed)
+    assert done.dataset.read(done.dataset.recordings[0]).values[0].tolist() == gyroscope.samples[50]
     with pytest.raises(
         ConfigError, match=r"--column label=…: in an XDF file, accepted are stream, markers, device_ms, x"
     ):

@@ -120,19 +120,22 @@ def _is_usable(label: str) -> bool:
     return name is not None and bool(plain_label(name.label)) and len(label) <= LONGEST_LABEL // 2
 
 
-def cut_by_markers(markers: Sequence[Marker], times_s: NDArray[np.float64], tolerance_s: float = 0.1) -> MarkerCuts:
+def cut_by_markers(
+    markers: Sequence[Marker], times_s: NDArray[np.float64], resets: Sequence[int] = (), tolerance_s: float = 0.1
+) -> MarkerCuts:
     """Return the recordings that ``markers`` delimit in a stream with rows at ``times_s`` (T,).
 
     A recording ends at the next marker that begins or ends one, or with the stream; at one that does neither, if the
-    markers name no ends. Where a clock was reset, the rows and markers before and after it are apart: if both have as
-    many resets, their parts belong together in order, else by time.
+    markers name no ends. Where a clock was reset, it ends too, and the rows and markers before and after are apart: if
+    the times of both go back as often, their parts belong together in order, else by time.
 
     Args:
+        resets: rows that are the first after a reset of the clock, though their times may be later than those before.
         tolerance_s: how far a recording may reach beyond the rows without being shortened.
     """
     cuts = MarkerCuts(unknown=[m.text for m in markers if not m.label and not m.ends])
     cuts.zeros += [m.text for m in markers if m.ends and m.text == "0"]
-    rows, groups = _runs(times_s), _runs(np.array([m.time_s for m in markers]))
+    rows, groups = _runs(times_s, resets), _runs(np.array([m.time_s for m in markers]), ())
     paired = len(rows) == len(groups)
     for at, group in enumerate(groups if paired else [slice(0, len(markers))]):
         for begin, end_s, early in _intervals(sorted(markers[group], key=lambda m: m.time_s)):
@@ -148,9 +151,10 @@ def cut_by_markers(markers: Sequence[Marker], times_s: NDArray[np.float64], tole
     return cuts
 
 
-def _runs(times_s: NDArray[np.float64]) -> list[slice]:
-    """Return the parts of ``times_s`` in which no clock was reset."""
-    edges = [0, *(np.flatnonzero(np.diff(times_s) < -_RESET_S) + 1).tolist(), len(times_s)]
+def _runs(times_s: NDArray[np.float64], resets: Sequence[int]) -> list[slice]:
+    """Return the parts of ``times_s`` in which no clock was reset: before ``resets``, and where times go back."""
+    back = np.flatnonzero(np.diff(times_s) < -_RESET_S) + 1
+    edges = sorted({0, *resets, *back.tolist(), len(times_s)})
     return [slice(a, b) for a, b in itertools.pairwise(edges) if b > a]
 
 
@@ -177,8 +181,8 @@ def _place(
     begin_s: float, end_s: float, times_s: NDArray[np.float64], runs: Sequence[slice], tolerance_s: float
 ) -> tuple[int, int, bool] | None:
     """Return the rows of an interval that lies in one run, first and last (exclusive), and whether it is longer."""
-    inside = [r for r in runs if times_s[r.start] - tolerance_s <= begin_s <= times_s[r.stop - 1]]
-    inside = inside or [r for r in runs if begin_s < times_s[r.start] < end_s]
+    inside = [r for r in runs if times_s[r.start] - _SAME_S <= begin_s <= times_s[r.stop - 1]]
+    inside = inside or [r for r in runs if begin_s < times_s[r.start] < end_s][:1]
     if len(inside) != 1:
         return None
     (run,) = inside

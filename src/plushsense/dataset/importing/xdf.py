@@ -48,7 +48,10 @@ _MOST_EVENTS = 100_000
 
 @dataclass(frozen=True, eq=False)
 class XdfStream:
-    """A stream of an XDF file: its number, what its header says, times (T,) in seconds, and samples: rows of values."""
+    """A stream of an XDF file: its number, what its header says, times (T,) in seconds, and samples: rows of values.
+
+    ``clock`` (T,) numbers the clock of each sample, which is another one after its computer was started again.
+    """
 
     number: int
     name: str
@@ -59,6 +62,7 @@ class XdfStream:
     rate: str
     labels: list[str]
     times_s: NDArray[np.float64]
+    clock: NDArray[np.int64]
     samples: Any
 
     @classmethod
@@ -68,7 +72,10 @@ class XdfStream:
         times = np.asarray(stream["time_stamps"], dtype=np.float64)
         name, kind, source, uid, number_format, rate = (_text(stream, key) for key in keys)
         number, labels, samples = int(stream["info"]["stream_id"]), _labels(stream), stream["time_series"]
-        return cls(number, name, kind, source, uid, number_format, rate, labels, times, samples)
+        clock = np.zeros(len(times), dtype=np.int64)
+        for first, _ in stream["info"]["clock_segments"][1:]:
+            clock[first:] += 1
+        return cls(number, name, kind, source, uid, number_format, rate, labels, times, clock, samples)
 
     def __str__(self) -> str:
         return f"'{self.name}' (#{self.number})"
@@ -254,13 +261,23 @@ def _joined(streams: Sequence[XdfStream]) -> tuple[XdfStream, str] | None:
         else:
             gaps.append(float(stream.times_s[0]) - last)
         times = np.concatenate([whole.times_s, stream.times_s[n:]])
-        whole = replace(whole, times_s=times, samples=np.concatenate([whole.samples, stream.samples[n:]]))
+        clock = np.concatenate([whole.clock, whole.clock[-1] + stream.clock[n:]])
+        samples = np.concatenate([whole.samples, stream.samples[n:]])
+        whole = replace(whole, times_s=times, clock=clock, samples=samples)
     note = f"the stream '{whole.name}' is in the file {len(streams)} times"
     if again:
         note += ", with equal rows: they are used once"
     if gaps:
         note += f", one after another: joined, with gaps of {', '.join(f'{gap:.3g} s' for gap in gaps[:5])}"
     return whole, Sentence(note, reason="xdf_joined", stream=whole.name, n=len(streams))
+
+
+def _renamed(labels: Sequence[str], channels: Mapping[str, str]) -> list[str]:
+    """Return ``labels`` with the name of the channel for each that ``channels`` gives one, and of no other."""
+    named = {label.strip().casefold(): channel for channel, label in channels.items()}
+    taken = {channel.casefold() for channel in channels}
+    keys = [label.strip().casefold() for label in labels]
+    return [named.get(key, "" if key in taken else label) for key, label in zip(keys, labels, strict=True)]
 
 
 @dataclass
@@ -280,11 +297,11 @@ def _find_toy(streams: Sequence[XdfStream], layout: Layout, choices: Mapping[str
         FileFormatError: if not exactly one stream fits.
     """
     choice = choices.get(STREAM_ROLE, "")
-    named = {label.strip().casefold(): channel for channel, label in choices.items()}
+    channels = {role: label for role, label in choices.items() if role not in (STREAM_ROLE, MARKERS_ROLE)}
     fitting: list[tuple[XdfStream, StreamColumns]] = []
     others: dict[int, str] = {}
     for stream in streams:
-        labels = [named.get(label.strip().casefold(), label) for label in stream.labels]
+        labels = _renamed(stream.labels, channels)
         columns = layout.match_columns(labels, np.shape(stream.samples)[-1], stream.format != "float32")
         if isinstance(columns, str):
             others[stream.number] = columns
@@ -371,8 +388,11 @@ def _find_markers(
     return markers, others, hint
 
 
-def _frames(toy: _Toy, layout: Layout) -> tuple[Frames, NDArray[np.float64]]:
-    """Return the frames of the toy and the time of each in seconds; add notes on rows and values to it."""
+def _frames(toy: _Toy, layout: Layout) -> tuple[Frames, NDArray[np.float64], list[int]]:
+    """Return the frames of the toy, the time of each in seconds, and the rows after a reset of the clock.
+
+    Notes on rows and values are added to the toy.
+    """
     stream, columns = toy.stream, toy.columns
     series = np.asarray(stream.samples, dtype=np.float64).reshape(len(stream.times_s), -1)
     times = stream.times_s
@@ -385,7 +405,8 @@ def _frames(toy: _Toy, layout: Layout) -> tuple[Frames, NDArray[np.float64]]:
     toy.notes += [warning] if warning else []
     host_ms = np.round(times[good] * 1000.0).astype(np.int64)
     device_ms = np.round(device[good]).astype(np.int64)
-    return Frames(values, device_ms, host_ms), times[good]
+    resets = (np.flatnonzero(np.diff(stream.clock[good])) + 1).tolist()
+    return Frames(values, device_ms, host_ms), times[good], resets
 
 
 def _quoted(texts: Iterable[str]) -> str:
@@ -447,9 +468,9 @@ def read_xdf(
     toy = _find_toy([s for s in streams if not s.is_text], layout, choices)
     events = [s for s in streams if s.number != toy.stream.number]
     markers, others, hint = _find_markers(events, gestures, choices.get(MARKERS_ROLE, ""))
-    frames, times = _frames(toy, layout)
+    frames, times, resets = _frames(toy, layout)
     tolerance_s = max(layout.gap_ms / 1000.0, 2.0 / layout.rate_hz)
-    cuts = cut_by_markers(markers, times, tolerance_s) if len(times) else MarkerCuts()
+    cuts = cut_by_markers(markers, times, resets, tolerance_s) if len(times) else MarkerCuts()
     yield from (about_file(display_name, note) for note in [*toy.notes, *_about_cuts(cuts, hint)])
     if not len(frames):
         message = f"the stream '{toy.stream.name}' has no sample with a number in every channel"
