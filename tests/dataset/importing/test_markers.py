@@ -114,7 +114,7 @@ def test_rows_and_markers_after_a_reset_of_the_clock_belong_together() -> None:
     # The times were corrected: the recording ends with the reset.
     markers = [m for m in (read_marker(t, ["Tail pull"], PLUSH) for t in (0.1, 0.3)) if m is not None]
     cuts = cut_by_markers(markers, np.arange(50) / 100.0, [20])
-    assert (places(cuts), cuts.shortened) == ([("Tail pull", 10, 20), ("Tail pull", 30, 50)], [])
+    assert (places(cuts), cuts.shortened) == ([("Tail pull", 10, 20), ("Tail pull", 30, 50)], ["Tail pull"])
     cuts = cut_by_markers(markers, np.array([i / 100 + 9 * (i >= 20) for i in range(50)]), [20])
     assert (places(cuts), cuts.shortened) == ([("Tail pull", 10, 20)], ["Tail pull"])
     # Times that lie in both parts are ambiguous.
