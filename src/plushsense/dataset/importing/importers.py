@@ -495,8 +495,8 @@ def import_recordings(
         simulated: whether the virtual toy made the recordings; detected in folders that `plushsense simulate` wrote.
         progress: called with (files done, number of files).
         people: the path of a people's table, see `dataset.store.read_people`.
-        columns: the column of a table by role (``{"label": "activity"}``); of XDF files the ``stream`` and the ``markers``
-            by name or ``#number``, and the labels of channels.
+        columns: the column of a table by role (``{"label": "activity"}``); in XDF files the ``stream`` and the
+            ``markers`` by name or ``#number``, and the labels of channels.
         limits: limits of unpacking a zip.
         adopt_proposals: put the proposed rate, gap, offsets and self-calibration (see `propose_settings`) into the
             layout of the new data set; otherwise they are only reported.
