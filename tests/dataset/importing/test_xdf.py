@@ -322,7 +322,7 @@ def test_markers_without_a_recording_and_shortened_recordings_are_counted(
     done = import_recordings(path, tmp_path / "DS", layout="accel-3")
     assert done.notes == [
         "sub-A.xdf: 1 markers name a gesture where the stream has no samples, and give no recording: 'Shake'",
-        "sub-A.xdf: 2 recordings are cut short by the stream or by a marker that names no gesture: 'Wave', 'Shake'",
+        "sub-A.xdf: 2 recordings are cut short by the stream or a marker that names no gesture: 'Wave', 'Shake'",
     ]
 
 

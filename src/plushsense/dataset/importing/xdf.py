@@ -373,7 +373,8 @@ def _find_markers(
         )
         message = f"{why} (there are {listed or 'none'}): choose one with --column markers=NAME or markers=#NUMBER"
         raise FileFormatError(message, reason="xdf_marker_streams", streams=listed)
-    others = {s.number: "" if s in chosen else "it is not the stream of markers" for s in events if chosen}
+    others = {s.number: "it is not the stream of markers" for s in events if s.is_text and chosen}
+    others |= {s.number: "" for s in chosen}
     markers: list[Marker] = []
     merged = [m for s in chosen for m in read[s.number]]
     for marker in sorted(merged, key=lambda m: m.time_s) if len(chosen) > 1 else merged:
@@ -420,11 +421,7 @@ def _about_cuts(cuts: MarkerCuts, hint: str) -> Iterator[Sentence]:
         (cuts.unknown, "xdf_markers", "markers name no gesture and begin no recording"),
         (cuts.zeros, "xdf_zeros", "markers end a recording; a gesture set can make them a gesture (--gestures FILE)"),
         (cuts.empty, "xdf_empty", "markers name a gesture where the stream has no samples, and give no recording"),
-        (
-            cuts.shortened,
-            "xdf_shortened",
-            "recordings are cut short by the stream or by a marker that names no gesture",
-        ),
+        (cuts.shortened, "xdf_shortened", "recordings are cut short by the stream or a marker that names no gesture"),
     ):
         if texts:
             listed = _quoted(texts)
@@ -466,7 +463,7 @@ def read_xdf(
         message = f"{display_name}: cut off or damaged from byte {good} of {size} on; the bytes before are used"
         yield Sentence(message, reason="xdf_cut", file=display_name)
     toy = _find_toy([s for s in streams if not s.is_text], layout, choices)
-    events = [s for s in streams if s.number != toy.stream.number]
+    events = [s for s in streams if s.is_text or s.name != toy.stream.name]
     markers, others, hint = _find_markers(events, gestures, choices.get(MARKERS_ROLE, ""))
     frames, times, resets = _frames(toy, layout)
     tolerance_s = max(layout.gap_ms / 1000.0, 2.0 / layout.rate_hz)
