@@ -186,3 +186,22 @@ def test_events_only_and_text_for_people(plush_bundle: Path, tmp_path: Path) -> 
         [*COMMAND, "live", *words, "--text", "--events"], capture_output=True, text=True, check=False, timeout=60
     )
     assert both.returncode == 2 and "Traceback" not in both.stderr
+
+
+def test_what_was_assumed_about_a_stream_is_said(
+    plush_bundle: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from plushsense.cli.main import main
+    from plushsense.devices import opening
+    from plushsense.devices.base import Device
+
+    open_virtual = opening.open_device
+
+    def open_unnamed(*args: Any, **settings: Any) -> Device:
+        device = open_virtual(*args, **settings)
+        device.notes = ("its channels have no names",)
+        return device
+
+    monkeypatch.setattr(opening, "open_device", open_unnamed)
+    assert main(["live", "--device", "virtual://?speed=0&seconds=1", "--model", str(plush_bundle)]) == 0
+    assert "warning: virtual://?speed=0&seconds=1: its channels have no names" in capsys.readouterr().err
