@@ -25,7 +25,7 @@ from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
 from plushsense.runtime.integer import deployable
-from plushsense.windows.features import Scaler, network_inputs
+from plushsense.windows.features import InputUnits, Scaler, network_inputs
 from support.exports import bundle_of
 
 # symbol, filters, layout, settings: every padding and normalisation, one layer to four, one reflection and several.
@@ -65,6 +65,11 @@ def others(bundle: Bundle, n: int = 20, seed: int = 5) -> np.ndarray[Any, np.dty
     return raw
 
 
+def values(bundle: Bundle, raw: Any) -> Any:
+    """Whole numbers as the values that a file reads, in the units of the layout."""
+    return InputUnits.of(bundle.layout).values(raw)
+
+
 def assert_floats(found: Any, bundle: Bundle, raw: Any) -> None:
     expected = bundle.network().forward(bundle.scaler.apply(raw))
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * max(1.0, np.abs(expected).max()))
@@ -78,7 +83,7 @@ def test_onnx_answers_as_the_network(net: Any, tmp_path: Path, onnx_here: None) 
     assert done.bytes == done.path.stat().st_size and done.path.name == "model.onnx"
     assert done.largest_difference is not None and done.largest_difference < 1e-3
     raw = others(bundle)
-    assert_floats(as_onnx.run_model(done.path.read_bytes(), raw), bundle, raw)
+    assert_floats(as_onnx.run_model(done.path.read_bytes(), values(bundle, raw)), bundle, raw)
     assert [p.name for p in done.path.parent.iterdir()] == ["model.onnx"], "something was left behind"
 
 
@@ -88,7 +93,7 @@ def test_litert_answers_as_the_network(net: Any, tmp_path: Path, litert_here: No
     done = convert(bundle, tmp_path / "model.tflite", "tflite")
     assert done.largest_difference is not None and done.largest_difference < 1e-3
     raw = others(bundle)
-    assert_floats(as_tflite.run_model(done.path.read_bytes(), raw), bundle, raw)
+    assert_floats(as_tflite.run_model(done.path.read_bytes(), values(bundle, raw)), bundle, raw)
 
 
 @pytest.mark.parametrize("net", DEPLOYABLE, ids=str)
@@ -104,7 +109,7 @@ def test_int8_comes_close_to_the_integers(name: str, net: Any, tmp_path: Path, r
     done = convert(bundle, tmp_path / "m", name)
     raw = others(bundle, 60)
     room = as_onnx if name == "onnx-int8" else as_tflite
-    found, expected = room.run_model(done.path.read_bytes(), raw), integer.forward(raw) / 256
+    found, expected = room.run_model(done.path.read_bytes(), values(bundle, raw)), integer.forward(raw) / 256
     assert found is not None
     # A code that rounds the other way moves a logit by little; a wrong scale or shift by much.
     assert np.abs(found - expected).max() < 0.01 * max(1.0, np.abs(expected).max())
@@ -118,8 +123,10 @@ def test_int8_comes_close_to_the_integers(name: str, net: Any, tmp_path: Path, r
 def test_a_vector_layer_is_written_to_onnx_only(layout: str, tmp_path: Path, onnx_here: None) -> None:
     bundle = bundle_of(layout, "v9_5d2", "4,6")
     raw = others(bundle)[:-1]
-    assert_floats(as_onnx.run_model(convert(bundle, tmp_path / "m", "onnx").path.read_bytes(), raw), bundle, raw)
-    found = as_onnx.run_model(convert(bundle, tmp_path / "n", "onnx-int8").path.read_bytes(), raw)
+    assert_floats(
+        as_onnx.run_model(convert(bundle, tmp_path / "m", "onnx").path.read_bytes(), values(bundle, raw)), bundle, raw
+    )
+    found = as_onnx.run_model(convert(bundle, tmp_path / "n", "onnx-int8").path.read_bytes(), values(bundle, raw))
     expected = integer_network(bundle).forward(raw) / 256
     assert found is not None and np.abs(found - expected).max() < 0.01 * max(1.0, np.abs(expected).max())
     for name in ("tflite", "tflite-int8", "espdl"):
@@ -130,19 +137,19 @@ def test_a_vector_layer_is_written_to_onnx_only(layout: str, tmp_path: Path, onn
 def test_real_windows(real_data: Path, onnx_here: None, litert_here: None) -> None:
     bundle = made(("14d1_19d2_19d4", (8, 12, 16), "accel-3", {}))
     stream = real_data / "makeability-gestures" / "P07" / "fulldatastream.csv"
-    values = network_inputs(read_stream(stream, bundle.layout).frames.values, bundle.layout)
-    raw = np.stack([values[at : at + bundle.arch.span].T for at in range(0, len(values) - bundle.arch.span, 400)])
+    rows = network_inputs(read_stream(stream, bundle.layout).frames.values, bundle.layout)
+    raw = np.stack([rows[at : at + bundle.arch.span].T for at in range(0, len(rows) - bundle.arch.span, 400)])
     assert len(raw) > 10
     fitted = Bundle(bundle.arch, bundle.weights, bundle.layout, Scaler.fit(raw), bundle.gestures)
-    assert_floats(as_onnx.run_model(as_onnx.float_model(fitted), raw), fitted, raw)
-    assert_floats(as_tflite.run_model(as_tflite.float_model(fitted), raw), fitted, raw)
+    assert_floats(as_onnx.run_model(as_onnx.float_model(fitted), values(fitted, raw)), fitted, raw)
+    assert_floats(as_tflite.run_model(as_tflite.float_model(fitted), values(fitted, raw)), fitted, raw)
 
 
 def test_a_converted_network_reads_calibrated_values() -> None:
     bundle = made(NETS[0])
     layout = replace(bundle.layout, self_calibration=bundle.layout.names)
-    assert "clock rule and self-calibration" in describe(replace(bundle, layout=layout))["input"]
-    assert "self-calibration" not in describe(bundle)["input"]
+    assert "self-calibrated values" in describe(replace(bundle, layout=layout), "")["input"]
+    assert "self-calibration" not in describe(bundle, "")["input"]
 
 
 def test_onnx_says_what_it_is(tmp_path: Path, onnx_here: None) -> None:
@@ -223,7 +230,7 @@ def test_a_file_that_answers_otherwise_is_refused(tmp_path: Path, onnx_here: Non
     job = ConversionJob.of(bundle, None)
     with pytest.raises(BundleError, match="gives other answers"):
         data = as_onnx.float_model(other)
-        compared(job, data, as_onnx.run_model(data, job.windows), "ONNX")
+        compared(job, data, as_onnx.run_model(data, job.values), "ONNX", ())
 
 
 def test_given_windows_are_tried_too(tmp_path: Path, onnx_here: None) -> None:
