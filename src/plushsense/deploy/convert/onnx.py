@@ -53,7 +53,7 @@ class OnnxGraph:
         self.constants: list[Any] = []
 
     def constant(self, name: str, values: NDArray[Any]) -> str:
-        self.constants.append(self.onnx.numpy_helper.from_array(np.ascontiguousarray(values), name))
+        self.constants.append(self.onnx.numpy_helper.from_array(np.asarray(values, order="C"), name))
         return name
 
     def add(self, kind: str, out: str, *inputs: str, **settings: Any) -> str:
@@ -105,9 +105,9 @@ def float_model(bundle: Bundle) -> bytes:
         root = np.sqrt(bundle.weights["vector.var"].astype(np.float64) + NORM_EPSILON)
         z = g.add("Mul", "vector", z, g.columns("vector.gain", (1.0 / root).astype(np.float32)))
     for i, layer in enumerate(arch.layers):
-        z, pads = _padding(g, i, arch, layer, z)
+        z = _padded(g, i, arch, layer, z)
         w, b = (g.constant(n, bundle.weights[n]) for n in (f"conv{i}.weight", f"conv{i}.bias"))
-        z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel], pads=pads)
+        z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel])
         z = g.add("Relu", f"relu{i}", z)
         if arch.norm == "batch":
             # No BatchNormalization, which onnx's own evaluator computes as in a training up to opset 13.
@@ -133,17 +133,16 @@ def _scaled(g: OnnxGraph, z: str, scaler: Scaler, start: NDArray[np.float64] | f
     return g.add("Add", "scaled", z, g.columns("input.rest", rest))
 
 
-def _padding(g: OnnxGraph, i: int, arch: Arch, layer: ConvLayer, z: str) -> tuple[str, list[int]]:
+def _padded(g: OnnxGraph, i: int, arch: Arch, layer: ConvLayer, z: str) -> str:
     if arch.padding == "stream" or not layer.reach:
-        return z, [0, 0]
-    if arch.padding == "causal":
-        return z, [layer.reach, 0]
-    if layer.reach < arch.window:
-        pads = np.array([0, 0, layer.reach, 0, 0, 0], dtype=np.int64)
-        return g.add("Pad", f"mirror{i}", z, g.constant(f"mirror{i}.pads", pads), mode="reflect"), [0, 0]
-    # Pad reflects only once; longer padding needs several reflections.
-    indices = reflected(arch.window, layer.reach).astype(np.int64)
-    return g.add("Gather", f"mirror{i}", z, g.constant(f"mirror{i}.places", indices), axis=2), [0, 0]
+        return z
+    if arch.padding == "mirror" and layer.reach >= arch.window:
+        # Pad reflects only once; longer padding needs several reflections.
+        indices = reflected(arch.window, layer.reach).astype(np.int64)
+        return g.add("Gather", f"padded{i}", z, g.constant(f"padded{i}.places", indices), axis=2)
+    # Not by the attribute of Conv, of whose two sides OpenCV reads one.
+    pads = g.constant(f"padded{i}.pads", np.array([0, 0, layer.reach, 0, 0, 0], dtype=np.int64))
+    return g.add("Pad", f"padded{i}", z, pads, mode="reflect" if arch.padding == "mirror" else "constant")
 
 
 def _invariants(
@@ -253,8 +252,8 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
         scales = sum_scales(integer_layer.scale.multiplier, integer_layer.scale.before, integer_layer.scale.after)
         w = weights_of(f"conv{i}.weight", integer_layer.weights, scales)
         b = dequantized(f"conv{i}.bias", integer_layer.bias.astype(np.int32), scales)
-        z, pads = _padding(g, i, arch, layer, z)
-        z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel], pads=pads)
+        z = _padded(g, i, arch, layer, z)
+        z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel])
         z = quantized(g.add("Relu", f"relu{i}", z), f"layer{i}")
     # Over images, because OpenVINO 2026.4 averages 8-bit codes (N, F, T) over time to 0 in all but the first F windows.
     z = g.add("Unsqueeze", "image", z, g.constant("image.axis", np.array([2], dtype=np.int64)))
