@@ -261,8 +261,8 @@ def _input_text(layout: Layout, tensor: str) -> str:
         else:
             parts.append(f"; {derived.name} is the running mean of {of[0]} over {1 << layout.gravity_shift} samples")
     return (
-        f"{tensor}; {'self-calibrated ' * bool(layout.self_calibration)}values as the toy sends them, each in its unit "
-        f"('units'), at {layout.rate_hz:g} Hz after the clock rule{''.join(parts)}; the newest sample is the last"
+        f"{tensor}; {'self-calibrated ' * bool(layout.self_calibration)}values as the toy sends them, in the units "
+        f"listed under 'units', at {layout.rate_hz:g} Hz after the clock rule{''.join(parts)}; the newest sample is the last"
     )
 
 

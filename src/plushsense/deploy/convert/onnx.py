@@ -165,8 +165,9 @@ def _invariants(
         edges = (np.array([v], dtype=np.int64) for v in (first, last, axis))
         return g.add("Slice", name, z, *(g.constant(f"{name}.{k}", v) for k, v in enumerate(edges)))
 
-    def length(name: str, z: str, keep: int) -> str:
-        squares = g.add("ReduceSum", f"{name}.squares", g.add("Mul", f"{name}.each", z, z), one, keepdims=keep)
+    def length(name: str, z: str) -> str:
+        # With keepdims=0, the sums of some filters are wrong in OpenVINO 2026.4 where all shapes are fixed.
+        squares = g.add("ReduceSum", f"{name}.squares", g.add("Mul", f"{name}.each", z, z), one, keepdims=1)
         return g.add("Sqrt", name, g.add("Add", f"{name}.sum", squares, small))
 
     def turned(name: str, z: str, axis: int, order: Sequence[int]) -> str:
@@ -175,7 +176,7 @@ def _invariants(
     small, smaller = (g.constant(f"epsilon.{i}", np.array(e, dtype=np.float32)) for i, e in enumerate(epsilons))
     newest = part("newest", z, 2, layer.reach, arch.span)
     gravity = part("gravity", newest, 1, arch.channels - 3, arch.channels)
-    up = g.add("Div", "up", gravity, length("gravity.length", gravity, 1))
+    up = g.add("Div", "up", gravity, length("gravity.length", gravity))
     up = g.add("Unsqueeze", "up.rows", up, g.constant("axis.2", np.array([2], dtype=np.int64)))
     outputs = [part("others", newest, 1, 0, others)] if others else []
     for v, kernels in enumerate(weights):
@@ -204,7 +205,7 @@ def _invariants(
         power = g.constant(f"{n}.power", np.array(-0.25, dtype=np.float32))
         sense = g.add("Mul", f"{n}.sense", turn, g.add("Pow", f"{n}.root", sized, power))
         flat = g.add("Squeeze", f"{n}.v", vertical, one)
-        outputs += [flat, length(f"{n}.n", h, 0), sense]
+        outputs += [flat, g.add("Squeeze", f"{n}.n", length(f"{n}.length", h), one), sense]
     return g.add("Concat", "invariants", *outputs, axis=1)
 
 
