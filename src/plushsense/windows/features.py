@@ -141,8 +141,8 @@ def _unit_of(layout: Layout, at: int, is_centred: bool) -> tuple[float, str]:
         return float(UNIT), "g" if channel.kind == ACCELERATION else "spread"
     if channel.scale == 1.0:
         return 1.0 / channel.step, channel.unit
-    zero = "" if is_centred or not channel.offset else f" - {channel.offset:g}"
-    return 1.0 / channel.step, f"raw: (value{zero}) * {channel.scale:g} is in {channel.unit}"
+    value = "value" if is_centred or not channel.offset else f"(value - {channel.offset:g})"
+    return 1.0 / channel.step, f"raw: {value} * {channel.scale:g} is in {channel.unit}"
 
 
 class SampleInputs:

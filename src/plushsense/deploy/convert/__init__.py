@@ -251,19 +251,15 @@ def describe(bundle: Bundle, tensor: str) -> dict[str, str]:
 def _input_text(layout: Layout, tensor: str) -> str:
     """Return a sentence about the input: tensor, units, and what the caller computes before."""
     offsets = {c.name: 0.0 if c.name in layout.self_calibration else c.offset for c in layout.channels}
-    parts = []
+    measured = f"{'self-calibrated ' * bool(layout.self_calibration)}values as the toy sends them"
+    parts = [f"{measured}, in the units listed under 'units', at {layout.rate_hz:g} Hz after the clock rule"]
     for derived in layout.derived:
         of = [f"({name} - {offsets[name]:g})" if offsets[name] else name for name in derived.of]
-        if derived.name not in layout.inputs:
-            continue
-        if derived.kind == "magnitude":
-            parts.append(f"; {derived.name} is sqrt({' + '.join(f'{part}^2' for part in of)})")
-        else:
-            parts.append(f"; {derived.name} is the running mean of {of[0]} over {1 << layout.gravity_shift} samples")
-    return (
-        f"{tensor}; {'self-calibrated ' * bool(layout.self_calibration)}values as the toy sends them, in the units "
-        f"listed under 'units', at {layout.rate_hz:g} Hz after the clock rule{''.join(parts)}; the newest sample is the last"
-    )
+        root = f"sqrt({' + '.join(f'{part}^2' for part in of)})"
+        mean = f"the running mean of {of[0]} over {1 << layout.gravity_shift} samples"
+        if derived.name in layout.inputs:
+            parts.append(f"{derived.name} is {root if derived.kind == 'magnitude' else mean}")
+    return "; ".join([tensor, *parts, "the newest sample is the last"])
 
 
 def compared(

@@ -111,9 +111,9 @@ def float_model(bundle: Bundle) -> bytes:
         z = g.add("Relu", f"relu{i}", z)
         if arch.norm == "batch":
             # No BatchNormalization, which onnx's own evaluator computes as in a training up to opset 13.
-            gain, shift = (part.astype(np.float32) for part in affine(arch, i, bundle.weights))
-            z = g.add("Mul", f"gained{i}", z, g.columns(f"norm{i}.gain", gain))
-            z = g.add("Add", f"norm{i}", z, g.columns(f"norm{i}.shift", shift))
+            factor, term = (part.astype(np.float32) for part in affine(arch, i, bundle.weights))
+            z = g.add("Mul", f"gained{i}", z, g.columns(f"norm{i}.gain", factor))
+            z = g.add("Add", f"norm{i}", z, g.columns(f"norm{i}.shift", term))
         elif arch.norm == "layer":
             gain, shift = (g.constant(n, bundle.weights[n]) for n in (f"norm{i}.gain", f"norm{i}.shift"))
             z = g.add("Transpose", f"norm{i}.rows", z, perm=[0, 2, 1])
