@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.gestures import NOBODY
 from plushsense.core.sentences import Sentence
+from plushsense.dataset.quality.outliers import far_inputs
 from plushsense.scoring.splits import Fold, Index
 from plushsense.windows.cut import WindowSet
 
@@ -44,7 +46,8 @@ def audit_leakage(train: WindowSet, score: WindowSet, folds: Sequence[Fold]) -> 
 
     Validation windows count as trained on. Nobody (recordings at rest) is no person. Windows that rarely change are
     neither copies nor near-duplicates: a toy at rest is equal to itself, and so are presses of a switch. Windows that
-    share rows of a stream are not, either: they are counted as overlapping.
+    share rows of a stream are not, either: they are counted as overlapping. Failed readings, which would make windows
+    alike that share nothing else, are left out of the comparison.
 
     Args:
         train, score: the windows that the indices of ``folds`` refer to.
@@ -53,7 +56,8 @@ def audit_leakage(train: WindowSet, score: WindowSet, folds: Sequence[Fold]) -> 
         ``windows``, the number of scored windows; a count for each of `KINDS`; ``pairs``, the recordings with most
         copies or near-duplicates, as {scored, trained, windows}.
     """
-    signatures = _Signatures.of(train, score)
+    compared = _without_far(train)
+    signatures = _Signatures.of(compared, compared if score is train else _without_far(score))
     totals, pairs = dict.fromkeys(("windows", *KINDS), 0), Counter[tuple[str, str]]()
     for fold in folds:
         known = np.union1d(fold.train, fold.validation)
@@ -74,6 +78,17 @@ def audit_leakage(train: WindowSet, score: WindowSet, folds: Sequence[Fold]) -> 
             pairs[str(mine), str(twin)] += 1
     listed = [{"scored": a, "trained": b, "windows": n} for (a, b), n in pairs.most_common(_LISTED)]
     return {**totals, "pairs": listed}
+
+
+def _without_far(windows: WindowSet) -> WindowSet:
+    """Return windows in which the samples that alone set the scale of their input are the input's median."""
+    found = far_inputs(windows.x)
+    if not found:
+        return windows
+    x = windows.x.copy()
+    for at, far in found.items():
+        x[:, at][far] = np.median(x[:, at])
+    return replace(windows, x=x)
 
 
 def warn_of_copies(audit: Mapping[str, Any], warn: Callable[[str], None]) -> None:
