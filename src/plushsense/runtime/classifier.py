@@ -293,8 +293,8 @@ class BothEngines(IntegerClassifier):
 def check_layout(sent: Layout, read: Layout) -> None:
     """Raise ConfigError if a model cannot read the frames that a device sends.
 
-    The channels are compared, with their units and integer steps, but not the line format, so that older firmware of the
-    same toy is accepted. Rate, gap, inputs, offsets and valid ranges are those of the model.
+    The channels are compared, with their units and integer steps, but not the line format, so that older firmware of
+    the same toy is accepted. Rate, gap, inputs, offsets and valid ranges are those of the model.
 
     Raises:
         ConfigError: naming both layouts and the first channel that differs.

@@ -30,9 +30,10 @@ _LIMITS = [limit for bits in (16, 24, 32) for half in (1 << (bits - 1),) for lim
 _LIMITS += [(1 << bits) - 1 for bits in (16, 24, 32)]
 
 
-def _bits(values: NDArray[np.integer], middle: NDArray[np.floating]) -> NDArray[np.intc]:
+def _bits(values: NDArray[np.integer], middle: NDArray[np.floating]) -> NDArray[np.int64]:
     """Return the number of bits of the distance of values (..., C) from their ``middle`` (C,)."""
-    return np.frexp(np.floor(np.abs(values - np.floor(middle))))[1]
+    bits: NDArray[np.int64] = np.frexp(np.floor(np.abs(values - np.floor(middle))))[1].astype(np.int64)
+    return bits
 
 
 def _usual_bits(counts: NDArray[np.int64], octaves: int) -> int:
@@ -70,23 +71,18 @@ class FailedReadings:
 
 
 def find_failed_readings(dataset: Dataset) -> list[FailedReadings]:
-    """Return the failed readings of each channel that is no switch or counter, without those outside its valid range."""
+    """Return the failed readings of each channel but switches and counters; those outside its valid range are known."""
     layout = dataset.layout
     counts = np.zeros((layout.n_channels, _BITS), dtype=np.int64)
     for _, frames in _files(dataset):
         valid, bits = _measured(frames, dataset)
         for c, at in enumerate(valid.T):
             counts[c] += np.bincount(bits[at, c], minlength=_BITS)
-    found = {
-        c: bits
-        for c, channel in enumerate(layout.channels)
-        if not channel.is_discrete and (bits := _usual_bits(counts[c], LIMIT_OCTAVES))
-    }
-    return [
-        failed
-        for c, bits in found.items()
-        if (failed := _failed_of(dataset, c, bits, _usual_bits(counts[c], OCTAVES) == bits)) is not None
+    usual = {c: _usual_bits(counts[c], LIMIT_OCTAVES) for c, ch in enumerate(layout.channels) if not ch.is_discrete}
+    described = [
+        _failed_of(dataset, c, limit, _usual_bits(counts[c], OCTAVES) == limit) for c, limit in usual.items() if limit
     ]
+    return [failed for failed in described if failed is not None]
 
 
 def _files(dataset: Dataset) -> Iterator[tuple[str, Frames]]:
@@ -98,11 +94,11 @@ def _files(dataset: Dataset) -> Iterator[tuple[str, Frames]]:
             yield recording.subject, dataset.read(recording)
 
 
-def _measured(frames: Frames, dataset: Dataset) -> tuple[NDArray[np.bool_], NDArray[np.intc]]:
+def _measured(frames: Frames, dataset: Dataset) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Return which values (T, C) are in their valid range, and the bits (T, C) of their distance from the median."""
     values, layout = frames.values, dataset.layout
     if not len(values):
-        return np.zeros(values.shape, dtype=np.bool_), np.zeros(values.shape, dtype=np.intc)
+        return np.zeros(values.shape, dtype=np.bool_), np.zeros(values.shape, dtype=np.int64)
     valid: NDArray[np.bool_] = np.logical_and(values >= layout.valid_min_int, values <= layout.valid_max_int)
     return valid, _bits(values, np.median(values, axis=0))
 
@@ -128,14 +124,8 @@ def _failed_of(dataset: Dataset, c: int, usual_bits: int, very_far: bool) -> Fai
             longest = max(longest, int((edges[1::2] - edges[::2]).max()))
     if not very_far and not {round(value * step) for value in failed} <= {*_LIMITS}:
         return None
-    return FailedReadings(
-        dataset.layout.names[c],
-        len(failed),
-        rows,
-        tuple(people),
-        *(float(f"{edge * step:.12g}") for edge in (min(others), max(others))),
-        longest,
-    )
+    low, high = (float(f"{edge * step:.12g}") for edge in (min(others), max(others)))
+    return FailedReadings(dataset.layout.names[c], len(failed), rows, tuple(people), low, high, longest)
 
 
 def far_inputs(x: NDArray[np.integer]) -> dict[int, NDArray[np.bool_]]:
