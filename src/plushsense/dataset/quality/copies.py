@@ -2,7 +2,7 @@
 
 Stretches of half a second are compared, whatever their place, clock and label. Equal ones are copies if they are too
 improbable to be chance: each row counts as the information, in bits, of its values, of their change, or of the change
-of that, whichever is least in all recordings together. A sensor at rest, the steps of a coarse one, a ramp and a switch
+of that, whichever is least by its frequency in all recordings together. A sensor at rest, the steps of a coarse one, a ramp and a switch
 that is pressed have little.
 """
 
@@ -21,6 +21,8 @@ STRETCH_S = 0.5
 _LEAST_ROWS = 10
 # Bits beyond those with which some two of all stretches are equal by chance: 1 in a million.
 _SURE_BITS = 20
+# A row is common if it occurs so often; copies seldom have so many copies.
+_COMMON = 32
 _BASE = np.uint64(0x9E3779B97F4A7C15)
 _INVERSE = np.uint64(pow(int(_BASE), -1, 1 << 64))
 
@@ -94,12 +96,17 @@ def find_copied_stretches(recordings: Sequence[HashedRows], rate_hz: float) -> I
 
 
 def _information(hashes: Hashes) -> NDArray[np.float64]:
-    """Return the bits of information (T,) of each row: the least of its hashes (3, T)."""
-    total = hashes.shape[1]
-    least = np.full(total, np.inf)
+    """Return the bits of information (T,) of each row: the least of its hashes (3, T), by their frequency.
+
+    After a row that is common, it is their frequency after such rows: at rest, rest follows.
+    """
+    least = np.full(hashes.shape[1], np.inf)
     for order in hashes:
-        _, inverse, counts = np.unique(order, return_inverse=True, return_counts=True)
-        least = np.minimum(least, np.log2(total / counts)[inverse])
+        _, number, counts = np.unique(order, return_inverse=True, return_counts=True)
+        before = np.roll(number, 1)
+        _, pair, pairs = np.unique(before * len(counts) + number, return_inverse=True, return_counts=True)
+        after = np.where(counts[before] >= _COMMON, counts[before] / pairs[pair], np.inf)
+        least = np.minimum(least, np.log2(np.minimum(len(number) / counts[number], after)))
     return least
 
 
