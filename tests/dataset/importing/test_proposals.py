@@ -12,7 +12,6 @@ import pytest
 
 from plushsense.core.errors import ConfigError
 from plushsense.core.layouts import Layout, load_layout
-from plushsense.core.recorder_csv import Frames, write_recording
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.importing.proposals import Sensor, find_sensors, readable_layouts
@@ -23,27 +22,7 @@ from plushsense.runtime.classifier import check_layout
 from plushsense.windows.clock import SampleClock, resample
 from plushsense.windows.cut import WindowSpec, cut_windows
 from plushsense.windows.features import Scaler
-
-ACCEL = load_layout("accel-3")
-
-
-def analogue(
-    folder: Path, zero: float, one_g: float, period_ms: int = 10, turned: bool = True, people: range = range(3)
-) -> Path:
-    """Recordings of an accelerometer of 10 bits, held in many directions for a while and moved in between."""
-    rng = np.random.default_rng(people.start)
-    for p in people:
-        (folder / f"P{p}").mkdir(parents=True)
-        for take in range(6):
-            up = rng.normal(size=3) if turned else np.array([0.0, 0.0, 1.0])
-            up /= np.linalg.norm(up)
-            rows = 3000 // period_ms
-            moves = np.where(np.arange(rows) > rows // 2, 0.8, 0.0) * np.sin(np.arange(rows) * period_ms / 70)
-            values = zero + one_g * (up + moves[:, None] * [0.3, 0.5, 0.2]) + rng.normal(0, 0.6, (rows, 3))
-            clock = np.arange(rows, dtype=np.int64) * period_ms
-            frames = Frames(np.round(values).astype(np.int64), clock, clock + 1_700_000_000_000)
-            write_recording(folder / f"P{p}" / f"Wave_{1_700_000_000_000 + take}_{rows}.csv", frames, ACCEL)
-    return folder
+from support.accelerometers import ACCEL, analogue
 
 
 @pytest.mark.parametrize(("zero", "one_g"), [(330.0, 68.0), (511.0, 102.0)])
@@ -129,15 +108,17 @@ def test_the_unit_is_recognised_where_it_is_plain(one_g: float, unit: str) -> No
 
 
 def test_the_unit_that_1_g_tells_is_adopted_and_the_model_still_reads_the_device(tmp_path: Path) -> None:
-    metres = replace(ACCEL, channels=tuple(replace(c, unit="g", valid_min=-8000, valid_max=8000) for c in ACCEL.channels))
-    milli = import_recordings(analogue(tmp_path / "R", 0, 1000), tmp_path / "DS", layout=metres)
+    given = replace(
+        ACCEL, channels=tuple(replace(c, unit="g", valid_min=-8000, valid_max=8000) for c in ACCEL.channels)
+    )
+    milli = import_recordings(analogue(tmp_path / "R", 0, 1000), tmp_path / "DS", layout=given)
     (unit,) = (p for p in milli.proposals if p["key"] == "unit")
     assert unit["value"] == dict.fromkeys("xyz", "mg") and unit["adopted"]
     adopted = milli.dataset.layout
     assert [c.unit for c in adopted.channels] == ["mg"] * 3
-    check_layout(metres, adopted)  # the device as its owner describes it, and the model made of the data set
-    assert import_recordings(tmp_path / "R", tmp_path / "DS", layout=metres, add_to=True).already_there == 18
-    other = replace(metres, name="other")
+    check_layout(given, adopted)  # the device as its owner describes it, and the model made of the data set
+    assert import_recordings(tmp_path / "R", tmp_path / "DS", layout=given, add_to=True).already_there == 18
+    other = replace(given, name="other")
     with pytest.raises(ConfigError, match="another kind, unit, scale or step"):
         check_layout(other, adopted)
 
@@ -152,7 +133,7 @@ def test_two_data_sets_of_one_sensor_are_read_alike(tmp_path: Path) -> None:
 
 
 def failing(folder: Path, value: float, rows: int = 1, every: int = 3, times: int = 1) -> Path:
-    """Recordings of two force sensors at 50 Hz, some of which have readings ``value`` of the first, for ``rows`` rows."""
+    """Write recordings of two force sensors at 50 Hz, some with readings ``value`` of the first for ``rows`` rows."""
     rng = np.random.default_rng(0)
     folder.mkdir(parents=True)
     lines = ["subject,time_ms,left,right,label"]

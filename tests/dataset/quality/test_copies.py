@@ -39,7 +39,8 @@ def test_shuffled_copies_in_a_third_file_are_found() -> None:
     gestures = [moving() for _ in range(6)]
     one, other = (np.concatenate([gestures[i] for i in order]) for order in ((0, 1, 2), (4, 2, 5)))
     assert found(recording("b", other), recording("a", one)) == [("a", "b", 400, 200, 200)]
-    shared = found(recording("a", one), recording("b", other), recording("c", np.concatenate([moving(77), gestures[4]])))
+    third = recording("c", np.concatenate([moving(77), gestures[4]]))
+    shared = found(recording("a", one), recording("b", other), third)
     assert shared == [("a", "b", 400, 200, 200), ("b", "c", 0, 77, 200)]
     assert not found(recording("a", one), recording("b", moving())), "nothing in common"
     assert not found(recording("a", one), recording("b", one[100:149])), "less than half a second"

@@ -371,8 +371,10 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
 _OF_ADDED = (SELF_CALIBRATION, "valid_min", "valid_max")
 
 
-def _propose(done: ImportSummary, adopting: bool = False, added: bool = False) -> None:
-    """Measure a data set; add what fits it better to the summary, and to its layout what is proven if ``adopting``.
+def propose(done: ImportSummary, adopting: bool = False, added: bool = False) -> None:
+    """Measure the data set of an import; add what fits it better to the summary, and if ``adopting`` to its layout.
+
+    A layout adopts only what is proven, and a note says what that was.
 
     If recordings were ``added``, only failed readings and sensors that differ are proposed on: the layout has been
     chosen.
@@ -391,7 +393,7 @@ def _propose(done: ImportSummary, adopting: bool = False, added: bool = False) -
     if reasons:
         settings = [f"{', '.join(texts)} ({reason})" for reason, texts in reasons.items()]
         what = [text for texts in reasons.values() for text in texts]
-        message = f"adopted in the layout, unless with --no-adopt: {'; '.join(settings)}"
+        message = f"adopted in the layout (--no-adopt keeps it as given): {'; '.join(settings)}"
         done.notes.append(Sentence(message, reason="adopted", settings=what))
     if layout != head.layout:
         head = replace(head, layout=layout)
@@ -555,7 +557,7 @@ def import_recordings(
                 simulated=search.simulated,
             )
             done = create_dataset(source, dest, search, new_head, people_info, progress)
-            _propose(done, adopt_proposals is not False)
+            propose(done, adopt_proposals is not False)
         else:
             try:
                 done = add_to_dataset(dest, search, known, people_info, progress, generation)
@@ -565,6 +567,6 @@ def import_recordings(
                     f"'{dest}' cannot be written ({cause.strerror or cause}, {cause.filename}), but is as valid as "
                     "before: check the disk and import again."
                 ) from None
-            _propose(done, added=True)
+            propose(done, added=True)
     done.seconds = time.perf_counter() - began
     return done

@@ -1,9 +1,9 @@
 """Find copies of stretches of recordings inside other recordings, by a rolling hash of their rows.
 
 Stretches of half a second are compared, whatever their place, clock and label. Equal ones are copies if they are too
-improbable to be chance: each row counts as the information, in bits, of its values, of their change, or of the change
-of that, whichever is least by its frequency in all recordings together. A sensor at rest, the steps of a coarse one, a ramp and a switch
-that is pressed have little.
+improbable to be chance. Each row counts as the information, in bits, of its values, of their change, or of the change
+of that, whichever is least by its frequency in all recordings together. A sensor at rest, the steps of a coarse one, a
+ramp and a switch that is pressed have little.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class HashedRows:
 
 @dataclass(frozen=True)
 class CopiedStretch:
-    """A stretch of ``rows`` rows of ``second`` from ``second_row`` on that is in ``first`` from ``first_row`` on, too."""
+    """A stretch of ``rows`` rows from ``second_row`` of ``second`` on, which ``first`` has from ``first_row`` on."""
 
     first: RecordingInfo
     second: RecordingInfo
@@ -138,7 +138,7 @@ def _same_place(
 
 
 def copied_recordings(dataset: Dataset, ids: Iterable[str]) -> set[tuple[str, str]]:
-    """Return the pairs, in both orders, of recordings of ``ids`` that share a stretch with each other or with a third."""
+    """Return the pairs, in both orders, of recordings of ``ids`` that share a stretch, maybe one of a third."""
     chosen = set(ids)
     hashed = [HashedRows.of(r, dataset.read(r).values) for r in dataset.used if r.id in chosen]
     alike: dict[str, set[str]] = {}
