@@ -395,12 +395,17 @@ class Layout:
         return replace(self, derived=derived, inputs=(*others, *axes, *(d.name for d in gravity)))
 
     def reads_as(self, other: Layout) -> bool:
-        """Return whether the channels are those of ``other``, but for what an import measures (`MEASURED`).
+        """Return whether the channels are those of ``other``, but for what an import measures (`MEASURED`)."""
+        return self.names == other.names and not self.unlike(other)
+
+    def unlike(self, other: Layout) -> list[str]:
+        """Return which channels of the same names differ from those of ``other`` in more than an import measures.
 
         Units must be the same unless the layouts have the same name.
         """
         measured = dict.fromkeys(key for key in MEASURED if key != "unit" or self.name == other.name)
-        return [asdict(c) | measured for c in self.channels] == [asdict(c) | measured for c in other.channels]
+        pairs = zip(self.channels, other.channels, strict=True)
+        return [a.name for a, b in pairs if asdict(a) | measured != asdict(b) | measured]
 
     def index(self, name: str) -> int:
         """Return the index of a channel; for an unknown name raise LayoutError with the nearest known one."""

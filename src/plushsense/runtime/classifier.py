@@ -311,8 +311,8 @@ def check_layout(sent: Layout, read: Layout) -> None:
             read=read.name,
         )
     raise ConfigError(
-        f"The device sends layout '{sent.name}', in which a channel has another kind, unit, scale or step than in the "
-        f"model's '{read.name}': {ask}.",
+        f"The device sends layout '{sent.name}', in which channel '{sent.unlike(read)[0]}' has another unit, scale, "
+        f"step or kind than in the model's '{read.name}': {ask}.",
         reason="toy_layout_differs",
         sent=sent.name,
         read=read.name,

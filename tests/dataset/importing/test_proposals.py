@@ -119,7 +119,7 @@ def test_the_unit_that_1_g_tells_is_adopted_and_the_model_still_reads_the_device
     check_layout(given, adopted)  # the device as its owner describes it, and the model made of the data set
     assert import_recordings(tmp_path / "R", tmp_path / "DS", layout=given, add_to=True).already_there == 18
     other = replace(given, name="other")
-    with pytest.raises(ConfigError, match="another kind, unit, scale or step"):
+    with pytest.raises(ConfigError, match="channel 'x' has another unit, scale, step"):
         check_layout(other, adopted)
 
 
