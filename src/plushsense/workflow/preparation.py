@@ -138,7 +138,7 @@ def warn_of_far_readings(windows: WindowSet, warn: Warn) -> None:
         people = ", ".join(sorted(set(windows.subject[far.any(axis=1)].tolist())))
         sentence = (
             f"the scale of {name} is set by {n} samples ({percent:.2g} %, of {people}) far from all others, so that "
-            f"everything else looks alike in it: look at them with  plushsense check  and, if they failed, give the "
+            "everything else looks alike in it: if these readings failed, exclude their recordings, or give the "
             "layout a valid_min and valid_max without them"
         )
         warn(Sentence(sentence, "far_readings", channel=name, n=n, people=people))
