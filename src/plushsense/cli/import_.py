@@ -26,12 +26,12 @@ def _columns(texts: list[str]) -> dict[str, str]:
 def _report(result: dict[str, Any], names: str) -> None:
     """Print warnings, and what was left out or rejected, on standard error; ``names`` says where all warnings are."""
     for line in result["warnings"][:_MOST_WARNINGS]:
-        say(f"warning: {line}")
+        say(line if getattr(line, "reason", "") == "adopted" else f"warning: {line}")
     if len(result["warnings"]) > _MOST_WARNINGS:
         say(f"... and {len(result['warnings']) - _MOST_WARNINGS} more warnings{names}")
     for sensor in result.get("sensors", ()):
         say(f"accelerometer {', '.join(sensor['axes'])}: {sensor['summary']}")
-    for proposal in result.get("proposals", ()):
+    for proposal in (p for p in result.get("proposals", ()) if not p["adopted"]):
         say(f"suggestion: {proposal['reason']}: {proposal['advice']}")
     for status in ("left_out", "rejected"):
         by_reason: dict[str, list[str]] = {}

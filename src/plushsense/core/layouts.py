@@ -117,6 +117,10 @@ class Channel:
         return float(f"{steps * self.step:.6g}"), f" {self.unit}" if plain else ""
 
 
+# What an import measures of the channels of a data set, and puts into its layout.
+MEASURED = ("offset", "unit", "valid_min", "valid_max")
+
+
 @dataclass(frozen=True)
 class Derived:
     """A channel computed from others, an integer with 4 fraction bits (`plushsense.windows.features.RunningMean`).
@@ -403,6 +407,19 @@ class Layout:
         others = [name for name in self.inputs if name not in (*axes, *(d.name for d in gravity))]
         derived = tuple(d for d in self.derived if d.kind != "gravity") + gravity
         return replace(self, derived=derived, inputs=(*others, *axes, *(d.name for d in gravity)))
+
+    def reads_as(self, other: Layout) -> bool:
+        """Return whether the channels are those of ``other``, but for what an import measures (`MEASURED`)."""
+        return self.names == other.names and not self.unlike(other)
+
+    def unlike(self, other: Layout) -> list[str]:
+        """Return which channels of the same names differ from those of ``other`` in more than an import measures.
+
+        Units must be the same unless the layouts have the same name.
+        """
+        measured = dict.fromkeys(key for key in MEASURED if key != "unit" or self.name == other.name)
+        pairs = zip(self.channels, other.channels, strict=True)
+        return [a.name for a, b in pairs if asdict(a) | measured != asdict(b) | measured]
 
     def index(self, name: str) -> int:
         """Return the index of a channel; for an unknown name raise LayoutError with the nearest known one."""

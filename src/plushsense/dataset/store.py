@@ -341,13 +341,15 @@ class Dataset:
         self._with_stretches = True
 
     def with_inputs(self, layout: Layout) -> Dataset:
-        """Return this data set with the network inputs of ``layout``; itself if the measured channels differ.
+        """Return this data set as a network with ``layout`` reads it; itself if it is of other channels.
 
-        With the inputs comes the self-calibration that they are computed from.
+        Besides the inputs, offsets, valid ranges, rate, gap and self-calibration become those of ``layout``: in a data
+        set, they may have been measured when it was imported (`Layout.reads_as`).
         """
         own = self.layout
-        given = {key: getattr(layout, key) for key in ("inputs", "derived", "self_calibration")}
-        if own.channels != layout.channels or given == {key: getattr(own, key) for key in given}:
+        keys = ("channels", "rate_hz", "gap_ms", "inputs", "derived", "self_calibration")
+        given = {key: getattr(layout, key) for key in keys}
+        if not own.reads_as(layout) or given == {key: getattr(own, key) for key in given}:
             return self
         head = replace(self.head, layout=replace(own, **given))
         return self._copy(head, self.recordings)

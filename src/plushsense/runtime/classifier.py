@@ -293,13 +293,13 @@ class BothEngines(IntegerClassifier):
 def check_layout(sent: Layout, read: Layout) -> None:
     """Raise ConfigError if a model cannot read the frames that a device sends.
 
-    The channels are compared, with their units, integer steps and valid ranges, but not the line format, so that older
-    firmware of the same toy is accepted. Rate, gap and inputs are those of the model.
+    The channels are compared, with their units and integer steps, but not the line format, so that older firmware of
+    the same toy is accepted. Rate, gap, inputs, offsets and valid ranges are those of the model.
 
     Raises:
         ConfigError: naming both layouts and the first channel that differs.
     """
-    if sent.channels == read.channels:
+    if sent.reads_as(read):
         return
     ask = f"open the device with ?layout={read.name}, or take a model made for '{sent.name}'"
     if sent.names != read.names:
@@ -310,10 +310,9 @@ def check_layout(sent: Layout, read: Layout) -> None:
             sent=sent.name,
             read=read.name,
         )
-    other = next(a.name for a, b in zip(sent.channels, read.channels, strict=True) if a != b)
     raise ConfigError(
-        f"The device sends layout '{sent.name}', in which channel '{other}' has another unit, scale, step or "
-        f"valid range than in the model's '{read.name}': {ask}.",
+        f"The device sends layout '{sent.name}', in which channel '{sent.unlike(read)[0]}' has another unit, scale, "
+        f"step or kind than in the model's '{read.name}': {ask}.",
         reason="toy_layout_differs",
         sent=sent.name,
         read=read.name,

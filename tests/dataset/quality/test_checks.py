@@ -232,6 +232,10 @@ def spiky(folder: Path) -> str:
     return change(recording(folder), with_values(np.arange(40, 280, 40), 11, 9000))
 
 
+def failed(folder: Path) -> str:
+    return change(recording(folder), with_values(120, 11, 8388607))
+
+
 def malformed(folder: Path) -> str:
     path = recording(folder)
     lines = path.read_text().splitlines(keepends=True)
@@ -249,6 +253,11 @@ def duplicate(folder: Path) -> str:
     target.write_text(format_header(PLUSH) + format_rows(moved, PLUSH), newline="\n")
     target = renamed(target, len(moved))
     return target.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
+def copied_inside(folder: Path) -> str:
+    taken = read_recording(recording(folder, label="Tail tap 1"), PLUSH).frames.values[100:]
+    return change(recording(folder, 2, "Tail tap 1", "P4"), with_values(slice(30, 30 + len(taken)), slice(None), taken))
 
 
 def overlapping(folder: Path) -> str:
@@ -397,8 +406,10 @@ PLANTS: list[tuple[str, Callable[[Path], str]]] = [
     ("garbage", garbage),
     ("blank-rows", blank),
     ("spikes", spiky),
+    ("garbage", failed),
     ("malformed", malformed),
     ("duplicate", duplicate),
+    ("duplicate", copied_inside),
     ("overlap", overlapping),
     ("missing", missing),
     ("several-gestures", two_in_one),

@@ -377,19 +377,33 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
     return search
 
 
-def _propose(done: ImportSummary, adopting: bool = False, added: bool = False) -> None:
-    """Measure a data set; add what fits it better to the summary, and to its layout if ``adopting``.
+_OF_ADDED = (SELF_CALIBRATION, "valid_min", "valid_max")
 
-    If recordings were ``added``, only sensors that differ are proposed on: the layout has been chosen.
+
+def propose(done: ImportSummary, adopting: bool = False, added: bool = False) -> None:
+    """Measure the data set of an import; add what fits it better to the summary, and if ``adopting`` to its layout.
+
+    A layout adopts only what is proven, and a note says what that was.
+
+    If recordings were ``added``, only failed readings and sensors that differ are proposed on: the layout has been
+    chosen.
     """
     sensors = find_sensors(done.dataset)
     done.sensors = [sensor.to_dict() for sensor in sensors]
-    found = [p for p in propose_settings(done.dataset, sensors) if not added or p.key == SELF_CALIBRATION]
+    found = [p for p in propose_settings(done.dataset, sensors) if not added or p.key in _OF_ADDED]
     head = done.dataset.head
     layout = adopt(head.layout, found) if adopting else head.layout
+    reasons: dict[str, list[str]] = {}
     for p in found:
-        adopted = adopting and (p.key != SELF_CALIBRATION or set(p.value) <= set(layout.self_calibration))
-        done.proposals.append({**p.to_dict(), "advice": p.advice(adopted)})
+        adopted = adopting and p.proven and (p.key != SELF_CALIBRATION or set(p.value) <= set(layout.self_calibration))
+        done.proposals.append({**p.to_dict(), "advice": p.advice(adopted), "adopted": adopted})
+        if adopted:
+            reasons.setdefault(p.reason, []).append(p.setting)
+    if reasons:
+        settings = [f"{', '.join(texts)} ({reason})" for reason, texts in reasons.items()]
+        what = [text for texts in reasons.values() for text in texts]
+        message = f"adopted in the layout (--no-adopt keeps it as given): {'; '.join(settings)}"
+        done.notes.append(Sentence(message, reason="adopted", settings=what))
     if layout != head.layout:
         head = replace(head, layout=layout)
         write_file(done.dataset.path / HEAD, head.to_toml())
@@ -451,9 +465,9 @@ def _check_layout(dest: Path, own: Layout, given: Layout | None, named: bool) ->
     Args:
         named: whether the user named the layout; otherwise it is that of a pattern.
     """
-    if named and given is not None and given.to_dict() != own.to_dict():
+    # Rate, gap, offsets and others may have been adopted from the recordings.
+    if named and given is not None and not (own.name == given.name and own.reads_as(given)):
         raise DatasetError(f"'{dest}' has the layout '{own.name}', not '{given.name}': leave --layout out.")
-    # The rate, gap and offsets may have been adopted from the recordings.
     if not named and given is not None and _grid(given) != _grid(own):
         raise DatasetError(
             f"'{dest}' has the channels {', '.join(own.names)}, but the pattern has {', '.join(given.names)}, or other "
@@ -477,7 +491,7 @@ def import_recordings(
     people: str | Path | None = None,
     columns: Mapping[str, str] | None = None,
     limits: UnpackLimits | None = None,
-    adopt_proposals: bool = False,
+    adopt_proposals: bool | None = None,
     person: str | None = None,
     guess_layout: bool = False,
     pattern: ImportPattern | str | Path | None = None,
@@ -498,8 +512,8 @@ def import_recordings(
         columns: the column of a table by role (``{"label": "activity"}``); in XDF files the ``stream`` and the
             ``markers`` by name or ``#number``, and the labels of channels.
         limits: limits of unpacking a zip.
-        adopt_proposals: put the proposed rate, gap, offsets and self-calibration (see `propose_settings`) into the
-            layout of the new data set; otherwise they are only reported.
+        adopt_proposals: whether the layout of a new data set takes what its recordings prove (see `propose_settings`):
+            rate, gap, offsets, units, valid ranges, self-calibration. Everything else is only reported.
         person: the person of files that name none: those directly in ``source``, in folders of gestures, and XDF files
             and tables without a person. "" refuses them; None takes the name of the folder where there is one.
         guess_layout: if no layout is given or stated, take the most probable built-in one that can read the files.
@@ -553,7 +567,7 @@ def import_recordings(
                 simulated=search.simulated,
             )
             done = create_dataset(source, dest, search, new_head, people_info, progress)
-            _propose(done, adopt_proposals)
+            propose(done, adopt_proposals is not False)
         else:
             try:
                 done = add_to_dataset(dest, search, known, people_info, progress, generation)
@@ -563,6 +577,6 @@ def import_recordings(
                     f"'{dest}' cannot be written ({cause.strerror or cause}, {cause.filename}), but is as valid as "
                     "before: check the disk and import again."
                 ) from None
-            _propose(done, added=True)
+            propose(done, added=True)
     done.seconds = time.perf_counter() - began
     return done

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.layouts import ACCELERATION, Layout
 from plushsense.core.recorder_csv import Frames
+from plushsense.dataset.quality.copies import HashedRows
 from plushsense.dataset.quality.findings import CheckLimits
 from plushsense.dataset.store import Dataset, RecordingInfo, StreamInfo
 from plushsense.recording.takes import measured_rate_hz
@@ -208,7 +209,8 @@ class RecordingSummary:
     ``top_at`` are the same at the highest or lowest value ``top``, which occurs in ``top_rows`` rows. ``spread`` (C,)
     is the range from the 2nd to the 98th percentile, ``lowest`` and ``highest`` the extremes, ``zeros`` counts the rows
     that are 0 and ``near_zeros`` those from 1 to `NEAR_ZERO` steps beside it, ``low`` the 10th percentile, ``lows`` (K,
-    C) the 10th percentile of every 10 s of a stream. ``content`` is a hash of the values, b"" for a stream.
+    C) the 10th percentile of every 10 s of a stream. ``content`` is a hash of the values, b"" for a stream, and
+    ``hashed`` has one of each row, None for a stream.
     """
 
     info: RecordingInfo | StreamInfo
@@ -231,6 +233,7 @@ class RecordingSummary:
     near_zeros: NDArray[np.int64]
     content: bytes
     lows: NDArray[np.float64] | None = None
+    hashed: HashedRows | None = None
 
     @property
     def first_row(self) -> int:
@@ -308,6 +311,7 @@ def summarize(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) 
         # Hash the values only, since copies may have other names and clocks.
         b"" if stream else hashlib.sha256(np.ascontiguousarray(frames.values).tobytes()).digest(),
         lows,
+        None if isinstance(info, StreamInfo) else HashedRows.of(info, frames.values),
     )
 
 

@@ -12,6 +12,9 @@ from plushsense.dataset.quality.findings import CheckLimits, Issue, Severity
 from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, Examination, duration_s
 
 _FEW = 0.01
+# A spike is an error at so many times the usual, and a value outside a valid range at so many times the range.
+_FAILED, _BEYOND = 1000, 300
+_MOVES = 4
 _SPIKE_ROWS = 20
 _OF_SPREAD = 0.02
 _SHOWN = 50
@@ -70,12 +73,14 @@ def garbage(s: Examination) -> Iterator[Issue]:
         channels = np.flatnonzero(outside.any(axis=0)).tolist()
         names = [s.layout.names[c] for c in channels]
         n, row = int(outside.sum()), s.row(int(np.argmax(rows)))
+        least, most = s.layout.valid_min_int, s.layout.valid_max_int
+        beyond = np.maximum(least - values, values - most) > _BEYOND * (most - least)
         message = f"{_plural(n, 'value')} outside the valid range ({', '.join(names)}; first in row {row})"
         yield Issue(
             Sentence(message, "out_of_range", n=n, channels=names, row=row),
             _ranges(np.flatnonzero(rows), s),
             tuple(channels),
-            severity=_weight(float(rows.mean()), s.limits),
+            severity="error" if beyond.any() and not s.stream else _weight(float(rows.mean()), s.limits),
         )
 
 
@@ -108,6 +113,8 @@ def spikes(s: Examination) -> Iterator[Issue]:
     # Another check reports values outside the valid range.
     far &= (values[1:-1] >= s.layout.valid_min_int) & (values[1:-1] <= s.layout.valid_max_int)
     rows = np.flatnonzero(far.any(axis=1)) + 1
+    # Beside a channel at rest, whose steps are 0 or 1, a tap is as large.
+    failed = far & (size > _FAILED * usual) & (usual >= _MOVES)
     if len(rows):
         n, row = len(rows), s.row(rows[0])
         message = (
@@ -116,7 +123,7 @@ def spikes(s: Examination) -> Iterator[Issue]:
         yield Issue(
             Sentence(message, "spikes", n=n, row=row),
             _ranges(rows, s),
-            severity=_weight(len(rows) / len(values), s.limits),
+            severity="error" if failed.any() else _weight(len(rows) / len(values), s.limits),
         )
 
 

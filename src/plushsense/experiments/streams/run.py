@@ -236,7 +236,7 @@ def streams_at(path: str | os.PathLike[str], bundle: Bundle | None = None) -> It
         return
     with temporary_folder() as folder:
         layout, gestures = (None, None) if bundle is None else (bundle.layout, bundle.gestures)
-        yield import_recordings(place, folder / "DS", layout=layout, gestures=gestures).dataset
+        yield import_recordings(place, folder / "DS", layout=layout, gestures=gestures, adopt_proposals=False).dataset
 
 
 def _people_of(dataset: Dataset, path: str | os.PathLike[str], subjects: Sequence[str] | None) -> list[str]:
