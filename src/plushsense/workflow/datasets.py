@@ -157,7 +157,6 @@ def publish_dataset(
     excluded: bool = False,
     columns: tuple[str, ...] = (),
     key: str | os.PathLike[str] | None = None,
-    bids: bool = False,
     reidentification: bool = True,
     seed: int = 1,
     published: str | None = None,
@@ -175,7 +174,6 @@ def publish_dataset(
         columns: columns of ``subjects.csv`` to publish besides age group and gender.
         key: a file outside the data set, created if absent. Packages made with the same key have the same time shifts;
             without a key they are random.
-        bids: add a folder tree in the style of Motion-BIDS.
         reidentification: test whether people can be recognised, and report it in the package.
         published: ISO date of the publication (default: today).
         thorough: let the slow validators read every row of the streams.
@@ -203,7 +201,6 @@ def publish_dataset(
         folder,
         head,
         options=options,
-        bids=bids,
         reidentification=tested,
         published=published,
         thorough=thorough,
