@@ -18,7 +18,7 @@ from plushsense.dataset.index import as_dataset, change_head, open_dataset
 from plushsense.dataset.privacy.forget import RemovalPlan, find_mentions, plan_removal
 from plushsense.dataset.privacy.forget import forget as remove_person
 from plushsense.dataset.publishing.checking import StageProgress
-from plushsense.dataset.publishing.contents import PublishOptions, public_codes
+from plushsense.dataset.publishing.contents import PublishOptions, public_codes, public_labels
 from plushsense.dataset.publishing.package import (
     PublishResult,
     Reidentification,
@@ -193,7 +193,7 @@ def publish_dataset(
     tested = None
     if reidentification:
         steps = (lambda done, total: progress("recognising people", done, total)) if progress else None
-        result = reidentify(dataset, seed=seed, progress=steps).under(public_codes(dataset))
+        result = reidentify(dataset, seed=seed, progress=steps).under(public_codes(dataset), public_labels(dataset))
         command = f"plushsense publish DATASET OUT --seed {seed}"
         tested = Reidentification(report(result, command), verdict(result), result.to_dict())
     done = publish(

@@ -18,7 +18,7 @@ from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks, read_marks
 from plushsense.dataset.publishing.contents import PublishOptions
 from plushsense.dataset.publishing.package import PublishResult
-from plushsense.dataset.publishing.texts import changed_text, is_misread, kind_of, public_labels
+from plushsense.dataset.publishing.texts import changed_text, is_misread, kind_of, label_prefix, public_label
 from plushsense.dataset.store import Dataset, PersonInfo, write_people
 from support.requirements import missing
 from support.toys import KEY, made_of
@@ -214,11 +214,8 @@ def test_texts_that_are_misread() -> None:
     )
     assert [text for text in odd if not is_misread(text)] == []
     assert not any(map(is_misread, ("none", "Pat", "1st", "Tail tap 1", "?", "❤", "手", "e3", "gesture 01")))
-    assert public_labels(["01", "gesture_01", "Pat"]) == {
-        "01": "gesture gesture 01",
-        "gesture_01": "gesture_01",
-        "Pat": "Pat",
-    }
+    assert (label_prefix(["01", "Pat"]), label_prefix(["01", "gesture_01"])) == ("gesture ", "gesture gesture ")
+    assert [public_label(label, "gesture ") for label in ("01", "Pat")] == ["gesture 01", "Pat"]
     assert [kind_of(v) for v in (["7", ""], ["7", "7.5"], ["true"], ["7", "a"], ["07"], [""])] == [
         "integer",
         "number",

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import hmac
 import secrets
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ from plushsense.core.recorder_csv import (
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.index import DUPLICATE_FOLDER, build_index
 from plushsense.dataset.marks import MARKS, PRACTICE, Mark, MarkState, mark_line, read_marks
-from plushsense.dataset.publishing.texts import is_misread, public_labels
+from plushsense.dataset.publishing.texts import is_misread, label_prefix, public_label
 from plushsense.dataset.store import (
     HEAD,
     PEOPLE,
@@ -159,7 +160,7 @@ class ContentsWriter:
         clocks = (HOST_MS, DEVICE_MS) if self._all_have_host() else (DEVICE_MS,)
         columns = (*clocks, *dataset.layout.names, *(("label",) if self.labelled else ()))
         self.layout = replace(dataset.layout, csv=CsvFormat(columns, columns, ","))
-        self.labels = public_labels(self._labels())
+        self.label = public_labels(dataset)
         self.head = replace(head, layout=self.layout, gestures=self._gestures(), source="")
         folders = {_folder_of(r.file) for r in self.kept} | {_folder_of(s.file) for s in self.streams}
         self.codes = {folder: public for folder, public in public_codes(dataset).items() if folder in folders}
@@ -183,7 +184,7 @@ class ContentsWriter:
         (self.folder / HEAD).write_text(self.head.to_toml(), encoding="utf-8", newline="\n")
         built = build_index(self.folder, self.head)
         published = {r.id: r for r in built.dataset.recordings}
-        origin = {ids[r.id]: replace(r, gesture=self.labels[r.gesture]) for r in self.kept}
+        origin = {ids[r.id]: replace(r, gesture=self.label(r.gesture)) for r in self.kept}
         if built.unreadable or published.keys() != origin.keys():
             odd = next(iter([*built.unreadable, *(published.keys() ^ origin.keys())]))
             raise DatasetError(
@@ -214,7 +215,7 @@ class ContentsWriter:
             target = self._free(f"{folder}/{self._inner(code, stream.session)}{STREAM_NAME}")
         raw = read_stream(self.source.path / stream.file, self.source.layout).frames
         if raw.labels is not None:
-            raw = replace(raw, labels=np.array([self.labels.get(label, label) for label in raw.labels.tolist()]))
+            raw = replace(raw, labels=np.array(list(map(self.label, raw.labels.tolist()))))
         self._put(target, self.shifts[code].frames(raw, self._host), raw.values)
         return target
 
@@ -240,7 +241,7 @@ class ContentsWriter:
             clock = shifted.host_ms if shifted.host_ms is not None else shifted.device_ms
             epoch = int(clock[0])
         folder = f"{RECORDINGS}/{self.codes[code]}/{self._inner(code, recording.session)}"
-        target = self._free(folder + recording_filename(self.labels[name.label], max(0, epoch), name.rows))
+        target = self._free(folder + recording_filename(self.label(name.label), max(0, epoch), name.rows))
         self._put(target, shifted, frames.values)
         return target
 
@@ -281,27 +282,16 @@ class ContentsWriter:
         if not self.labelled:
             return identity
         number = recording.id.removeprefix(f"{recording.stream}#").partition(" ")[0]
-        return f"{identity}#{number} {self.labels[recording.recorded]}"
+        return f"{identity}#{number} {self.label(recording.recorded)}"
 
     @property
     def _host(self) -> bool:
         return HOST_MS in self.layout.csv.columns
 
-    def _labels(self) -> Iterable[str]:
-        """Yield every label of a gesture or a family, as files, rows, marks and the gesture set have it."""
-        for g in self.source.gestures.gestures:
-            yield from (g.label, g.family, *g.labels)
-        for r in self.kept:
-            named = parse_name(Path(r.file).name)
-            yield from (r.gesture, r.recorded, *((named.label,) if named else ()))
-        for stream in self.streams if self.labelled else ():
-            labels = read_stream(self.source.path / stream.file, self.source.layout).frames.labels
-            yield from (() if labels is None else np.unique(labels).tolist())
-
     def _gestures(self) -> GestureSet:
         def public(g: Gesture) -> Gesture:
-            family, *others = (self.labels[label] for label in (g.family, *g.labels))
-            return replace(g, label=self.labels[g.label], family=family, labels=tuple(others))
+            labels = tuple(map(self.label, g.labels))
+            return replace(g, label=self.label(g.label), family=self.label(g.family), labels=labels)
 
         gestures = self.source.gestures
         return replace(gestures, gestures=tuple(map(public, gestures.gestures)))
@@ -380,7 +370,7 @@ class ContentsWriter:
             if (mark.start, mark.stop) != (0, -1):
                 marks.append(Mark(identity, "trim", "", start=mark.start, stop=mark.stop))
             if mark.gesture:
-                marks.append(Mark(identity, "relabel", "", gesture=self.labels.get(mark.gesture, mark.gesture)))
+                marks.append(Mark(identity, "relabel", "", gesture=self.label(mark.gesture)))
             if mark.excluded:
                 marks.append(Mark(identity, "exclude", ""))
             marks += [Mark(identity, "accept", "", check=check) for check in sorted(mark.accepted)]
@@ -389,7 +379,7 @@ class ContentsWriter:
             identity = Path(files[stream.file]).relative_to(STREAMS).with_suffix("").as_posix()
             stretches = states.get(stream.id, MarkState()).stretches
             for s in stretches:
-                label = f"{PRACTICE}{self.labels.get(s.gesture, s.gesture)}" if s.gesture else s.label
+                label = f"{PRACTICE}{self.label(s.gesture)}" if s.gesture else s.label
                 marks.append(Mark(identity, "label", "", start=s.start, stop=s.stop, label=label))
         if marks:
             (self.folder / MARKS).write_text("".join(map(mark_line, marks)), encoding="utf-8", newline="\n")
@@ -428,9 +418,9 @@ class ContentsWriter:
                 "a P in front."
             )
             self.notes.append(Sentence(message, "codes_renamed", n=len(renamed)))
-        odd = sorted(r for r in {r.gesture for r in self.kept} if self.labels[r] != r)
+        odd = sorted(r for r in {r.gesture for r in self.kept} if self.label(r) != r)
         if odd:
-            listed = ", ".join(f"'{label}' is now '{self.labels[label]}'" for label in odd)
+            listed = ", ".join(f"'{label}' is now '{self.label(label)}'" for label in odd)
             message = f"Renamed: gestures that other programs read as a number, a date or no value; {listed}."
             self.notes.append(Sentence(message, "gestures_renamed", n=len(odd), listed=listed))
         if self.streams and published.recordings and not self.labelled:
@@ -462,3 +452,10 @@ def public_codes(dataset: Dataset) -> dict[str, str]:
         taken.add(public.casefold())
         codes[folder] = public
     return codes
+
+
+def public_labels(dataset: Dataset) -> Callable[[str], str]:
+    """Return the function that gives the public label of a gesture or family of a data set."""
+    used = {label for g in dataset.gestures.gestures for label in (g.label, *g.labels)}
+    used |= {label for r in dataset.recordings for label in (r.gesture, r.recorded)}
+    return partial(public_label, prefix=label_prefix(used))

@@ -36,13 +36,18 @@ def is_misread(text: str) -> bool:
     return _is_no_value(text) or any(pattern.fullmatch(plain) for pattern in (_CHANGED, _OTHER_TYPE))
 
 
-def public_labels(labels: Iterable[str]) -> dict[str, str]:
-    """Return the public label of each gesture: ``gesture 01`` for ``01``, the same for all that are not misread."""
+def label_prefix(labels: Iterable[str]) -> str:
+    """Return what `public_label` puts in front: ``gesture ``, more often where a label would then be there twice."""
     labels = set(labels)
     prefix, plain = "gesture ", {plain_label(label) for label in labels}
     while any(plain_label(prefix + label) in plain for label in labels if is_misread(label)):
         prefix += "gesture "
-    return {label: prefix + label if is_misread(label) else label for label in labels}
+    return prefix
+
+
+def public_label(label: str, prefix: str) -> str:
+    """Return the public label of a gesture: ``gesture 01`` for ``01``, and one that nobody misreads as it is."""
+    return prefix + label if is_misread(label) else label
 
 
 def kind_of(values: Iterable[str]) -> str:
