@@ -239,3 +239,27 @@ def test_the_head_of_the_readme_lists_every_table(package: PublishResult) -> Non
     configs = [json.loads(line[2:]) for line in head.splitlines() if "data_files" in line]
     assert [c["config_name"] for c in configs] == [t.name for t in package.description.tables]
     assert text.startswith("# ")
+
+
+def test_the_code_in_the_readme_runs(
+    package: PublishResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, expected: list[tuple[str, str, str]]
+) -> None:
+    for module in ("mlcroissant", "frictionless", "duckdb", "pandas", "polars"):
+        reader(module)
+    monkeypatch.setattr(reader("datasets").config, "HF_DATASETS_CACHE", tmp_path)
+    monkeypatch.chdir(package.folder)
+    blocks = re.findall(r"```python\n(.*?)```", (package.folder / "README.md").read_text("utf-8"), re.DOTALL)
+    assert len(blocks) == 5
+    found: dict[str, Any] = {}
+    # Not the first one: PlushSense may write its index into the folder.
+    for block in blocks[1:]:
+        exec(block, found)
+        if "recordings" in block:
+            rows = found["recordings"]
+            rows = rows.to_dict("records") if hasattr(rows, "to_dict") and hasattr(rows, "iloc") else list(rows)
+            assert [(r["subject"], r["gesture"], r["file"]) for r in rows] == expected
+        if "one =" in block:
+            assert len(found["one"]) == ROWS
+        if "rows =" in block:
+            assert found["rows"].shape[0] == ROWS * len(expected)
+    assert found["row"]["samples/file"].decode() == expected[-1][2]
