@@ -18,7 +18,7 @@ from plushsense.dataset.index import as_dataset, change_head, open_dataset
 from plushsense.dataset.privacy.forget import RemovalPlan, find_mentions, plan_removal
 from plushsense.dataset.privacy.forget import forget as remove_person
 from plushsense.dataset.publishing.checking import StageProgress
-from plushsense.dataset.publishing.contents import PublishOptions, public_codes
+from plushsense.dataset.publishing.contents import PublishOptions, public_codes, public_labels
 from plushsense.dataset.publishing.package import (
     PublishResult,
     Reidentification,
@@ -157,7 +157,6 @@ def publish_dataset(
     excluded: bool = False,
     columns: tuple[str, ...] = (),
     key: str | os.PathLike[str] | None = None,
-    bids: bool = False,
     reidentification: bool = True,
     seed: int = 1,
     published: str | None = None,
@@ -175,7 +174,6 @@ def publish_dataset(
         columns: columns of ``subjects.csv`` to publish besides age group and gender.
         key: a file outside the data set, created if absent. Packages made with the same key have the same time shifts;
             without a key they are random.
-        bids: add a folder tree in the style of Motion-BIDS.
         reidentification: test whether people can be recognised, and report it in the package.
         published: ISO date of the publication (default: today).
         thorough: let the slow validators read every row of the streams.
@@ -195,7 +193,7 @@ def publish_dataset(
     tested = None
     if reidentification:
         steps = (lambda done, total: progress("recognising people", done, total)) if progress else None
-        result = reidentify(dataset, seed=seed, progress=steps).under(public_codes(dataset))
+        result = reidentify(dataset, seed=seed, progress=steps).under(public_codes(dataset), public_labels(dataset))
         command = f"plushsense publish DATASET OUT --seed {seed}"
         tested = Reidentification(report(result, command), verdict(result), result.to_dict())
     done = publish(
@@ -203,7 +201,6 @@ def publish_dataset(
         folder,
         head,
         options=options,
-        bids=bids,
         reidentification=tested,
         published=published,
         thorough=thorough,
