@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, say, table
 from plushsense.cli.settings import listed, report_stages
+from plushsense.cli.signals import interrupt_on_signals
 from plushsense.core.errors import ConfigError
 from plushsense.core.files import check_output_file
 
@@ -38,6 +39,7 @@ def _publish(args: argparse.Namespace) -> int:
     from plushsense.devices.opening import open_device
 
     with (
+        interrupt_on_signals(),
         open_device(args.lsl_out, args.layout, reconnect=True) as device,
         LslOutlet(device.layout, args.lsl_name or "PlushSense") as outlet,
     ):
