@@ -18,7 +18,7 @@ from urllib.parse import unquote
 
 from plushsense.core.errors import ConfigError, DeviceError, need
 from plushsense.core.layouts import Layout
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, join_names
 from plushsense.devices.base import Device, Frame, now_ms
 from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
 from plushsense.devices.wire import LineParser
@@ -273,7 +273,7 @@ class BleDevice(Device):
         else:
             here = f"there are {len(names)} without a name" if names else "nothing advertises here"
         if connected:
-            still = ", ".join(f"{device.name or 'a device without a name'} ({device.address})" for device in connected)
+            still = join_names(f"{device.name or 'a device without a name'} ({device.address})" for device in connected)
             here += f"; still connected to this computer: {still}"
         described = f"named '{target.name}'" if target.address is None else f"with the address {target.address}"
         raise DeviceError(
@@ -288,7 +288,7 @@ class BleDevice(Device):
         service = next((s for s in services if s.uuid.lower() == target.service), None)
         if service is None:
             raise DeviceError(
-                f"'{self.url}' has no service {target.service}; it has {_listed(s.uuid for s in services)}: "
+                f"'{self.url}' has no service {target.service}; it has {join_names(sorted(s.uuid for s in services))}: "
                 "write ?service=UUID&tx=UUID."
             )
         notifying = [c for c in service.characteristics if {"notify", "indicate"} & set(c.properties)]
@@ -299,7 +299,7 @@ class BleDevice(Device):
             wrong = "names none of those" if target.tx is None else f"{target.tx} is none of those"
             raise DeviceError(
                 f"'{self.url}': of service {target.service} the characteristics that notify are "
-                f"{_listed(c.uuid for c in notifying)}, and the URL's tx {wrong}: write &tx=UUID."
+                f"{join_names(sorted(c.uuid for c in notifying))}, and the URL's tx {wrong}: write &tx=UUID."
             )
         return match
 
@@ -382,11 +382,6 @@ def in_words(cause: Exception) -> str:
 
 def _same(address: str, other: str) -> bool:
     return address.replace("-", ":").lower() == other.replace("-", ":").lower()
-
-
-def _listed(uuids: Any) -> str:
-    texts = sorted(uuids)
-    return ", ".join(texts) if texts else "none"
 
 
 def _uuid(address: DeviceAddress, key: str) -> str | None:

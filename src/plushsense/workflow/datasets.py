@@ -370,7 +370,7 @@ def _training_of(bundle: Bundle, subject: str, name: str, dataset: Dataset | Non
     if same_name:
         return "trained on this code in an earlier state of this data set: train it again, and remove it", False
     return (
-        f"trained on this code in the data set '{provenance.get('dataset')}': check whether it is the same person",
+        f"trained on this code in the data set '{provenance.get('dataset', '?')}': check whether it is the same person",
         False,
     )
 
