@@ -66,7 +66,6 @@ _NEVER_EMPTY = {
     "'; '.join((f'{name}: {why}' for name, why in not_run))": "of two lists, the other one is empty",
     "', '.join((c for c in EVENT_COLUMNS if c not in ('t', 'label')))": "a constant",
     "', '.join((label for label in labels if label not in used))": "after len(used) < len(labels)",
-    "', '.join((f'{int((self.context == c).sum())} {c}' for c in np.unique(self.context)))": "of a representation",
     "' and '.join(dict.fromkeys((v.name for v in stream)))": "a stream of the proof has vectors",
     "', '.join([f'{config.preset} training, seed {config.training.seed}'] + [f'{key} {text(value)}' for key, value in "
     "config.changes(layout).items()])": "begins with the preset",

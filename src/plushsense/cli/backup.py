@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from plushsense.cli.output import emit, say
 from plushsense.core.errors import ConfigError, DatasetError
@@ -60,7 +61,7 @@ def run_restore(args: argparse.Namespace) -> int:
     return 0
 
 
-def _counts(table: dict[str, object]) -> str:
+def _counts(table: dict[str, Any]) -> str:
     return (
         f"{plural(table['recordings'], 'recording')} of {plural(table['subjects'], 'person')}, "
         f"{plural(table['files'], 'file')}"
