@@ -6,8 +6,9 @@ import argparse
 from typing import Any
 
 from plushsense.cli.options import options
-from plushsense.cli.output import emit, plural, say, table
+from plushsense.cli.output import emit, say, table
 from plushsense.core.errors import ConfigError
+from plushsense.core.sentences import plural
 from plushsense.jobs.progress import ProgressReporter
 
 _MOST_WARNINGS = 20
@@ -75,7 +76,7 @@ def _dry_run(args: argparse.Namespace, given: dict[str, Any]) -> int:
         [
             table(["person", "session", "gesture", "time in ms", *shown], rows),
             *more,
-            f"{plural(found['recordings'], 'recording')} of {len(found['subjects'])} people, "
+            f"{plural(found['recordings'], 'recording')} of {plural(len(found['subjects']), 'person')}, "
             f"{plural(found['streams'], 'stream')}, layout {found['layout']}; nothing was written",
             *([f"gestures: {gestures}"] if gestures else []),
         ],
@@ -114,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
     emit(
         args,
         result,
-        f"{args.dest}: {plural(done.recordings, 'recording')} of {done.subjects} people{new}, "
+        f"{args.dest}: {plural(done.recordings, 'recording')} of {plural(done.subjects, 'person')}{new}, "
         f"{plural(len(done.gestures), 'gesture')}, {plural(done.streams, 'stream')}; "
         f"{plural(len(result['warnings']), 'warning')}, {plural(len(done.rejected), 'file')} rejected; "
         f"{done.seconds:.1f} s",

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from plushsense.cli.output import say, write_line
+from plushsense.cli.signals import interrupt_on_signals
 
 if TYPE_CHECKING:
     from plushsense.live.reactions import Reaction
@@ -37,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     if args.smoothing is not None:
         decide = replace(decide, smoothing_s=args.smoothing)
     classifier = classifier_of(bundle, decide, args.engine)
-    with open_device(args.device, bundle.layout, reconnect=args.reconnect) as device:
+    with interrupt_on_signals(), open_device(args.device, bundle.layout, reconnect=args.reconnect) as device:
         say(
             f"reading {args.device}; {bundle.arch.symbol}, a decision every "
             f"{classifier.step_s * 1000:.0f} ms; Ctrl-C ends"

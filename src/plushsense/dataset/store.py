@@ -33,6 +33,7 @@ from plushsense.core.files import refuse_special_files, write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames, ReadResult, read_bytes, read_recording, read_stream
+from plushsense.core.sentences import plural
 from plushsense.core.toml import load_table, read_toml
 from plushsense.dataset.about import About, HeadFile
 from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, append_marks, locked, read_marks
@@ -510,8 +511,9 @@ class Dataset:
 
     def __repr__(self) -> str:
         return (
-            f"Dataset({self.head.name!r}: {len(self.recordings)} recordings, {len(self.subjects)} people, "
-            f"{len(self.gestures)} gestures, {len(self.streams)} streams)"
+            f"Dataset({self.head.name!r}: {plural(len(self.recordings), 'recording')}, "
+            f"{plural(len(self.subjects), 'person')}, {plural(len(self.gestures), 'gesture')}, "
+            f"{plural(len(self.streams), 'stream')})"
         )
 
     def _repr_html_(self) -> str:

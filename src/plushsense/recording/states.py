@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from plushsense.core.errors import DatasetError, PlushSenseError
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, plural
 from plushsense.devices.base import Counters, Device, Frame, now_ms
 from plushsense.recording.plan import Step
 from plushsense.recording.session import Key, OpenSession, SessionProgress
@@ -140,8 +140,8 @@ def write_error(session: OpenSession, recordings: int, cause: Exception) -> Data
     why = getattr(cause, "strerror", None) or cause
     remedy = "close other programs" if lacks_descriptor(cause) else "free disk space"
     return DatasetError(
-        f"'{session.folder}' cannot be written any more ({why}): the session has stopped, with {recordings} recordings "
-        f"saved; {remedy}, and continue the same session.",
+        f"'{session.folder}' cannot be written any more ({why}): the session has stopped, with "
+        f"{plural(recordings, 'recording')} saved; {remedy}, and continue the same session.",
         reason="files_open" if lacks_descriptor(cause) else "disk_full",
         folder=session.folder,
         why=why,

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import Gesture, GestureSet
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, plural
 from plushsense.dataset.marks import LabelledStretch
 from plushsense.dataset.store import Dataset, Progress, RecordingInfo, StreamInfo
 from plushsense.windows.clock import Segment
@@ -186,7 +186,8 @@ def cut_anywhere(
     cuts += [(recording, place.cut(reach)) for recording, place in (*moving, *quiet)]
     if not cuts:
         raise DatasetError(
-            f"Data set '{dataset.head.name}' gives no window: {len(used)} recordings of {len(gestures)} gestures."
+            f"Data set '{dataset.head.name}' gives no window: {plural(len(used), 'recording')} of "
+            f"{plural(len(gestures), 'gesture')}."
         )
     return replace(assemble(cuts, gestures, dataset), left_out=tuple(left_out))
 

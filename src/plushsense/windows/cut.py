@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
 from plushsense.core.gestures import NOBODY, GestureSet
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, plural
 from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, usual_rows
 from plushsense.dataset.store import RECORDINGS, UNKNOWN_SUBJECT, Dataset, Progress, RecordingInfo
 from plushsense.windows.clock import Segment
@@ -134,8 +134,8 @@ class WindowSet:
         n, f, t = self.x.shape
         kinds = ", ".join(f"{int((self.context == c).sum())} {c}" for c in np.unique(self.context))
         return (
-            f"WindowSet({n} windows of {f} channels × {t} samples at {self.rate_hz:g} Hz, "
-            f"{len(np.unique(self.recording))} recordings, {len(self.labels)} classes; {kinds})"
+            f"WindowSet({plural(n, 'window')} of {plural(f, 'channel')} × {t} samples at {self.rate_hz:g} Hz, "
+            f"{plural(len(np.unique(self.recording)), 'recording')}, {len(self.labels)} classes; {kinds or 'empty'})"
         )
 
 
@@ -250,8 +250,8 @@ def cut_windows(
             progress(done + 1, len(recordings))
     if not cuts:
         raise DatasetError(
-            f"Data set '{dataset.head.name}' gives no window: {len(recordings)} recordings of "
-            f"{len(gestures)} gestures ({', '.join(gestures.labels[:6])}…).",
+            f"Data set '{dataset.head.name}' gives no window: {plural(len(recordings), 'recording')} of "
+            f"{plural(len(gestures), 'gesture')} ({', '.join(gestures.labels[:6])}…).",
             reason="no_windows",
         )
     return replace(assemble(cuts, gestures, dataset), left_out=tuple(left_out))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from plushsense.core.errors import BundleError, ConfigError, DatasetError
 from plushsense.core.files import write_file
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, plural
 from plushsense.dataset.index import as_dataset, change_head, open_dataset
 from plushsense.dataset.privacy.forget import RemovalPlan, find_mentions, plan_removal
 from plushsense.dataset.privacy.forget import forget as remove_person
@@ -63,8 +63,8 @@ class CheckResult(CheckReport):
     def __repr__(self) -> str:
         n = self.counts()["by_severity"]
         return (
-            f"CheckResult({self.dataset.head.name!r}: {self.recordings} recordings, "
-            f"{n['error']} errors, {n['warning']} warnings, {n['info']} notes)"
+            f"CheckResult({self.dataset.head.name!r}: {plural(self.recordings, 'recording')}, "
+            f"{plural(n['error'], 'error')}, {plural(n['warning'], 'warning')}, {plural(n['info'], 'note')})"
         )
 
     def _repr_html_(self) -> str:
@@ -367,7 +367,7 @@ def _training_of(bundle: Bundle, subject: str, name: str, dataset: Dataset | Non
     if same_name:
         return "trained on this code in an earlier state of this data set: train it again, and remove it", False
     return (
-        f"trained on this code in the data set '{provenance.get('dataset')}': check whether it is the same person",
+        f"trained on this code in the data set '{provenance.get('dataset', '?')}': check whether it is the same person",
         False,
     )
 

@@ -18,7 +18,7 @@ from plushsense.core.files import temporary_folder, work_folder, write_file
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, plural
 from plushsense.dataset.importing.adding import add_to_dataset
 from plushsense.dataset.importing.archives import UnpackLimits, unpack
 from plushsense.dataset.importing.build import (
@@ -369,7 +369,8 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
         elif search.shape == "labelled-rows":
             expected += " (or CSVs with a label column)"
         raise DatasetError(
-            f"'{source}' holds no recording: expected {expected}; found {len(search.found)} other files.{first}"
+            f"'{source}' holds no recording: expected {expected}; found "
+            f"{plural(len(search.found), 'other file')}.{first}"
             + ("" if options.pattern is not None else " Other files can be described with --pattern FILE.toml."),
             reason="person_unknown" if unknown else "import_nothing",
             n=len(search.found),

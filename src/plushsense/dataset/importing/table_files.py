@@ -311,7 +311,7 @@ def _numbered(text: TextIO, begin: list[str], separator: str, skipped: int) -> I
 def _bit_column(file: TableFile, name: str, there: Sequence[str]) -> int:
     at = file.column_index((name,), [t.strip().casefold() for t in there])
     if at is None:
-        listed = ", ".join(t.strip()[:30] for t in there[:20])
+        listed = ", ".join(filter(None, (t.strip()[:30] for t in there[:20]))) or "no names"
         raise file.error(f"has no column '{name}', which bits names; it has {listed}", reason="")
     return at
 

@@ -234,7 +234,7 @@ class Export:
         try:
             return read_bytes(self._require_file(name), MOST_FILE_BYTES)
         except OSError as cause:
-            message = f"'{self.folder / name}' cannot be read ({cause.strerror}): export the model again."
+            message = f"'{self.folder / name}' cannot be read ({cause.strerror or cause}): export the model again."
             raise BadInput(message, reason="export_damaged", name=self.folder.name) from None
 
     def require_unchanged(self) -> None:

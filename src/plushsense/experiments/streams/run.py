@@ -315,7 +315,7 @@ def stream_eval(
             warn(f"TRAINED ON: the model was trained on {', '.join(met)}; their scores are too high and are no result")
         if alike := [p for p in wanted if p not in trained and p in known_people(bundle.provenance)]:
             warn(
-                f"the model was trained on people of the same codes in '{bundle.provenance.get('dataset')}': if "
+                f"the model was trained on people of the same codes in '{bundle.provenance.get('dataset', '?')}': if "
                 f"{', '.join(alike)} are the same people, their scores are too high"
             )
         if not known_people(bundle.provenance):
