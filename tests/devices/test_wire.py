@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Iterable
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -165,6 +167,49 @@ def test_a_restarted_or_paused_clock_is_no_loss() -> None:
     meter = LossCounter()
     clock = [*range(0, 1000, 10), *range(5, 500, 10), *range(90_000, 91_000, 10)]
     assert sum(meter.push(c) for c in clock) == 0
+
+
+def stamps(seed: int, n: int = 301, period_ms: float = 10.0, jitter: float = 0.0) -> np.ndarray:
+    """Time stamps of an even clock that are each up to ``jitter`` periods early or late, in order."""
+    even = (np.arange(n) + np.random.default_rng(seed).uniform(-jitter, jitter, n)) * period_ms
+    return np.maximum.accumulate(np.rint(even + 1000).astype(int))
+
+
+def lost(clock: Iterable[int]) -> int:
+    meter = LossCounter()
+    return sum(meter.push(int(ms)) for ms in clock)
+
+
+@pytest.mark.parametrize("period_ms", [10.0, 9.7, 1000 / 60, 40.0])
+@pytest.mark.parametrize("seed", range(12))
+def test_jitter_is_no_loss(seed: int, period_ms: float) -> None:
+    uneven = stamps(seed, period_ms=period_ms, jitter=0.4)
+    assert np.diff(uneven).max() > 1.5 * period_ms
+    assert lost(uneven) == 0
+
+
+def test_late_frames_and_frames_in_bursts_are_no_loss() -> None:
+    clock = stamps(1)
+    for size in (2, 4, 16):
+        assert lost(clock[np.minimum(np.arange(301) // size * size + size, 300)]) == 0, size
+    stalled = np.where((clock >= clock[50]) & (clock < clock[80]), clock[80], clock)
+    assert lost(stalled) == 0, "thirty frames came at once"
+    meter = LossCounter()
+    counted = np.cumsum([meter.push(int(ms)) for ms in stalled])
+    assert counted.max() == 30, "until they come, they are missing"
+
+
+@given(st.sets(st.integers(1, 299), max_size=40), st.sampled_from([10.0, 9.7, 1000 / 60, 40.0]))
+@settings(max_examples=100)
+def test_every_lost_frame_of_an_even_clock_is_counted(missing: set[int], period_ms: float) -> None:
+    missing -= {1, 2, 3, 4}  # the period is known after a few frames
+    assert lost(np.delete(stamps(0, period_ms=period_ms), sorted(missing))) == len(missing)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_loss_is_counted_among_jitter(seed: int) -> None:
+    clock = stamps(seed, jitter=0.15)
+    assert lost(np.delete(clock, [60, 61, 62, 120, 200, 201, 250])) == 7
 
 
 def test_loss_follows_the_real_period() -> None:

@@ -465,7 +465,8 @@ class RecordingMachine:
             self._log_step("start", row=row, host_ms=frame.host_ms, device_ms=frame.device_ms)
             self._enter("recording")
         elif self._take is not None:
-            self._take.lost += missing
+            # Negative where frames that were counted before the recording came late.
+            self._take.lost = max(0, self._take.lost + missing)
         self._received.append(frame)
         if self._take is not None:
             self._take.frames.append(frame)
