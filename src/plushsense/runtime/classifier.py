@@ -53,7 +53,7 @@ class GestureEvent:
         return {"what": values.pop("kind"), **values}
 
 
-State = Literal["warming", "tracking", "no signal", "sensor fault"]
+State = Literal["warming", "tracking", "no signal", "unreadable", "sensor fault"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,8 @@ class Decision:
         confidence: smoothed probability of the gesture, 0 to 1, or None.
         source: what decided: ``cnn``, the network, or, between two steps, ``gate``, the threshold rules.
         state: ``warming`` from the start or a restart until enough samples for the network were read; then
-            ``tracking``; ``no signal`` when frames are missing; ``sensor fault`` when sensors are at fault.
+            ``tracking``; ``no signal`` when frames are missing; ``unreadable`` when lines come that are none;
+            ``sensor fault`` when sensors are at fault.
         probabilities: smoothed probabilities in class order, or None.
         answer: ``sure`` (of one gesture), ``affect`` (of an affect only), ``unsure``, ``unknown`` (not a known
             gesture) or ``idle``; None while there is no answer.
@@ -108,7 +109,12 @@ class StreamReader:
     time of the last frame before. During a sensor fault there are no decisions.
 
     The arguments are those of `ToyMachine`.
+
+    Attributes:
+        bundle: the model that it was made from, None if that is not known; `LiveRun` compares the frames with it.
     """
+
+    bundle: Bundle | None = None
 
     def __init__(
         self, network: LogitStream, layout: Layout, gestures: GestureSet, rules: Rules, smoothing: int
