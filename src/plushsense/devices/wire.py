@@ -82,14 +82,16 @@ class LineParser:
         self._other_fields = self._others = 0
         # The first unreadable line since the last frame, and how many there were.
         self._unread, self._unreadable = b"", 0
+        self._early = 0  # malformed lines before the first frame, as of a board that starts
 
     def mismatch(self, url: str) -> Sentence:
         """Return why lines cannot be read, and what to do; "" if they can.
 
         Ten lines with another number of numbers are of another layout. Before the first frame, one unreadable line is
-        enough; afterwards ten without a frame between them, or a quarter of all lines.
+        enough; afterwards ten without a frame between them, or a quarter of all lines since.
         """
-        bad, lines = self.counters.malformed, self.counters.frames + self.counters.malformed
+        bad = self.counters.malformed - self._early
+        lines = bad + self.counters.frames
         comma = _DECIMAL_COMMA.search(self._unread) and _OTHER_GAP.search(self._unread)
         if self._others >= _SURE and not comma:
             return self._other_layout(url)
@@ -232,7 +234,8 @@ class LineParser:
             if self._clock_ms > _LIMIT:
                 self._clock_ms = 0
             device_ms = self._clock_ms
-        self._begun = True
+        if not self._begun:
+            self._begun, self._early = True, self.counters.malformed
         values = tuple([numbers[at] for _, at in self._channels])
         garbage = False
         for value, (low, high) in zip(values, self._valid, strict=True):

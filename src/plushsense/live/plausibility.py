@@ -23,7 +23,9 @@ _BLOCKS = 3
 """Blocks that must agree: those at rest, those in sequence in which a channel is out of range, those of the rate."""
 _STILL = 0.1
 """Spread of the axes over a block, relative to the length of their mean, up to which the toy rests."""
-_OTHER_GRAVITY = 1.5
+_OTHER_GRAVITY, _GRAVITY_SUBTRACTED = 1.5, 0.02
+# Where gravity of the training is not certain: no training moves so much, and rest without gravity reads less.
+_UNCERTAIN = (0.05, 0.25, 2.0)
 _OTHER_RATE = 1.25
 _SLOW = 0.3
 """Share of the mean square of an acceleration from which its running mean is gravity; 0.43 for energetic gestures."""
@@ -32,29 +34,33 @@ _CERTAIN = 3.0
 _UNITS = ((1 / 9.81, "g, not m/s²"), (9.81, "m/s², not g"), (1000.0, "thousandths of the unit"), (0.001, "thousands"))
 
 
-def gravity_in_training(bundle: Bundle, axes: Sequence[int]) -> float | None:
+def gravity_in_training(bundle: Bundle, axes: Sequence[int]) -> tuple[float, bool] | None:
     """Return the length of gravity in the training data, in steps, for the channels ``axes`` of an accelerometer.
 
-    It follows from the scaling of the inputs: of the gravity itself, else of the magnitude, else of the axes. None if
-    the network reads none of them, or if they do not show gravity, as where it was subtracted before.
+    It follows from the scaling of the inputs: of the gravity itself, else of the magnitude, else of the axes.
+
+    Returns:
+        The length, and whether it is certain; else it is the root mean square of all accelerations, movement included.
+        None if the network reads none of them, or its training data show no gravity, as where it was subtracted.
     """
     layout, scaler = bundle.layout, bundle.scaler
     names = [layout.names[axis] for axis in axes]
     derived = {d.of: layout.inputs.index(d.name) for d in layout.derived if d.name in layout.inputs}
     mean, spread = np.asarray(scaler.offset), 1.0 / np.asarray(scaler.scale)
-    if all(name in layout.inputs for name in names):
-        at = [layout.inputs.index(name) for name in names]
-        square, motion = float((mean[at] ** 2 + spread[at] ** 2).sum()), float((spread[at] ** 2).sum())
-        gravity = [derived.get((name,)) for name in names]
-        if None not in gravity:
-            held = [g for g in gravity if g is not None]
-            length = float((mean[held] ** 2 + spread[held] ** 2).sum()) / 4.0**GRAVITY_FRACTION_BITS
-            return math.sqrt(length) if length >= _SLOW * square else None
-        return math.sqrt(square) if square >= _CERTAIN**2 * motion else None
-    place = next((at for of, at in derived.items() if set(of) == set(names)), None)
-    if place is None or mean[place] < _CERTAIN * spread[place]:
+    squares = mean**2 + spread**2
+    magnitude = next((at for of, at in derived.items() if len(of) > 1 and set(of) == set(names)), None)
+    if magnitude is not None:
+        if mean[magnitude] <= 0.0:  # not the scaling of lengths, but that of a test
+            return None
+        length = math.sqrt(squares[magnitude]) / float(1 << MAGNITUDE_FRACTION_BITS)
+        return length, bool(mean[magnitude] >= _CERTAIN * spread[magnitude])
+    if not set(names) <= set(layout.inputs):
         return None
-    return math.hypot(mean[place], spread[place]) / float(1 << MAGNITUDE_FRACTION_BITS)
+    square = float(squares[[layout.inputs.index(name) for name in names]].sum())
+    if not all((name,) in derived for name in names):
+        return math.sqrt(square), False
+    held = float(squares[[derived[(name,)] for name in names]].sum()) / 4.0**GRAVITY_FRACTION_BITS
+    return (math.sqrt(held), True) if held >= _SLOW * square else None
 
 
 def ranges_in_training(bundle: Bundle) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -93,16 +99,16 @@ class PlausibilityMonitor:
         self._frames: list[Frame] = []
         self._clock: list[float] | None = []
         calibrated = {at for sensor in layout.calibrated_sensors for at in sensor}
-        self._rest: list[tuple[list[int], float, list[float]]] = []
+        self._rest: list[tuple[list[int], float, bool, list[float]]] = []
         self._low, self._high = np.full(layout.n_channels, -np.inf), np.full(layout.n_channels, np.inf)
         if bundle is not None:
             low, high = ranges_in_training(bundle)
             for axes in _accelerometers(layout):
                 expected = gravity_in_training(bundle, axes)
-                if expected and not calibrated & set(axes):
-                    self._rest.append((axes, expected, []))
+                if expected is not None and not calibrated & set(axes):
+                    self._rest.append((axes, *expected, []))
                     # What an axis reads depends on how the toy is held.
-                    calibrated |= set(axes)
+                    calibrated |= set(axes) if expected[1] else set()
             free = [at for at in range(layout.n_channels) if at not in calibrated]
             # A sensor may stay at its end stop, which is one step beyond the limits.
             self._low[free], self._high[free] = low[free] - 1.0, high[free] + 1.0
@@ -147,7 +153,7 @@ class PlausibilityMonitor:
 
     def _check_rest(self, values: NDArray[np.float64]) -> Iterator[Sentence]:
         for one in list(self._rest):
-            axes, expected, lengths = one
+            axes, expected, certain, lengths = one
             x = values[:, axes] - self._layout.zero_int[axes]
             length = float(np.linalg.norm(x.mean(axis=0)))
             if math.sqrt(float(x.var(axis=0).sum())) > _STILL * max(length, expected / 2.0):
@@ -157,7 +163,10 @@ class PlausibilityMonitor:
                 continue
             self._rest.remove(one)
             found = float(np.median(lengths))
-            if not 1.0 / _OTHER_GRAVITY < found / expected < _OTHER_GRAVITY:
+            ratio, (least, little, much) = found / expected, _UNCERTAIN
+            if certain and 1.0 / _OTHER_GRAVITY < ratio < _OTHER_GRAVITY:
+                continue
+            if certain or least < ratio < little or ratio > much:
                 yield self._other_gravity(axes, found, expected)
 
     def _other_gravity(self, axes: list[int], found: float, expected: float) -> Sentence:
@@ -166,7 +175,7 @@ class PlausibilityMonitor:
         ratio = found / expected
         unit = next((name for factor, name in _UNITS if 0.8 < ratio / factor < 1.25), "")
         why = f"it seems to send {unit}" if unit else "its unit or measuring range is another"
-        if ratio < 0.02:
+        if ratio < _GRAVITY_SUBTRACTED:
             why = "gravity seems to be subtracted, or the sensor is dead"
         names = [self._layout.names[axis] for axis in axes]
         return Sentence(
@@ -205,10 +214,12 @@ class PlausibilityMonitor:
 
 
 def _accelerometers(layout: Layout) -> list[list[int]]:
-    """Return the indices of the axes of each accelerometer: of its vectors, else of the magnitudes of accelerations."""
+    """Return the indices of the axes of each accelerometer: of vectors, of magnitudes, or the only three of the kind."""
     groups = layout.vectors or tuple(d.of for d in layout.derived if d.kind == "magnitude")
     found = [[layout.index(name) for name in group] for group in groups]
-    return [axes for axes in found if all(layout.channels[axis].kind == ACCELERATION for axis in axes)]
+    all_axes = [at for at, channel in enumerate(layout.channels) if channel.kind == ACCELERATION]
+    found = [axes for axes in found if set(axes) <= set(all_axes)]
+    return found or ([all_axes] if len(all_axes) == 3 else [])
 
 
 def _value(value: tuple[float, str]) -> str:

@@ -5,11 +5,12 @@ A `StreamReader` runs a `plushsense.runtime.machine.ToyMachine` and converts its
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import ArrayError, ConfigError
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.devices.base import Frame
@@ -163,7 +164,13 @@ class StreamReader:
         return self._decision(self._machine.silence())
 
     def push(self, frame: Frame) -> list[Decision]:
-        """Process one frame and return the decisions that it completes, usually none or one."""
+        """Process one frame and return the decisions that it completes, usually none or one.
+
+        Raises:
+            ArrayError: for a frame that does not have the layout's channels in whole steps, as `Layout.in_steps` gives
+                them, and whole milliseconds.
+        """
+        frame = whole_frame(frame, self.layout)
         silent, self._silent = self._silent, False
         decisions = [
             self._decision(moment)
@@ -270,7 +277,7 @@ class BothEngines(IntegerClassifier):
         self._largest = 0.0
 
     def push(self, frame: Frame) -> list[Decision]:
-        """Process one frame; return the deployed model's decisions that it completes."""
+        """Process one frame like `StreamReader.push`; return the deployed model's decisions."""
         decisions = super().push(frame)
         both = (decisions, self.original.push(frame))
         answered = [[(d, d.probabilities) for d in part if d.probabilities is not None] for part in both]
@@ -294,6 +301,34 @@ class BothEngines(IntegerClassifier):
             "affect": self._affect / n if n and self._has_affects else None,
             "largest_difference": self._largest if n else None,
         }
+
+
+def whole_frame(frame: Frame, layout: Layout) -> Frame:
+    """Return a frame as Python integers; raise ArrayError if it is not one of the layout, in whole steps."""
+    host_ms, device_ms, values = frame
+    if type(device_ms) is int and len(values) == layout.n_channels and {int}.issuperset(map(type, values)):
+        return frame
+    if len(values) != layout.n_channels:
+        raise ArrayError(
+            f"The frame has {len(values)} values, but layout '{layout.name}' has {layout.n_channels} channels: give one "
+            f"for each of {', '.join(layout.names)}."
+        )
+    try:
+        device_ms = operator.index(device_ms)
+    except TypeError:
+        raise ArrayError(
+            f"device_ms is {device_ms!r} in a frame: accepted are whole milliseconds of the toy's clock."
+        ) from None
+    whole = []
+    for channel, value in zip(layout.channels, values, strict=True):
+        try:
+            whole.append(operator.index(value))
+        except TypeError:
+            raise ArrayError(
+                f"'{channel.name}' is {value!r} in a frame, whose values are whole numbers of steps, here of "
+                f"{channel.step:g}: convert the sample by values=layout.in_steps(sample)."
+            ) from None
+    return Frame(host_ms, device_ms, tuple(whole))
 
 
 def check_layout(sent: Layout, read: Layout) -> None:
