@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from abc import ABC, abstractmethod
 from bisect import bisect_left, bisect_right
 from collections import deque
@@ -11,7 +12,9 @@ from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import NamedTuple, Self
 
+from plushsense.core.errors import PlushSenseWarning
 from plushsense.core.layouts import Layout
+from plushsense.core.sentences import Sentence
 
 
 class Frame(NamedTuple):
@@ -151,7 +154,8 @@ class Device(ABC):
     """An open toy. Use it as a context manager and iterate over its frames, or call `read` repeatedly.
 
     Iteration ends when the source ends (a file, or a connection that the other side closed properly) or when `close` is
-    called, even from another thread. A lost connection raises DeviceError.
+    called, even from another thread. A lost connection raises DeviceError. Lines that cannot be read give a
+    PlushSenseWarning.
 
     Attributes:
         url: the URL with which it was opened.
@@ -179,9 +183,9 @@ class Device(ABC):
         """
 
     @property
-    def mismatch(self) -> str:
-        """What to do if the toy sends lines that do not fit the layout; "" if they do, or nothing has been received."""
-        return ""
+    def mismatch(self) -> Sentence:
+        """Why lines of the toy cannot be read, with the first of them, and what to do; "" if they can, or none came."""
+        return Sentence()
 
     def reopen(self) -> Device | None:
         """Return a device that continues, or ends, after a lost connection; None: it must be opened anew by its URL.
@@ -201,8 +205,12 @@ class Device(ABC):
             self._shut()
 
     def __iter__(self) -> Iterator[Frame]:
+        reported = ""
         while not self.closed:
             frames = self.read()
+            if not frames and self.mismatch != reported:
+                reported = self.mismatch
+                warnings.warn(str(reported), PlushSenseWarning, stacklevel=2)
             if frames is None:
                 return
             yield from frames

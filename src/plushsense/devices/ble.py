@@ -137,7 +137,7 @@ class BleDevice(Device):
         self._received.put((time.perf_counter(), now_ms(), bytes(data)))
 
     @property
-    def mismatch(self) -> str:
+    def mismatch(self) -> Sentence:
         """As in `Device`."""
         return self._parser.mismatch(self.url)
 

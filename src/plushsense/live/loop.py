@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from plushsense.core.errors import ConfigError, PlushSenseWarning
+from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Device, Frame
 from plushsense.live.plausibility import PlausibilityMonitor
 from plushsense.runtime.classifier import Decision, StreamReader, check_layout
@@ -90,10 +91,10 @@ class LiveRun(Iterator[Decision]):
     ) -> None:
         self.device = device
         self.classifier = classifier
-        self.warnings: list[str] = []
+        self.warnings: list[Sentence] = []
         self._warn = warn
         self._monitor = PlausibilityMonitor(classifier.layout, classifier.bundle)
-        self._mismatch = ""
+        self._mismatch = Sentence()
         self._malformed = device.counters.malformed  # at the last frame
         self._seconds, self._silence_s = seconds, silence_s
         self._begun = self._last_frames_s = time.perf_counter()
@@ -128,7 +129,7 @@ class LiveRun(Iterator[Decision]):
             self._note(sentence)
         if self.device.counters.malformed > self._malformed:
             self._note(self.device.mismatch)
-        self._malformed, self._mismatch = self.device.counters.malformed, ""
+        self._malformed, self._mismatch = self.device.counters.malformed, Sentence()
         # Set after the computation, whose duration must not count as silence of the toy.
         self._last_frames_s, self._silent = time.perf_counter(), False
         return decided
@@ -142,9 +143,9 @@ class LiveRun(Iterator[Decision]):
             return []
         return [self._quiet()]
 
-    def _unread(self) -> str:
+    def _unread(self) -> Sentence:
         """Return why the lines that came since the last frame cannot be read; "" if none came."""
-        return self.device.mismatch if self.device.counters.malformed > self._malformed else ""
+        return self.device.mismatch if self.device.counters.malformed > self._malformed else Sentence()
 
     def _quiet(self) -> Decision:
         """Return the decision that ends an open event because no frame comes."""
@@ -156,7 +157,7 @@ class LiveRun(Iterator[Decision]):
         decision = replace(decision, state="unreadable")
         return decision if again else self._noted(decision)
 
-    def _note(self, sentence: str) -> None:
+    def _note(self, sentence: Sentence) -> None:
         if sentence and sentence not in self.warnings:
             self.warnings.append(sentence)
             self._warn(sentence)
