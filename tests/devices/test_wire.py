@@ -161,7 +161,9 @@ def test_a_few_damaged_lines_are_no_other_format_but_a_quarter_is() -> None:
     parser.feed(b"20 1.5 1.5.2\n")
     assert parser.mismatch("x").startswith("The toy sends lines that cannot be read")
     parser.feed(b"20 1F 3\n20 15 3\n" * 60)
-    assert parser.mismatch("x").startswith("70 of 230 lines of the toy cannot be read, such as '20 1F 3': '1F' for left")
+    assert parser.mismatch("x").startswith(
+        "70 of 230 lines of the toy cannot be read, such as '20 1F 3': '1F' for left"
+    )
 
 
 def test_other_layouts() -> None:

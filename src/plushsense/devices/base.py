@@ -73,10 +73,10 @@ class _LongStep:
 class LossCounter:
     """Count lost frames by the device clock.
 
-    A step of at least 1.5 periods means lost frames only if the frames after it stay as late as it was: time stamps that
-    vary, a late frame that the next ones make up for, and frames stamped several at once are no loss. The period is
-    measured, because the rate of a toy is not exactly that of its layout. Where steps vary by about a third, it is their
-    mean, so that frames lost evenly look like a lower rate.
+    A step of at least 1.5 periods means lost frames only if the frames after it stay as late as it was: time stamps
+    that vary, a late frame that the next ones make up for, and frames stamped several at once are no loss. The period
+    is measured, because the rate of a toy is not exactly that of its layout. Where steps vary by about a third, it is
+    their mean, so that frames lost evenly look like a lower rate.
 
     If the clock goes back or advances by more than ``pause_ms``, it was reset or paused, and no frames are counted.
     """

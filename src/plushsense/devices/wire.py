@@ -20,7 +20,7 @@ _DECIMAL = re.compile(rb"[+-]?(?:[0-9]{1,18}(?:\.[0-9]{0,18})?|\.[0-9]{1,18})(?:
 _SEPARATORS = bytes.maketrans(b",;\t\v\f", b"   \0\0")
 _LIMIT = 2**53
 _LONGEST_DELAY_MS = 2**31
-# So many lines of another width in a row are not lines that were cut or joined, and so many unreadable ones no accident.
+# So many lines of another width in a row are not lines that were cut or joined, and so many unreadable ones no chance.
 _SURE = 10
 _QUOTED = 100  # characters of an unreadable line
 _NAMED = 8  # fields whose names are listed

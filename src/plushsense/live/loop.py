@@ -71,8 +71,9 @@ def _python_warning(sentence: str) -> None:
 class LiveRun(Iterator[Decision]):
     """A live run: iterate over it for decisions; call `summary` for its figures at any time.
 
-    If the device sends no frame for ``silence_s``, there is one decision with the state ``no signal``, or ``unreadable``
-    if it sends lines that are none, which ends an open event; the same happens if an event is open when the device ends.
+    If the device sends no frame for ``silence_s``, there is one decision with the state ``no signal``, or
+    ``unreadable`` if it sends lines that are none, which ends an open event; the same happens if an event is open when
+    the device ends.
 
     Attributes:
         over: whether the run has ended.

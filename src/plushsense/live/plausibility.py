@@ -197,8 +197,8 @@ class PlausibilityMonitor:
         self._low[at], self._high[at] = -np.inf, np.inf
         self._outside[at] = 0
         yield Sentence(
-            f"For {_BLOCKS * BLOCK_S:g} s {'; '.join(parts)}: is it the same sensor, in the same unit and with the same "
-            "settings? The gestures may not be recognised.",
+            f"For {_BLOCKS * BLOCK_S:g} s {'; '.join(parts)}: is it the same sensor, in the same unit and with the "
+            "same settings? The gestures may not be recognised.",
             "live_range",
             s=_BLOCKS * BLOCK_S,
             channels=[self._layout.names[channel] for channel in at],

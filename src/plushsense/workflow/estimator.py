@@ -69,7 +69,7 @@ def stacked(X: Any) -> Any:
     nested = X
     if hasattr(X, "dtypes"):  # a table of pandas, perhaps with a series in each cell
         nested = np.asarray(X)
-    if not isinstance(nested, list | tuple) and getattr(nested, "dtype", None) != object:
+    if not isinstance(nested, list | tuple) and getattr(getattr(nested, "dtype", None), "kind", "") != "O":
         return X
     if isinstance(nested, np.ndarray) and nested.ndim == 2 and nested.size and _is_sequence(nested[0, 0]):
         nested = [list(row) for row in nested]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -150,7 +150,7 @@ class LiveState:
     running: bool = False
     ended: PlushSenseError | None = None
     connection: Connection = ""
-    mismatch: Sentence = Sentence()
+    mismatch: Sentence = field(default_factory=Sentence)
     warnings: tuple[Sentence, ...] = ()
     state: str = ""
     t_s: float = 0.0
