@@ -154,6 +154,12 @@ def test_the_first_unreadable_line_is_quoted_with_what_is_wrong(line: bytes, fau
     assert parser.mismatch("x") == "", "it was a message of the start"
 
 
+def test_no_built_in_layout_is_recommended_to_users_of_their_own() -> None:
+    parser = LineParser(PRESS)
+    parser.feed(b"20 1.5 2.25 7\n" * 30)
+    assert "the first is '20 1.5 2.25 7': it has 4 fields, not 3. Layout 'press' expects" in parser.mismatch("x")
+
+
 def test_a_few_damaged_lines_are_no_other_format_but_a_quarter_is() -> None:
     parser = LineParser(PRESS)
     parser.feed(b"20 1.5 2.25\n" * 100 + b"20 1.5 1.5.2\n" * 9)

@@ -87,13 +87,14 @@ class LineParser:
     def mismatch(self, url: str) -> Sentence:
         """Return why lines cannot be read, and what to do; "" if they can.
 
-        Ten lines with another number of numbers are of another layout. Before the first frame, one unreadable line is
-        enough; afterwards ten without a frame between them, or a quarter of all lines since.
+        Ten lines with another number of numbers are of another built-in layout. Before the first frame, one unreadable
+        line is enough; afterwards ten without a frame between them, or a quarter of all lines since.
         """
         bad = self.counters.malformed - self._early
         lines = bad + self.counters.frames
         comma = _DECIMAL_COMMA.search(self._unread) and _OTHER_GAP.search(self._unread)
-        if self._others >= _SURE and not comma:
+        # To the user of a layout of their own, the built-in ones are of no use.
+        if self._others >= _SURE and not comma and self.layout.name in layout_names():
             return self._other_layout(url)
         if self._unreadable >= (_SURE if self._begun else 1):
             problem, many = "The toy sends lines that cannot be read, the first is", {}

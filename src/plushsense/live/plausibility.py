@@ -210,11 +210,12 @@ class PlausibilityMonitor:
         low, high = (channel.in_units(steps)[0] for steps in (values.min(), values.max()))
         first, last = (channel.in_units(steps)[0] for steps in (self._low[at] + 1.0, self._high[at] - 1.0))
         unit = channel.in_units(0.0)[1]
-        return f"{channel.name} reads {low:g} to {high:g}{unit}, outside {first:g} to {last:g}{unit} of the training"
+        usual = f"{first:.4g} to {last:.4g}{unit} of the training"
+        return f"{channel.name} reads {low:.4g} to {high:.4g}{unit}, outside {usual}"
 
 
 def _accelerometers(layout: Layout) -> list[list[int]]:
-    """Return the indices of the axes of each accelerometer: of vectors, of magnitudes, or the only three of the kind."""
+    """Return the indices of the axes of each accelerometer: of vectors or magnitudes, or the only three of the kind."""
     groups = layout.vectors or tuple(d.of for d in layout.derived if d.kind == "magnitude")
     found = [[layout.index(name) for name in group] for group in groups]
     all_axes = [at for at, channel in enumerate(layout.channels) if channel.kind == ACCELERATION]

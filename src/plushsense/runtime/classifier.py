@@ -310,8 +310,8 @@ def whole_frame(frame: Frame, layout: Layout) -> Frame:
         return frame
     if len(values) != layout.n_channels:
         raise ArrayError(
-            f"The frame has {len(values)} values, but layout '{layout.name}' has {layout.n_channels} channels: give one "
-            f"for each of {', '.join(layout.names)}."
+            f"The frame has {len(values)} values, but layout '{layout.name}' has {layout.n_channels} channels: give "
+            f"one for each of {', '.join(layout.names)}."
         )
     try:
         device_ms = operator.index(device_ms)
