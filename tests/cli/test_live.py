@@ -96,7 +96,8 @@ def test_over_tcp(plush_bundle: Path, tmp_path: Path) -> None:
 def test_a_toy_of_another_layout_says_which_one_fits(plush_bundle: Path) -> None:
     with toy("--tcp", "0", "--layout", "plush-14") as url:
         lines, summary = live("--device", url, "--model", str(plush_bundle), "--seconds", "1")
-        assert [line["state"] for line in lines] == ["no signal"]
+        assert [line["state"] for line in lines] == ["unreadable"]
+        assert lines[0]["warnings"] == summary["warnings"] == [lines[0]["mismatch"]]
         assert lines[0]["mismatch"].endswith(f"'plush-14' has 14: open it as {url}?layout=plush-14")
         assert (summary["counters"]["frames"], summary["no_signal"]) == (0, 1)
         lines, _ = live("--device", f"{url}?layout=plush-14", "--model", str(plush_bundle), "--seconds", "1")

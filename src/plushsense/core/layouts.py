@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import LayoutError, nearest
+from plushsense.core.errors import ArrayError, LayoutError, nearest
 from plushsense.core.sentences import Sentence
 from plushsense.core.toml import builtin_names, load_table, read_named
 
@@ -429,6 +429,22 @@ class Layout:
                 f"{nearest(name, self.names)}"
             )
         return self.names.index(name)
+
+    def in_steps(self, values: Sequence[float]) -> tuple[int, ...]:
+        """Return one sample of all channels (C,), as files and lines have it, in the integer steps of a frame.
+
+        Raises:
+            ArrayError: for another number of values, or one that is not finite.
+        """
+        if len(values) != self.n_channels:
+            raise ArrayError(
+                f"A sample has {len(values)} values, but layout '{self.name}' has {self.n_channels} channels: give one "
+                f"for each of {', '.join(self.names)}."
+            )
+        for channel, value in zip(self.channels, values, strict=True):
+            if not math.isfinite(value):
+                raise ArrayError(f"'{channel.name}' is {value} in a sample: accepted are finite numbers.")
+        return tuple(round(float(v) / c.step) for c, v in zip(self.channels, values, strict=True))
 
     def match_columns(self, labels: Sequence[str], width: int, exact: bool = True) -> StreamColumns | str:
         """Match the ``width`` columns of a stream by label, or by position; return why if the stream does not fit.

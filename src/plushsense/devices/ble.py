@@ -164,7 +164,7 @@ class BleDevice(Device):
         self._received.put((self._received_s, now_ms(), bytes(data)))
 
     @property
-    def mismatch(self) -> str:
+    def mismatch(self) -> Sentence:
         """As in `Device`."""
         return self._parser.mismatch(self.url)
 

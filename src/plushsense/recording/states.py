@@ -271,7 +271,7 @@ class RecordingMachine:
         self._since_s = time.monotonic()
         self._state: RecorderState = "idle"
         self._paused = False
-        self._message = Sentence()
+        self._message = self._mismatch = Sentence()
         self.over = Sentence()
         self._failed = Sentence()
         self._closing = False
@@ -429,6 +429,8 @@ class RecordingMachine:
                     for frame in frames:
                         self._receive(frame)
                     self._receiver.check_malformed()
+                    if not frames:
+                        self._show_unreadable()
                     if frames:
                         self._flush()
                         self._receiver.end_reading()
@@ -465,7 +467,8 @@ class RecordingMachine:
             self._log_step("start", row=row, host_ms=frame.host_ms, device_ms=frame.device_ms)
             self._enter("recording")
         elif self._take is not None:
-            self._take.lost += missing
+            # Negative where frames that were counted before the recording came late.
+            self._take.lost = max(0, self._take.lost + missing)
         self._received.append(frame)
         if self._take is not None:
             self._take.frames.append(frame)
@@ -476,6 +479,14 @@ class RecordingMachine:
                 self._stop("longest")
         elif self._state == "idle" and self._auto is not None and self._passed_s() >= self._auto.rest_s:
             self._begin()
+
+    def _show_unreadable(self) -> None:
+        """Show why no line of the toy can be read, once for each reason."""
+        unreadable = self._receiver.silent and self._receiver.quality().signal == "unreadable"
+        mismatch = self.device.mismatch if unreadable else Sentence()
+        if mismatch and mismatch != self._mismatch:
+            self._show_message(mismatch)
+        self._mismatch = mismatch
 
     def _flush(self) -> None:
         """Pass the received frames to the background writer; call this before anything to be written after them."""

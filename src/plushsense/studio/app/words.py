@@ -90,8 +90,8 @@ class Words:
             return self.channel(str(value))
         return self.gesture(str(value)) if key in ("gesture", "gestures") else str(value)
 
-    def error(self, error: PlushSenseError) -> str:
-        """Return the sentence of an error in this language, see `explain`."""
+    def error(self, error: PlushSenseError | Sentence) -> str:
+        """Return the sentence of an error, or another one of the library, in this language, see `explain`."""
         return self.explain(str(error), error.reason, error.values)
 
     def explain(self, message: str, reason: str = "", values: Mapping[str, object] | None = None) -> str:
