@@ -53,7 +53,6 @@ _FILLED = {
 }  # fmt: skip
 # Joins of which the function itself ensures that there is something to join.
 _NEVER_EMPTY = {
-    "', '.join(parts)": "begins with the eyes of the toy",
     "', '.join((f'{name} {macs:,}' for name, macs in profile.macs_by_layer.items()))": "a network has layers",
     "', '.join((a for a in vector if a in named))": "after 0 < len(set(vector) & set(named))",
     "', '.join((f'{name} {value:g}' for name, value in self.zero.items()))": "three axes",
@@ -67,8 +66,14 @@ _NEVER_EMPTY = {
     "', '.join((c for c in EVENT_COLUMNS if c not in ('t', 'label')))": "a constant",
     "', '.join((label for label in labels if label not in used))": "after len(used) < len(labels)",
     "' and '.join(dict.fromkeys((v.name for v in stream)))": "a stream of the proof has vectors",
-    "', '.join([f'{config.preset} training, seed {config.training.seed}'] + [f'{key} {text(value)}' for key, value in "
-    "config.changes(layout).items()])": "begins with the preset",
+    "', '.join(names if len(names) <= _NAMED else (*names[:_NAMED - 1], '…'))": "the columns of a layout",
+    "'; '.join(parts)": "one for each of the channels that the condition asks about",
+    "', '.join(map(str, column.codes[:6]))": "a column of codes has codes",
+    "', '.join((repr(word) for word in list(label.words)[:2]))": "after 1 < len(c.words)",
+    "' and '.join(listed)": "the first example is always there",
+    "', '.join(texts)": "made by setdefault and append, or of a value with names",
+    "'; '.join(dict.fromkeys((f'1 g is about {s.one_g:g}, and the layout says {s.unit}' for s in wrong)))": "as units",
+    "', '.join(sorted(set(windows.subject[far.any(axis=1)].tolist())))": "somebody has the readings",
     "' and '.join(advice)": "one of its conditions holds where the function has not returned",
 }
 _SEPARATORS = (", ", " and ", " or ", "; ")
@@ -96,6 +101,13 @@ def _items(node: ast.expr) -> ast.expr | None:
             return node
 
 
+def _begins(node: ast.expr) -> bool:
+    """Whether a collection is written with at least one element."""
+    if isinstance(node, ast.BinOp):
+        return _begins(node.left) or _begins(node.right)
+    return isinstance(node, ast.List | ast.Tuple) and not all(isinstance(each, ast.Starred) for each in node.elts)
+
+
 def unguarded(source: str) -> Iterator[tuple[int, str]]:
     """Yield line and text of each list that is joined into a sentence without words for an empty one.
 
@@ -119,10 +131,12 @@ def unguarded(source: str) -> Iterator[tuple[int, str]]:
             continue
         if not any(isinstance(each, ast.JoinedStr | ast.Assign) for each in around):
             continue
-        items = _items(node.args[0])
+        assigned = [each for each in ast.walk(around[-1]) if isinstance(each, ast.Assign)]
+        made = [each.value for each in assigned if ast.unparse(each.targets[0]) == ast.unparse(node.args[0])]
+        items = _items(next((value for value in made if _begins(value)), node.args[0]))
         name = ast.unparse(items) if items is not None else ast.unparse(node.args[0])
         last = name.split(".")[-1].split("['")[-1].removesuffix("']")
-        if items is not None and (isinstance(items, ast.List | ast.Tuple) or last.isupper() or last in _FILLED):
+        if items is not None and (_begins(items) or last.isupper() or last in _FILLED):
             continue
         joined = {
             t.id for each in around if isinstance(each, ast.Assign) for t in each.targets if isinstance(t, ast.Name)
