@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -21,9 +22,9 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import plain_label
 from plushsense.core.recorder_csv import parse_name
-from plushsense.dataset.importing.pattern import ENDINGS, PARTS, ROLES, UNITS
+from plushsense.dataset.importing.pattern import ENDINGS, PARTS, ROLES, UNITS, ImportPattern
 from plushsense.dataset.importing.sources import source_files, split_regular_files
-from plushsense.dataset.importing.table_files import json_cells, unit_of_time
+from plushsense.dataset.importing.table_files import is_between, json_cells, number_blocks, unit_of_time
 
 _FILES, _LINES = 12, 400
 _USUAL_HZ = 50.0
@@ -31,6 +32,7 @@ _USUAL_HZ = 50.0
 _SEPARATORS = ("\t", ";", "|", ",", " ")
 _MOST_LABELS = 60
 _MOST_STEPS = 1e7
+_LEAST_ROWS = 20
 _PERSON = re.compile(r"(s|p|subj|subject|sub|participant|person|user|u|id|child|kid)[-_ ]?\d+", re.IGNORECASE)
 _SESSION = re.compile(r"(session|ses|day|visit|run)[-_ ]?\d*", re.IGNORECASE)
 # Words in paths that are no persons: devices, sensors, sides and parts of a data set.
@@ -116,6 +118,7 @@ class _PatternDraft:
     rate_hz: float = 0.0
     width: int = 1
     separator: str = ""
+    in_blocks: bool = False
     doubts: list[str] = field(default_factory=list)
 
 
@@ -160,6 +163,8 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
         listed = ", ".join(column.name.strip()[:30] for column in columns[:20])
         raise DatasetError(f"No column of numbers that could be a channel was found in '{source}'; it has {listed}.")
     _paths([f.relative_to(base) for f in mine], ending, guess)
+    if "row_rate_hz" in guess.keys and "label" not in guess.taken and not is_json:
+        _equal_recordings(mine, guess)
     _aliases(guess)
     # Names in the files may hold characters that no line of text can show.
     guess.doubts = ["".join(c if c.isprintable() else " " for c in doubt) for doubt in guess.doubts]
@@ -228,12 +233,53 @@ def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[_Colum
     counts = Counter(name.casefold() for name in names)
     seen: Counter[str] = Counter()
     columns = []
+    head = rows[heads[0]] if heads else []
     data = [row for lines in samples for row in list(_cells(lines, separator))[begin:] if len(row) == width]
+    data = [row for row in data if not is_between(row, head, ImportPattern())]
+    _row_blocks(samples, head, guess)
     for k, name in enumerate(names):
         seen[name.casefold()] += 1
         key = f"{name}#{seen[name.casefold()]}" if counts[name.casefold()] > 1 else name or f"#{k + 1}"
         columns.append(_Column(name, key, [row[k] for row in data], guess.keys.get("decimal", ".")))
     return columns
+
+
+def _row_blocks(samples: list[list[str]], head: list[str], guess: _PatternDraft) -> None:
+    """Add a doubt if empty lines, comments or lines of column names separate blocks of rows."""
+    blocks = 0
+    for lines in samples:
+        between, rows = dict[int, float](), 0
+        for line in lines:
+            row = next(iter(_cells([line], guess.separator)), [])
+            if is_between(row, head, ImportPattern()):
+                between[rows] = between.get(rows, 0) + (math.inf if row and row[0].strip() else 1)
+            else:
+                rows += len(row) == guess.width and any(map(_is_number, row))
+        blocks = max(blocks, int(number_blocks(between, rows).max(initial=0)) + 1)
+    if blocks > 1:
+        guess.doubts.append(
+            "empty lines, comments or repeated column names separate blocks of rows: each block is taken for a "
+            f'recording (up to {blocks} in the first lines of a file); if they are no recordings, add  between = "none"'
+        )
+        guess.in_blocks = True
+
+
+def _equal_recordings(files: Sequence[Path], guess: _PatternDraft) -> None:
+    """Add a doubt if the numbers of rows of the files suggest recordings of equal length, one after the other."""
+    if guess.in_blocks:
+        return
+    counts = set()
+    for file in files:
+        with file.open("rb") as opened:
+            lines = (line.replace(b";", b",").split(b",", 1)[0] for line in opened)
+            counts.add(sum(_is_number(cell.decode("latin-1")) for cell in lines))
+    common = math.gcd(*counts)
+    if common >= _LEAST_ROWS and len(counts) > 1:
+        listed = ", ".join(str(n) for n in sorted(counts)[:4]) + (", …" if len(counts) > 4 else "")
+        guess.doubts.append(
+            f"the files have {listed} rows, all of them multiples of {common}: if recordings of a fixed number of rows "
+            "follow one another, give it as recording_rows"
+        )
 
 
 def _cells(lines: Iterable[str], separator: str) -> Iterable[list[str]]:

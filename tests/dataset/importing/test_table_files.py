@@ -1,0 +1,122 @@
+"""Blocks of rows in tables of text: what separates recordings, and what does not."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from plushsense.core.errors import ConfigError
+from plushsense.dataset.importing.guessing import guess_pattern
+from plushsense.dataset.importing.importers import ImportSummary, import_recordings
+from plushsense.dataset.importing.pattern import ImportPattern
+
+CHANNELS = [{"name": name, "unit": "", "kind": "sensor"} for name in ("a", "b")]
+PATTERN: dict[str, Any] = {
+    "paths": ("{subject}/{label}.csv",),
+    "row_rate_hz": 100.0,
+    "layout": {"rate_hz": 100.0, "channels": CHANNELS},
+}
+HEAD = "a,b"
+
+
+def block(rows: int, first: int = 0) -> list[str]:
+    return [f"{k * 7 % 17},{first + k * 5 % 23}" for k in range(rows)]
+
+
+def joined(blocks: Sequence[list[str]], *between: str) -> list[str]:
+    return [line for k, rows in enumerate(blocks) for line in ([*between] if k else []) + rows]
+
+
+def imported(tmp_path: Path, lines: Sequence[str], ends: str = "\n", head: str = HEAD, **keys: Any) -> ImportSummary:
+    path = tmp_path / "src" / "P1" / "Pat.csv"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(ends.join([head, *lines, ""]).encode())
+    return import_recordings(tmp_path / "src", tmp_path / "DS", pattern=ImportPattern(**PATTERN | keys))
+
+
+def rows_of(done: ImportSummary) -> list[int]:
+    return [r.rows for r in sorted(done.dataset.recordings, key=lambda r: r.epoch_ms)]
+
+
+@pytest.mark.parametrize(
+    "between",
+    [("",), ("", ""), ("  ",), (",",), (",,,",), (HEAD,), ("# take",), ("// take", ""), ("-----",), ("", "x", HEAD)],
+)
+def test_lines_between_blocks_of_rows_end_a_recording(tmp_path: Path, between: tuple[str, ...]) -> None:
+    done = imported(tmp_path, ["", *joined([block(40), block(50), block(30)], *between), ",", ""])
+    assert rows_of(done) == [40, 50, 30]
+    assert sum("3 blocks of rows" in note for note in done.notes) == 1
+
+
+def test_an_empty_line_after_every_row_is_a_doubled_line_end(tmp_path: Path) -> None:
+    done = imported(tmp_path, block(60), ends="\r\r\n")
+    assert (rows_of(done), done.notes) == ([60], [])
+    done = imported(tmp_path / "2", joined([block(40), block(50)], ""), ends="\r\r\n")
+    assert rows_of(done) == [40, 50]
+
+
+def test_the_pattern_can_name_the_lines_between_recordings(tmp_path: Path) -> None:
+    done = imported(tmp_path, joined([block(40), block(50)], ""), between="none")
+    assert (rows_of(done), done.notes) == ([90], [])
+    lines = joined([block(40), block(50)], "START 2")
+    done = imported(tmp_path / "2", lines, between="START.*")
+    assert rows_of(done) == [40, 50]
+    done = imported(tmp_path / "3", lines)
+    assert rows_of(done) == [90]
+    assert "line 42: 'START 2'; if such lines are between recordings, describe them with  between" in done.notes[0]
+    # A spreadsheet fills a line of text with empty cells.
+    done = imported(tmp_path / "4", joined([block(40), block(50)], "Take two,"))
+    assert "line 42: 'Take two,'; if such lines are between recordings" in done.notes[0]
+    with pytest.raises(ConfigError, match=r"between is '\(', an expression that is not valid"):
+        ImportPattern(between="(")
+
+
+def test_blocks_also_end_recordings_of_a_labelled_table_with_a_clock(tmp_path: Path) -> None:
+    rows = [f"ana,{'Pat' if k < 80 else 'Hit'},{10 * k},1,2,{k}" for k in range(120)]
+    path = tmp_path / "all.csv"
+    path.write_text("\n".join(["subject,label,time_ms,x,y,z", *rows[:30], "", *rows[30:], ""]))
+    done = import_recordings(path, tmp_path / "DS", layout="accel-3")
+    assert rows_of(done) == [30, 50, 40]
+    assert "all.csv: 2 blocks of rows" in done.notes[0] and "pattern" not in done.notes[0]
+
+
+def test_missing_values_may_fill_a_row(tmp_path: Path) -> None:
+    done = imported(tmp_path, joined([block(40), block(50)], ","), missing=("",))
+    assert rows_of(done) == [91]
+
+
+def test_a_number_of_rows_is_one_recording(tmp_path: Path) -> None:
+    done = imported(tmp_path, [*block(118), "1", *block(119, 500)], recording_rows=119)
+    assert rows_of(done) == [118, 119], "a row that is left out counts"
+    assert done.dataset.read(done.dataset.recordings[1]).values[0].tolist() == [0, 500]
+    done = imported(tmp_path / "2", joined([block(100), block(120)], ""), recording_rows=50)
+    assert rows_of(done) == [50, 50, 50, 50, 20], "rows are counted from the beginning of a block"
+    assert any("1 of 5 recordings have fewer than 50 rows" in note for note in done.notes)
+    with pytest.raises(ConfigError, match="recording_rows is 1: accepted are 0 and 2 or more rows"):
+        ImportPattern(recording_rows=1)
+
+
+def test_a_guess_says_that_files_hold_blocks(tmp_path: Path) -> None:
+    for n, label in enumerate(("Pat", "Hit", "Rub", "Hold")):
+        for person in ("P1", "P2"):
+            (tmp_path / "src" / person).mkdir(parents=True, exist_ok=True)
+            lines = joined([block(30 + n), block(31), block(32)], HEAD, "")
+            (tmp_path / "src" / person / f"{label}.csv").write_text("\n".join([HEAD, *lines, ""]))
+    guessed = guess_pattern(tmp_path / "src")
+    assert "(up to 3 in the first lines of a file)" in guessed.doubts[0]
+    found = tomllib.loads(guessed.toml)
+    assert "missing" not in found, "names of columns are no missing values"
+    assert import_recordings(tmp_path / "src", tmp_path / "DS", pattern=ImportPattern(**found)).recordings == 24
+
+
+def test_a_guess_asks_about_equal_numbers_of_rows(tmp_path: Path) -> None:
+    for n, label in enumerate(("Pat", "Hit", "Rub", "Hold")):
+        for person in ("P1", "P2"):
+            (tmp_path / "src" / person).mkdir(parents=True, exist_ok=True)
+            (tmp_path / "src" / person / f"{label}.csv").write_text("\n".join([HEAD, *block(40 * (n + 2)), ""]))
+    doubts = guess_pattern(tmp_path / "src").doubts
+    assert any("80, 120, 160, 200 rows, all of them multiples of 40" in doubt for doubt in doubts)
