@@ -7,12 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.importing.guessing import guess_pattern
-from plushsense.dataset.importing.importers import ImportSummary, import_recordings
+from plushsense.dataset.importing.importers import ImportSummary, import_recordings, preview_import
 from plushsense.dataset.importing.pattern import ImportPattern
+from plushsense.windows.anywhere import cut_anywhere
+from plushsense.windows.cut import WindowSpec, cut_windows
 
 CHANNELS = [{"name": name, "unit": "", "kind": "sensor"} for name in ("a", "b")]
 PATTERN: dict[str, Any] = {
@@ -120,3 +123,49 @@ def test_a_guess_asks_about_equal_numbers_of_rows(tmp_path: Path) -> None:
             (tmp_path / "src" / person / f"{label}.csv").write_text("\n".join([HEAD, *block(40 * (n + 2)), ""]))
     doubts = guess_pattern(tmp_path / "src").doubts
     assert any("80, 120, 160, 200 rows, all of them multiples of 40" in doubt for doubt in doubts)
+
+
+@pytest.mark.parametrize("clock", [[f"{1.5e12:.5E}"] * 120, [f"{np.float32(1.7e9 + k / 100):.1f}" for k in range(120)]])
+def test_no_unit_is_guessed_from_a_clock_that_stands_still(tmp_path: Path, clock: list[str]) -> None:
+    (tmp_path / "src").mkdir()
+    rows = [f"P{p},{t},{'Pat' if k < 60 else 'Hit'},{k * (6 + p) % 17}.5" for p in (1, 2) for k, t in enumerate(clock)]
+    (tmp_path / "src" / "t.csv").write_text("\n".join(["subject,timestamp,label,force", *rows]))
+    layout = {"rate_hz": 100.0, "channels": [{"name": "force", "unit": "", "kind": "sensor", "step": 0.5}]}
+    given = ImportPattern(paths=("*.csv",), layout=layout)
+    said = ["column 'timestamp' is read as milliseconds", "the clock stands still: all 60 rows have one time"]
+    assert_said(preview_import(tmp_path / "src", pattern=given).warnings, said)
+    done = import_recordings(tmp_path / "src", tmp_path / "DS", pattern=given)
+    assert_said(done.to_dict()["warnings"], said)
+    with pytest.raises(DatasetError, match="the clock stands still in 4 recordings"):
+        cut_windows(done.dataset)
+    with pytest.raises(DatasetError, match="the clock stands still in 4 recordings"):
+        cut_anywhere(done.dataset, WindowSpec(context="anywhere"), done.dataset.gestures)
+    guessed = guess_pattern(tmp_path / "src")
+    assert "the clock in 'timestamp' stands still" in guessed.doubts[0]
+    assert tomllib.loads(guessed.toml)["row_rate_hz"] == 50.0
+    again = import_recordings(tmp_path / "src", tmp_path / "D2", pattern=ImportPattern(**tomllib.loads(guessed.toml)))
+    assert (cut_windows(again.dataset).x.std(axis=2) > 0).all()
+
+
+def assert_said(warnings: Sequence[str], said: Sequence[str]) -> None:
+    assert len(warnings) == len(said) and all(part in text for part, text in zip(said, warnings, strict=True)), warnings
+
+
+def test_a_recording_whose_clock_stands_still_is_left_out(tmp_path: Path) -> None:
+    rows = [
+        f"ana,{label},{2000 * n + (10 * k if n < 2 else 0)},1,2,{k % 9}"
+        for n, label in enumerate(("Pat", "Hit", "Pat"))
+        for k in range(100)
+    ]
+    (tmp_path / "all.csv").write_text("\n".join(["subject,label,time_ms,x,y,z", *rows]))
+    done = import_recordings(tmp_path / "all.csv", tmp_path / "DS", layout="accel-3")
+    windows = cut_windows(done.dataset)
+    assert [str(text) for text in windows.left_out] == [f"{done.dataset.recordings[2].id}: its clock stands still"]
+    assert len(windows) == 2
+
+
+def test_times_in_another_unit_than_their_name_says(tmp_path: Path) -> None:
+    rows = [f"ana,Pat,{k / 100},1,2,{k}" for k in range(100)]
+    (tmp_path / "all.csv").write_text("\n".join(["subject,label,time_ms,x,y,z", *rows]))
+    done = import_recordings(tmp_path / "all.csv", tmp_path / "DS", layout="accel-3")
+    assert "all.csv: by column 'time_ms', rows are only 0.01 ms apart" in done.notes[0]

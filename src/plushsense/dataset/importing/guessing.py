@@ -25,6 +25,7 @@ from plushsense.core.recorder_csv import parse_name
 from plushsense.dataset.importing.pattern import ENDINGS, PARTS, ROLES, UNITS, ImportPattern
 from plushsense.dataset.importing.sources import source_files, split_regular_files
 from plushsense.dataset.importing.table_files import is_between, json_cells, number_blocks, unit_of_time
+from plushsense.dataset.quality.measurements import rows_at_one_time
 
 _FILES, _LINES = 12, 400
 _USUAL_HZ = 50.0
@@ -330,6 +331,13 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
     dates = next((c for c in left if c.is_date), None)
     numeric = [c for c in left if c.is_numeric]
     time = dates or _named(numeric, (*ROLES["time"], "time", "stamp")) or next((c for c in numeric if c.rises), None)
+    if time is not None and (still := rows_at_one_time(np.array(time.numbers))):
+        left.remove(time)
+        guess.doubts.append(
+            f"the clock in '{time.key}' stands still ({still} rows in turn have the same time), as where a spreadsheet "
+            "or float32 cut digits off: export its times again, or let row_rate_hz stand instead of it"
+        )
+        time = None
     _clock(take("time", time), guess)
     texts = [c for c in left if not c.is_numeric and c.words]
     take("subject", _named([*texts, *left], (*ROLES["subject"], *_PERSON_NAMES)) if len(columns) > 1 else None)

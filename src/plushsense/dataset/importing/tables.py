@@ -40,7 +40,7 @@ from plushsense.dataset.files import sha256_of
 from plushsense.dataset.importing.pattern import UNITS, ImportPattern
 from plushsense.dataset.importing.sources import COMPANIONS, SourceFile
 from plushsense.dataset.importing.table_files import ImportedColumns, TableFile, forward_steps, read_rows, unit_of_time
-from plushsense.dataset.quality.measurements import in_order
+from plushsense.dataset.quality.measurements import in_order, rows_at_one_time
 from plushsense.dataset.store import RECORDINGS, STREAMS
 
 ORIGIN = "origin.json"
@@ -48,6 +48,8 @@ LARGEST = 2.0**53
 # A channel with values between the steps of its layout, and a spread of few steps, probably has another scale.
 _FEW_STEPS = 10.0
 _BETWEEN = 0.05
+# More than 20 rows in turn would have one time.
+_FINEST_MS = 0.05
 
 
 @dataclass(frozen=True)
@@ -270,6 +272,7 @@ class TableImport:
         factor, note = self._factor(columns, times)
         notes += [about_file(name, note)] if note else []
         device = times * factor
+        notes += _too_fine(table, columns, device)
         host = columns.numbers.get(HOST_MS, device)
         rows = len(device)
 
@@ -393,8 +396,10 @@ class TableImport:
         unit, stated = unit_of_time(name, times, self.layout.rate_hz)
         if stated:
             return UNITS[unit], ""
-        suggests = len(forward_steps(times)) > 0
+        # Steps of a clock that stands still say nothing about its unit.
+        suggests = len(forward_steps(times)) > 0 and not rows_at_one_time(times[np.isfinite(times)])
         why = f", as the rate of {self.layout.rate_hz:g} Hz suggests" if suggests else ""
+        unit = unit if suggests else "ms"
         message = f"column '{name}' is read as {unit if suggests else 'milliseconds'}{why}"
         return UNITS[unit], Sentence(message, reason="time_unit", column=name, unit=unit)
 
@@ -425,6 +430,17 @@ def _left_out(
             at = f" (the first: {where})" if where else ""
             message = f"{count} row{'s' if count > 1 else ''} {reason} left out{at}"
             yield about_file(table.display_name, Sentence(message, reason="rows_left_out", n=count))
+
+
+def _too_fine(table: TableFile, columns: ImportedColumns, device: NDArray[np.float64]) -> Iterator[Sentence]:
+    """Yield a note if the times in ``device`` (T,), in ms, would stand still since they are kept in whole ms."""
+    steps = forward_steps(device)
+    if len(steps) and float(np.median(steps)) < _FINEST_MS:
+        name, step = columns.names["time"], float(np.median(steps))
+        message = (
+            f"by column '{name}', rows are only {step:g} ms apart, but times are kept in whole ms: is its unit right?"
+        )
+        yield about_file(table.display_name, Sentence(message, reason="time_too_fine", column=name))
 
 
 def _ask_for_between(table: TableFile, columns: ImportedColumns) -> str:
