@@ -168,4 +168,4 @@ def test_times_in_another_unit_than_their_name_says(tmp_path: Path) -> None:
     rows = [f"ana,Pat,{k / 100},1,2,{k}" for k in range(100)]
     (tmp_path / "all.csv").write_text("\n".join(["subject,label,time_ms,x,y,z", *rows]))
     done = import_recordings(tmp_path / "all.csv", tmp_path / "DS", layout="accel-3")
-    assert "all.csv: by column 'time_ms', rows are only 0.01 ms apart" in done.notes[0]
+    assert "all.csv: by column 'time_ms', rows are 0.01 ms apart" in done.notes[0]

@@ -109,6 +109,8 @@ class ImportPattern:
         columns: column of each channel, and of ``subject``, ``session``, ``recording``, ``label``, ``time`` and
             ``host_ms``: its name, ``x#2`` for the second column ``x``, ``#3`` for the third column, ``a.b`` for a value
             within a JSON object (default: the columns of those names, as for one table).
+        idle: labels in a column that mean that nothing happens, such as ``null``: these rows belong to no recording,
+            but to the stream of the session (default: none; a gesture with ``idle = true`` keeps such recordings).
         aliases: for each label, a list of other spellings of it in the source. Case, ``_`` and spaces never make a
             difference.
     """
@@ -131,6 +133,7 @@ class ImportPattern:
     row_rate_hz: float = 0.0
     time_unit: Literal["", "s", "ms", "us", "ns", "iso"] = ""
     columns: dict[str, str] = field(default_factory=dict)
+    idle: tuple[str, ...] = ()
     aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -194,6 +197,10 @@ class ImportPattern:
     def label_of(self, text: str) -> str:
         """Return the label of which ``text`` is a spelling; other labels stay as they are."""
         return self._spellings.get(text) or self._spellings.get(plain_label(text), text)
+
+    def names_gesture(self, label: str) -> bool:
+        """Return whether ``label`` names a gesture, not idle time."""
+        return bool(plain_label(label)) and plain_label(label) not in map(plain_label, self.idle)
 
     @functools.cached_property
     def _spellings(self) -> dict[str, str]:

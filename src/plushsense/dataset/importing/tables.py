@@ -6,9 +6,10 @@ recording or stream.
 Rows are grouped by person and session, in the order of the file. A recording is a run of rows with the same label (and
 the same ``recording``, if there is such a column); without that column it also ends where the time decreases or pauses
 for more than a second. Empty lines, and the other lines of ``between`` in `ImportPattern`, end a recording too, and so
-does every ``recording_rows`` rows. A file whose path names the label or the take is one recording
-otherwise. Rows without a label belong to
-no recording; a session with such rows is also written as stream.
+does every ``recording_rows`` rows. A file whose path names the label or the take is one recording otherwise.
+
+Rows without a label, or with one of ``idle``, belong to no recording. A session with such rows is also written as
+stream, and so is one in which most recordings begin where the one before ends.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from plushsense.dataset.files import sha256_of
 from plushsense.dataset.importing.pattern import UNITS, ImportPattern
 from plushsense.dataset.importing.sources import COMPANIONS, SourceFile
 from plushsense.dataset.importing.table_files import ImportedColumns, TableFile, forward_steps, read_rows, unit_of_time
-from plushsense.dataset.quality.measurements import in_order, rows_at_one_time
+from plushsense.dataset.quality.measurements import SLOW_FACTOR, in_order, rows_at_one_time
 from plushsense.dataset.store import RECORDINGS, STREAMS
 
 ORIGIN = "origin.json"
@@ -324,7 +325,8 @@ class TableImport:
         frames = Frames(every.values[mine], every.device_ms[mine], every.host_ms[mine])
         label, take = samples.label[mine], samples.take[mine]
         names = [self.pattern.label_of(text) for text in samples.labels]
-        named = np.array([bool(plain_label(n)) and len(n) <= LONGEST_LABEL for n in names], dtype=bool)[label]
+        good = [self.pattern.names_gesture(n) and len(n) <= LONGEST_LABEL for n in names]
+        named = np.array(good, dtype=bool)[label]
         new = (np.diff(label) != 0) | (np.diff(take) != 0)
         if not apart:
             steps = np.diff(frames.device_ms)
@@ -332,6 +334,9 @@ class TableImport:
         if self.pattern.recording_rows:
             new |= self._ends_by_rows(new, samples.row[mine])
         runs = [0, *(np.flatnonzero(new) + 1).tolist(), len(mine)]
+        # Without a clock, nothing is known of the time between recordings that a file tells apart.
+        timed = not (apart and self.pattern.row_rate_hz)
+        with_stream = not named.all() or (timed and self._go_on(frames.device_ms, new))
         cuts = [
             LabelledSegment(names[label[a]], a, b, samples.labels[label[a]])
             for a, b in itertools.pairwise(runs)
@@ -343,7 +348,7 @@ class TableImport:
         folder = self.folder / str(self._written)
         self._written += 1
         files = list(
-            write_session(folder, *key, frames, cuts, self.layout, original, with_stream=not named.all(), taken=taken)
+            write_session(folder, *key, frames, cuts, self.layout, original, with_stream=with_stream, taken=taken)
         )
         yield from files
         yield from self._merged(table.display_name, sorted({cut.label for cut in cuts}))
@@ -361,6 +366,19 @@ class TableImport:
         begins = np.flatnonzero(np.append(True, new))
         first = np.repeat(row[begins], np.diff([*begins.tolist(), len(row)]))
         return np.asarray(np.diff((row - first) // self.pattern.recording_rows) != 0)
+
+    def _go_on(self, device_ms: NDArray[np.int64], new: NDArray[np.bool_]) -> bool:
+        """Return whether most runs of rows go on where the one before ends, so that they are parts of one stream.
+
+        Args:
+            new: (T − 1,) whether another run begins after the row.
+        """
+        steps = np.diff(device_ms)
+        forward = steps[steps > 0]
+        if not new.any() or not len(forward):
+            return False
+        gap_ms = max(self.layout.gap_ms, SLOW_FACTOR * float(np.median(forward)))
+        return float(np.mean((steps[new] > 0) & (steps[new] <= gap_ms))) > 0.5
 
     def _short(self, source: str, recordings: Sequence[NDArray[np.int64]]) -> Iterator[Sentence]:
         """Yield a note about recordings, given as the numbers of their rows, with fewer than ``recording_rows``."""
@@ -437,9 +455,7 @@ def _too_fine(table: TableFile, columns: ImportedColumns, device: NDArray[np.flo
     steps = forward_steps(device)
     if len(steps) and float(np.median(steps)) < _FINEST_MS:
         name, step = columns.names["time"], float(np.median(steps))
-        message = (
-            f"by column '{name}', rows are only {step:g} ms apart, but times are kept in whole ms: is its unit right?"
-        )
+        message = f"by column '{name}', rows are {step:g} ms apart, but times are kept in whole ms: is its unit right?"
         yield about_file(table.display_name, Sentence(message, reason="time_too_fine", column=name))
 
 
