@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -169,3 +169,49 @@ def test_times_in_another_unit_than_their_name_says(tmp_path: Path) -> None:
     (tmp_path / "all.csv").write_text("\n".join(["subject,label,time_ms,x,y,z", *rows]))
     done = import_recordings(tmp_path / "all.csv", tmp_path / "DS", layout="accel-3")
     assert "all.csv: by column 'time_ms', rows are 0.01 ms apart" in done.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("clock", "unit"),
+    [
+        (lambda k: f"12:00:{k // 100:02}.{k % 100:02}", "iso"),
+        (lambda k: f"59:{k // 100:02},{k % 100:02}", "iso"),
+        (lambda k: f"{46082.5 + k / 8_640_000:.9f}", "d"),
+        (lambda k: f"2026-03-01 12:00:{k // 100:02}.{k % 100:02}0", "iso"),
+    ],
+)
+def test_clocks_of_spreadsheets(tmp_path: Path, clock: Callable[[int], str], unit: str) -> None:
+    guessed, _ = guess_table(tmp_path, clock)
+    assert guessed["time_unit"] == unit and guessed["layout"]["rate_hz"] == 100.0
+    done = import_recordings(tmp_path / "src", tmp_path / "DS", pattern=ImportPattern(**guessed))
+    (recording,) = (r for r in done.dataset.recordings if r.gesture == "Pat")
+    assert np.diff(done.dataset.read(recording).device_ms).tolist() == [10] * 149
+
+
+def test_times_that_are_only_whole_seconds_or_not_read(tmp_path: Path) -> None:
+    guessed, doubts = guess_table(tmp_path, lambda k: f"2026-03-01 12:00:{k // 100:02}")
+    assert guessed["row_rate_hz"] == 50.0 and "the clock in 'time' stands still (100 rows" in doubts[0]
+    guessed, doubts = guess_table(tmp_path / "2", lambda k: f"01/03/2026 12:00:{k // 100:02}.{k % 100:02}")
+    assert guessed["row_rate_hz"] == 50.0 and "the times in 'time', such as '01/03/2026" in doubts[0]
+
+
+def guess_table(folder: Path, clock: Callable[[int], str]) -> tuple[dict[str, Any], list[str]]:
+    (folder / "src").mkdir(parents=True)
+    rows = [f"ana;{clock(k)};{'Pat' if k < 150 else 'Hit'};{k * 7 % 17}.5" for k in range(300)]
+    (folder / "src" / "all.csv").write_text("\n".join(["subject;time;label;force", *rows]))
+    guessed = guess_pattern(folder / "src")
+    return tomllib.loads(guessed.toml), guessed.doubts
+
+
+def test_a_guess_asks_about_lines_of_text_between_rows(tmp_path: Path) -> None:
+    for label in ("Pat", "Hit", "Rub", "Hold"):
+        for person in ("P1", "P2"):
+            (tmp_path / "src" / person).mkdir(parents=True, exist_ok=True)
+            lines = joined([block(30), block(31), block(32)], "START,")
+            (tmp_path / "src" / person / f"{label}.csv").write_text("\n".join([HEAD, *lines, ""]))
+    guessed = guess_pattern(tmp_path / "src")
+    assert "such as  between = 'START.*'" in guessed.doubts[0]
+    found = tomllib.loads(guessed.toml)
+    assert "missing" not in found
+    done = import_recordings(tmp_path / "src", tmp_path / "DS", pattern=ImportPattern(**found, between="START.*"))
+    assert done.recordings == 24

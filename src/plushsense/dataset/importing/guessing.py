@@ -12,7 +12,6 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,14 @@ from plushsense.core.gestures import plain_label
 from plushsense.core.recorder_csv import parse_name
 from plushsense.dataset.importing.pattern import ENDINGS, PARTS, ROLES, UNITS, ImportPattern
 from plushsense.dataset.importing.sources import source_files, split_regular_files
-from plushsense.dataset.importing.table_files import is_between, json_cells, number_blocks, unit_of_time
+from plushsense.dataset.importing.table_files import (
+    date_ms,
+    is_between,
+    is_text,
+    json_cells,
+    number_blocks,
+    unit_of_time,
+)
 from plushsense.dataset.quality.measurements import rows_at_one_time
 
 _FILES, _LINES = 12, 400
@@ -79,10 +85,14 @@ class _Column:
 
     @property
     def is_date(self) -> bool:
-        try:
-            return all(datetime.fromisoformat(word) for word in self.words) and len(self.words) > 3
-        except ValueError:
-            return False
+        return len(self.words) > 3 and not any(map(math.isnan, map(date_ms, self.words)))
+
+    @property
+    def times(self) -> np.ndarray:
+        """Times as numbers: dates in seconds."""
+        if self.is_date:
+            return np.array([date_ms(cell) / 1000.0 for cell in self.cells if cell.strip()])
+        return np.array(self.numbers)
 
     @property
     def rises(self) -> bool:
@@ -236,7 +246,7 @@ def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[_Colum
     columns = []
     head = rows[heads[0]] if heads else []
     data = [row for lines in samples for row in list(_cells(lines, separator))[begin:] if len(row) == width]
-    data = [row for row in data if not is_between(row, head, ImportPattern())]
+    data = [row for row in data if not is_between(row, head, ImportPattern()) and not _is_marker(row)]
     _row_blocks(samples, head, guess)
     for k, name in enumerate(names):
         seen[name.casefold()] += 1
@@ -247,13 +257,15 @@ def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[_Colum
 
 def _row_blocks(samples: list[list[str]], head: list[str], guess: _PatternDraft) -> None:
     """Add a doubt if empty lines, comments or lines of column names separate blocks of rows."""
-    blocks = 0
+    blocks, markers = 0, Counter[str]()
     for lines in samples:
         between, rows = dict[int, float](), 0
         for line in lines:
             row = next(iter(_cells([line], guess.separator)), [])
             if is_between(row, head, ImportPattern()):
                 between[rows] = between.get(rows, 0) + (math.inf if row and row[0].strip() else 1)
+            elif rows and _is_marker(row):
+                markers[row[0].strip()] += 1
             else:
                 rows += len(row) == guess.width and any(map(_is_number, row))
         blocks = max(blocks, int(number_blocks(between, rows).max(initial=0)) + 1)
@@ -263,6 +275,17 @@ def _row_blocks(samples: list[list[str]], head: list[str], guess: _PatternDraft)
             f'recording (up to {blocks} in the first lines of a file); if they are no recordings, add  between = "none"'
         )
         guess.in_blocks = True
+    if markers:
+        line = markers.most_common(1)[0][0][:40]
+        guess.doubts.append(
+            f"lines of text stand between rows, such as '{line}': if they separate recordings, describe them with a "
+            f"regular expression, such as  between = '{re.escape(line.split()[0])}.*'"
+        )
+
+
+def _is_marker(row: Sequence[str]) -> bool:
+    """Return whether a line has text in its first cell only."""
+    return bool(row) and bool(row[0].strip()) and is_text(row) and not any(cell.strip() for cell in row[1:])
 
 
 def _equal_recordings(files: Sequence[Path], guess: _PatternDraft) -> None:
@@ -331,13 +354,20 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
     dates = next((c for c in left if c.is_date), None)
     numeric = [c for c in left if c.is_numeric]
     time = dates or _named(numeric, (*ROLES["time"], "time", "stamp")) or next((c for c in numeric if c.rises), None)
-    if time is not None and (still := rows_at_one_time(np.array(time.numbers))):
+    if time is not None and (still := rows_at_one_time(time.times)):
         left.remove(time)
         guess.doubts.append(
             f"the clock in '{time.key}' stands still ({still} rows in turn have the same time), as where a spreadsheet "
             "or float32 cut digits off: export its times again, or let row_rate_hz stand instead of it"
         )
         time = None
+    unread = _named([c for c in left if not c.is_numeric and c.words], (*ROLES["time"], "time", "stamp"))
+    if time is None and unread is not None:
+        left.remove(unread)
+        guess.doubts.append(
+            f"the times in '{unread.key}', such as '{next(iter(unread.words))[:30]}', cannot be read: write them as "
+            "2026-03-01 12:01:02.5, as 12:01:02.5, or as numbers"
+        )
     _clock(take("time", time), guess)
     texts = [c for c in left if not c.is_numeric and c.words]
     take("subject", _named([*texts, *left], (*ROLES["subject"], *_PERSON_NAMES)) if len(columns) > 1 else None)
@@ -372,9 +402,8 @@ def _clock(time: _Column | None, guess: _PatternDraft) -> None:
             f"the files have no clock: give the true rate as row_rate_hz and rate_hz, now {_USUAL_HZ:g}"
         )
         return
-    numbers = np.array(time.numbers)
+    numbers = time.times
     if time.is_date:
-        numbers = np.array([datetime.fromisoformat(cell.strip()).timestamp() for cell in time.cells if cell.strip()])
         guess.keys["time_unit"], factor = "iso", 1000.0
     else:
         unit, stated = unit_of_time(time.name, numbers, _USUAL_HZ)

@@ -29,7 +29,7 @@ ROLES: dict[str, tuple[str, ...]] = {
     HOST_MS: (HOST_MS,),
 }
 STREAM_ROLE = "stream"
-UNITS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1000.0}
+UNITS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1000.0, "d": 86_400_000.0}
 ENDINGS = {".parquet": "parquet", ".jsonl": "json", ".ndjson": "json", ".json": "json"}
 """Formats by the ending of a file; any other is a table of text, ``csv``."""
 
@@ -105,7 +105,8 @@ class ImportPattern:
             the other (0 or from 2; 0: recordings have any length).
         row_rate_hz: rows for each second, for files without a clock. Rows that are left out take their time, too; 0:
             there is a column of times (from 0).
-        time_unit: unit of times; ``iso`` for dates (default: by the name of the column, else by the rate).
+        time_unit: unit of times; ``iso`` for dates and for times such as ``12:01:02.5``, ``d`` for days, as those of
+            spreadsheets (default: by the name of the column, else by the rate).
         columns: column of each channel, and of ``subject``, ``session``, ``recording``, ``label``, ``time`` and
             ``host_ms``: its name, ``x#2`` for the second column ``x``, ``#3`` for the third column, ``a.b`` for a value
             within a JSON object (default: the columns of those names, as for one table).
@@ -131,7 +132,7 @@ class ImportPattern:
     between: str = ""
     recording_rows: int = 0
     row_rate_hz: float = 0.0
-    time_unit: Literal["", "s", "ms", "us", "ns", "iso"] = ""
+    time_unit: Literal["", "d", "s", "ms", "us", "ns", "iso"] = ""
     columns: dict[str, str] = field(default_factory=dict)
     idle: tuple[str, ...] = ()
     aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)

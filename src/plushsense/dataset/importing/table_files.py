@@ -13,7 +13,7 @@ from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from math import inf, isfinite
+from math import inf, isfinite, isnan
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -74,6 +74,24 @@ class ImportedColumns:
     def number_of_row(self) -> NDArray[np.int64]:
         """Number of each row (T,), with those that are left out."""
         return self.row_numbers if len(self.row_numbers) else np.arange(len(self.numbers["time"]), dtype=np.int64)
+
+
+_TIME_OF_DAY = re.compile(r"(?:(\d+):)?(\d+):(\d+(?:[.,]\d+)?)")
+
+
+def date_ms(text: str) -> float:
+    """Return the milliseconds of a date in ISO form, in UTC if it names no zone, or of a time; NaN if ``text`` is none.
+
+    Times are ``12:01:02.5`` and, as spreadsheets show them, minutes and seconds with decimals: ``01:02.5``.
+    """
+    text = text.strip()
+    with contextlib.suppress(ValueError):
+        found = datetime.fromisoformat(text)
+        return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp() * 1000.0
+    time = _TIME_OF_DAY.fullmatch(text)
+    if time is None or (time[1] is None and time[3].isdecimal()):
+        return _NOT_A_NUMBER
+    return 1000.0 * (3600.0 * int(time[1] or 0) + 60.0 * int(time[2]) + float(time[3].replace(",", ".")))
 
 
 @dataclass(frozen=True)
@@ -165,7 +183,7 @@ class TableFile:
     def parser(self, role: str) -> Callable[[str], float]:
         """Return the function that reads the number in a cell: NaN if it holds none, infinite for a missing-value word.
 
-        Dates in a column of times become milliseconds, in UTC if they name no zone.
+        Dates in a column of times become milliseconds, see `date_ms`.
         """
         missing, comma = self.pattern.missing, self.pattern.decimal == ","
 
@@ -182,11 +200,8 @@ class TableFile:
             return value if isfinite(value) and "_" not in text else _NOT_A_NUMBER
 
         def date(text: str) -> float:
-            try:
-                found = datetime.fromisoformat(text.strip())
-            except ValueError:
-                return number(text)
-            return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp() * 1000.0
+            found = date_ms(text)
+            return number(text) if isnan(found) else found
 
         return date if self.pattern.time_unit == "iso" and role in ("time", HOST_MS) else number
 
@@ -310,11 +325,11 @@ def read_csv(file: TableFile) -> ImportedColumns:
                     # Some loggers end each line so.
                     row[-1] = row[-1].rstrip("; ")
                 # Spreadsheets save a line of text as a row with text in its first cell only.
-                whole = len(row) == len(there) and (bool(row[-1] or any(row[1:])) or not (row[0] and _is_text(row)))
+                whole = len(row) == len(there) and (bool(row[-1] or any(row[1:])) or not (row[0] and is_text(row)))
                 if whole and rows.add(line, [row[k] for k in places], [row[k] for k in bits_at]):
                     numbers.append(row_number)
                 else:
-                    rows.leave_out(line, separator.join(row), is_text=_is_text(row))
+                    rows.leave_out(line, separator.join(row), is_text=is_text(row))
                 # Rows that are left out have taken their time too.
                 row_number += 1
     except UnicodeError:
@@ -356,7 +371,7 @@ def number_blocks(between: Mapping[int, float], rows: int) -> NDArray[np.int64]:
     return np.cumsum(begins)
 
 
-def _is_text(row: Sequence[str]) -> bool:
+def is_text(row: Sequence[str]) -> bool:
     """Return whether no cell begins with a number."""
     return not any(re.match(r"\s*[-+.,]?\d", cell) for cell in row)
 
