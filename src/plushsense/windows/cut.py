@@ -258,6 +258,22 @@ def cut_windows(
     return replace(assemble(cuts, gestures, dataset), left_out=tuple(left_out))
 
 
+def constant_windows(windows: WindowSet) -> Sentence | None:
+    """Return a warning if windows are constant in time, None if none is."""
+    constant = np.flatnonzero((windows.x == windows.x[:, :, :1]).all(axis=(1, 2)))
+    if not len(constant):
+        return None
+    first = windows.recording_ids[windows.recording[constant[0]]]
+    return Sentence(
+        f"{len(constant)} of {len(windows)} windows are constant in time, for instance of {first}: look at the sensors "
+        "and the clock with  plushsense check",
+        "windows_constant",
+        n=len(constant),
+        of=len(windows),
+        recording=first,
+    )
+
+
 def without_window(recording: RecordingInfo, sessions: SessionReader) -> Sentence:
     """Return the reason why a recording gives no window."""
     if recording.id in sessions.standing:

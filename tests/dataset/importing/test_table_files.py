@@ -176,13 +176,13 @@ def test_times_in_another_unit_than_their_name_says(tmp_path: Path) -> None:
     [
         (lambda k: f"12:00:{k // 100:02}.{k % 100:02}", "iso"),
         (lambda k: f"59:{k // 100:02},{k % 100:02}", "iso"),
-        (lambda k: f"{46082.5 + k / 8_640_000:.9f}", "d"),
+        (lambda k: f"{46082.5 + k / 8_640_000:.10f}", "d"),
         (lambda k: f"2026-03-01 12:00:{k // 100:02}.{k % 100:02}0", "iso"),
     ],
 )
 def test_clocks_of_spreadsheets(tmp_path: Path, clock: Callable[[int], str], unit: str) -> None:
     guessed, _ = guess_table(tmp_path, clock)
-    assert guessed["time_unit"] == unit and guessed["layout"]["rate_hz"] == 100.0
+    assert guessed["time_unit"] == unit and guessed["layout"]["rate_hz"] == pytest.approx(100.0, rel=0.01)
     done = import_recordings(tmp_path / "src", tmp_path / "DS", pattern=ImportPattern(**guessed))
     (recording,) = (r for r in done.dataset.recordings if r.gesture == "Pat")
     assert np.diff(done.dataset.read(recording).device_ms).tolist() == [10] * 149
@@ -215,3 +215,10 @@ def test_a_guess_asks_about_lines_of_text_between_rows(tmp_path: Path) -> None:
     assert "missing" not in found
     done = import_recordings(tmp_path / "src", tmp_path / "DS", pattern=ImportPattern(**found, between="START.*"))
     assert done.recordings == 24
+
+
+def test_a_guess_asks_about_labels_that_may_mean_idle_time(tmp_path: Path) -> None:
+    (tmp_path / "src").mkdir()
+    rows = [f"ana,{10 * k},{('null', 'Pat')[k // 30 % 2]},{k * 7 % 17}.5" for k in range(300)]
+    (tmp_path / "src" / "all.csv").write_text("\n".join(["subject,time_ms,label,force", *rows]))
+    assert any('idle = ["null"]' in doubt for doubt in guess_pattern(tmp_path / "src").doubts)

@@ -40,6 +40,7 @@ _SEPARATORS = ("\t", ";", "|", ",", " ")
 _MOST_LABELS = 60
 _MOST_STEPS = 1e7
 _LEAST_ROWS = 20
+_IDLE_LABELS = frozenset(("0", "null", "null class", "none", "idle", "nothing", "background", "no gesture", "noise"))
 _PERSON = re.compile(r"(s|p|subj|subject|sub|participant|person|user|u|id|child|kid)[-_ ]?\d+", re.IGNORECASE)
 _SESSION = re.compile(r"(session|ses|day|visit|run)[-_ ]?\d*", re.IGNORECASE)
 # Words in paths that are no persons: devices, sensors, sides and parts of a data set.
@@ -85,12 +86,16 @@ class _Column:
 
     @property
     def is_date(self) -> bool:
-        return len(self.words) > 3 and not any(map(math.isnan, map(date_ms, self.words)))
+        return len(self.words) > 3 and self.holds_dates
+
+    @property
+    def holds_dates(self) -> bool:
+        return not any(map(math.isnan, map(date_ms, self.words)))
 
     @property
     def times(self) -> np.ndarray:
         """Times as numbers: dates in seconds."""
-        if self.is_date:
+        if self.words and self.holds_dates:
             return np.array([date_ms(cell) / 1000.0 for cell in self.cells if cell.strip()])
         return np.array(self.numbers)
 
@@ -176,6 +181,7 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
     _paths([f.relative_to(base) for f in mine], ending, guess)
     if "row_rate_hz" in guess.keys and "label" not in guess.taken and not is_json:
         _equal_recordings(mine, guess)
+    _idle(guess)
     _aliases(guess)
     # Names in the files may hold characters that no line of text can show.
     guess.doubts = ["".join(c if c.isprintable() else " " for c in doubt) for doubt in guess.doubts]
@@ -354,6 +360,9 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
     dates = next((c for c in left if c.is_date), None)
     numeric = [c for c in left if c.is_numeric]
     time = dates or _named(numeric, (*ROLES["time"], "time", "stamp")) or next((c for c in numeric if c.rises), None)
+    unread = _named([c for c in left if not c.is_numeric and c.words], (*ROLES["time"], "time", "stamp"))
+    if time is None and unread is not None and unread.holds_dates:
+        time = unread
     if time is not None and (still := rows_at_one_time(time.times)):
         left.remove(time)
         guess.doubts.append(
@@ -361,8 +370,7 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
             "or float32 cut digits off: export its times again, or let row_rate_hz stand instead of it"
         )
         time = None
-    unread = _named([c for c in left if not c.is_numeric and c.words], (*ROLES["time"], "time", "stamp"))
-    if time is None and unread is not None:
+    elif time is None and unread is not None:
         left.remove(unread)
         guess.doubts.append(
             f"the times in '{unread.key}', such as '{next(iter(unread.words))[:30]}', cannot be read: write them as "
@@ -403,7 +411,7 @@ def _clock(time: _Column | None, guess: _PatternDraft) -> None:
         )
         return
     numbers = time.times
-    if time.is_date:
+    if time.words and time.holds_dates:
         guess.keys["time_unit"], factor = "iso", 1000.0
     else:
         unit, stated = unit_of_time(time.name, numbers, _USUAL_HZ)
@@ -528,6 +536,16 @@ def _role(texts: list[str], several: bool, taken: set[str], at: int) -> str:
     if "label" not in taken and 1 < len(distinct) <= min(_MOST_LABELS, max(2, len(texts) // 2)):
         return "label"
     return "*"
+
+
+def _idle(guess: _PatternDraft) -> None:
+    """Add a doubt about labels that may stand for idle time."""
+    found = [label for label in guess.labels if plain_label(label) in _IDLE_LABELS]
+    if "label" in guess.taken and found:
+        guess.doubts.append(
+            f"rows with the label {', '.join(map(repr, found))} are taken for a gesture: if nothing happens in them, "
+            f"add  idle = {json.dumps(found, ensure_ascii=False)}"
+        )
 
 
 def _aliases(guess: _PatternDraft) -> None:
