@@ -70,10 +70,10 @@ def test_the_pattern_can_name_the_lines_between_recordings(tmp_path: Path) -> No
     assert rows_of(done) == [40, 50]
     done = imported(tmp_path / "3", lines)
     assert rows_of(done) == [90]
-    assert "line 42: 'START 2'; if such lines are between recordings, describe them with  between" in done.notes[0]
+    assert "line 42: 'START 2'; if such lines separate recordings, describe them with  between" in done.notes[0]
     # A spreadsheet fills a line of text with empty cells.
     done = imported(tmp_path / "4", joined([block(40), block(50)], "Take two,"))
-    assert "line 42: 'Take two,'; if such lines are between recordings" in done.notes[0]
+    assert "line 42: 'Take two,'; if such lines separate recordings" in done.notes[0]
     with pytest.raises(ConfigError, match=r"between is '\(', an expression that is not valid"):
         ImportPattern(between="(")
 

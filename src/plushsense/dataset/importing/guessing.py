@@ -39,7 +39,7 @@ _USUAL_HZ = 50.0
 _SEPARATORS = ("\t", ";", "|", ",", " ")
 _MOST_LABELS = 60
 _MOST_STEPS = 1e7
-_LEAST_ROWS = 20
+_LEAST_ROWS, _COUNTED = 20, 200
 _IDLE_LABELS = frozenset(("0", "null", "null class", "none", "idle", "nothing", "background", "no gesture", "noise"))
 _PERSON = re.compile(r"(s|p|subj|subject|sub|participant|person|user|u|id|child|kid)[-_ ]?\d+", re.IGNORECASE)
 _SESSION = re.compile(r"(session|ses|day|visit|run)[-_ ]?\d*", re.IGNORECASE)
@@ -298,11 +298,11 @@ def _equal_recordings(files: Sequence[Path], guess: _PatternDraft) -> None:
     """Add a doubt if the numbers of rows of the files suggest recordings of equal length, one after the other."""
     if guess.in_blocks:
         return
-    counts = set()
-    for file in files:
+    counts, separator = set[int](), guess.separator.strip().encode() or None
+    for file in files[:_COUNTED]:
         with file.open("rb") as opened:
-            lines = (line.replace(b";", b",").split(b",", 1)[0] for line in opened)
-            counts.add(sum(_is_number(cell.decode("latin-1")) for cell in lines))
+            cells = (line.split(separator, 1)[0].decode("latin-1") for line in opened if line.strip())
+            counts.add(sum(map(_is_number, cells)))
     common = math.gcd(*counts)
     if common >= _LEAST_ROWS and len(counts) > 1:
         listed = ", ".join(str(n) for n in sorted(counts)[:4]) + (", …" if len(counts) > 4 else "")
@@ -370,7 +370,7 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
             "or float32 cut digits off: export its times again, or let row_rate_hz stand instead of it"
         )
         time = None
-    elif time is None and unread is not None:
+    elif time is None and unread is not None and re.search(r"\d", next(iter(unread.words))):
         left.remove(unread)
         guess.doubts.append(
             f"the times in '{unread.key}', such as '{next(iter(unread.words))[:30]}', cannot be read: write them as "

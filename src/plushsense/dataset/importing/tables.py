@@ -439,8 +439,13 @@ def _left_out(
     def first(bad: NDArray[np.bool_]) -> str:
         return f"line {columns.lines[int(np.argmax(bad))]}" if len(columns.lines) and bad.any() else ""
 
+    ask = (
+        "; if such lines are between recordings, describe them with  between  in a pattern"
+        if columns.text_lines
+        else ""
+    )
     for count, reason, where in (
-        (columns.malformed, columns.why_malformed, columns.first_malformed + _ask_for_between(table, columns)),
+        (columns.malformed, columns.why_malformed, columns.first_malformed + ask),
         (int(np.sum(~good)), "without a number in every column", first(~good)),
         (int(np.sum(good & ~known)), "without a subject", first(good & ~known)),
     ):
@@ -457,13 +462,6 @@ def _too_fine(table: TableFile, columns: ImportedColumns, device: NDArray[np.flo
         name, step = columns.names["time"], float(np.median(steps))
         message = f"by column '{name}', rows are {step:g} ms apart, but times are kept in whole ms: is its unit right?"
         yield about_file(table.display_name, Sentence(message, reason="time_too_fine", column=name))
-
-
-def _ask_for_between(table: TableFile, columns: ImportedColumns) -> str:
-    """Return what to do if malformed rows are lines of text between recordings; "" if there are none."""
-    if not columns.text_lines:
-        return ""
-    return "; if such lines are between recordings, describe them with  between  in a pattern"
 
 
 def _blocks(table: TableFile, columns: ImportedColumns) -> Iterator[Sentence]:
