@@ -439,11 +439,7 @@ def _left_out(
     def first(bad: NDArray[np.bool_]) -> str:
         return f"line {columns.lines[int(np.argmax(bad))]}" if len(columns.lines) and bad.any() else ""
 
-    ask = (
-        "; if such lines are between recordings, describe them with  between  in a pattern"
-        if columns.text_lines
-        else ""
-    )
+    ask = "; if such lines separate recordings, describe them with  between  in a pattern" if columns.text_lines else ""
     for count, reason, where in (
         (columns.malformed, columns.why_malformed, columns.first_malformed + ask),
         (int(np.sum(~good)), "without a number in every column", first(~good)),
