@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,17 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import plain_label
 from plushsense.core.recorder_csv import parse_name
-from plushsense.dataset.importing.pattern import ENDINGS, PARTS, ROLES, UNITS
+from plushsense.dataset.importing.pattern import ENDINGS, PARTS, ROLES, UNITS, ImportPattern
 from plushsense.dataset.importing.sources import source_files, split_regular_files
-from plushsense.dataset.importing.table_files import json_cells, unit_of_time
+from plushsense.dataset.importing.table_files import (
+    date_ms,
+    is_between,
+    is_text,
+    json_cells,
+    number_blocks,
+    unit_of_time,
+)
+from plushsense.dataset.quality.measurements import rows_at_one_time
 
 _FILES, _LINES = 12, 400
 _USUAL_HZ = 50.0
@@ -31,6 +39,8 @@ _USUAL_HZ = 50.0
 _SEPARATORS = ("\t", ";", "|", ",", " ")
 _MOST_LABELS = 60
 _MOST_STEPS = 1e7
+_LEAST_ROWS, _COUNTED = 20, 200
+_IDLE_LABELS = frozenset(("0", "null", "null class", "none", "idle", "nothing", "background", "no gesture", "noise"))
 _PERSON = re.compile(r"(s|p|subj|subject|sub|participant|person|user|u|id|child|kid)[-_ ]?\d+", re.IGNORECASE)
 _SESSION = re.compile(r"(session|ses|day|visit|run)[-_ ]?\d*", re.IGNORECASE)
 # Words in paths that are no persons: devices, sensors, sides and parts of a data set.
@@ -76,10 +86,18 @@ class _Column:
 
     @property
     def is_date(self) -> bool:
-        try:
-            return all(datetime.fromisoformat(word) for word in self.words) and len(self.words) > 3
-        except ValueError:
-            return False
+        return len(self.words) > 3 and self.holds_dates
+
+    @property
+    def holds_dates(self) -> bool:
+        return not any(map(math.isnan, map(date_ms, self.words)))
+
+    @property
+    def times(self) -> np.ndarray:
+        """Times as numbers: dates in seconds."""
+        if self.words and self.holds_dates:
+            return np.array([date_ms(cell) / 1000.0 for cell in self.cells if cell.strip()])
+        return np.array(self.numbers)
 
     @property
     def rises(self) -> bool:
@@ -116,6 +134,7 @@ class _PatternDraft:
     rate_hz: float = 0.0
     width: int = 1
     separator: str = ""
+    in_blocks: bool = False
     doubts: list[str] = field(default_factory=list)
 
 
@@ -160,6 +179,9 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
         listed = ", ".join(column.name.strip()[:30] for column in columns[:20])
         raise DatasetError(f"No column of numbers that could be a channel was found in '{source}'; it has {listed}.")
     _paths([f.relative_to(base) for f in mine], ending, guess)
+    if "row_rate_hz" in guess.keys and "label" not in guess.taken and not is_json:
+        _equal_recordings(mine, guess)
+    _idle(guess)
     _aliases(guess)
     # Names in the files may hold characters that no line of text can show.
     guess.doubts = ["".join(c if c.isprintable() else " " for c in doubt) for doubt in guess.doubts]
@@ -228,12 +250,66 @@ def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[_Colum
     counts = Counter(name.casefold() for name in names)
     seen: Counter[str] = Counter()
     columns = []
+    head = rows[heads[0]] if heads else []
     data = [row for lines in samples for row in list(_cells(lines, separator))[begin:] if len(row) == width]
+    data = [row for row in data if not is_between(row, head, ImportPattern()) and not _is_marker(row)]
+    _row_blocks(samples, head, guess)
     for k, name in enumerate(names):
         seen[name.casefold()] += 1
         key = f"{name}#{seen[name.casefold()]}" if counts[name.casefold()] > 1 else name or f"#{k + 1}"
         columns.append(_Column(name, key, [row[k] for row in data], guess.keys.get("decimal", ".")))
     return columns
+
+
+def _row_blocks(samples: list[list[str]], head: list[str], guess: _PatternDraft) -> None:
+    """Add a doubt if empty lines, comments or lines of column names separate blocks of rows."""
+    blocks, markers = 0, Counter[str]()
+    for lines in samples:
+        between, rows = dict[int, float](), 0
+        for line in lines:
+            row = next(iter(_cells([line], guess.separator)), [])
+            if is_between(row, head, ImportPattern()):
+                between[rows] = between.get(rows, 0) + (math.inf if row and row[0].strip() else 1)
+            elif rows and _is_marker(row):
+                markers[row[0].strip()] += 1
+            else:
+                rows += len(row) == guess.width and any(map(_is_number, row))
+        blocks = max(blocks, int(number_blocks(between, rows).max(initial=0)) + 1)
+    if blocks > 1:
+        guess.doubts.append(
+            "empty lines, comments or repeated column names separate blocks of rows: each block is taken for a "
+            f'recording (up to {blocks} in the first lines of a file); if they are no recordings, add  between = "none"'
+        )
+        guess.in_blocks = True
+    if markers:
+        line = markers.most_common(1)[0][0][:40]
+        guess.doubts.append(
+            f"lines of text stand between rows, such as '{line}': if they separate recordings, describe them with a "
+            f"regular expression, such as  between = '{re.escape(line.split()[0])}.*'"
+        )
+
+
+def _is_marker(row: Sequence[str]) -> bool:
+    """Return whether a line has text in its first cell only."""
+    return bool(row) and bool(row[0].strip()) and is_text(row) and not any(cell.strip() for cell in row[1:])
+
+
+def _equal_recordings(files: Sequence[Path], guess: _PatternDraft) -> None:
+    """Add a doubt if the numbers of rows of the files suggest recordings of equal length, one after the other."""
+    if guess.in_blocks:
+        return
+    counts, separator = set[int](), guess.separator.strip().encode() or None
+    for file in files[:_COUNTED]:
+        with file.open("rb") as opened:
+            cells = (line.split(separator, 1)[0].decode("latin-1") for line in opened if line.strip())
+            counts.add(sum(map(_is_number, cells)))
+    common = math.gcd(*counts)
+    if common >= _LEAST_ROWS and len(counts) > 1:
+        listed = ", ".join(str(n) for n in sorted(counts)[:4]) + (", …" if len(counts) > 4 else "")
+        guess.doubts.append(
+            f"the files have {listed} rows, all of them multiples of {common}: if recordings of a fixed number of rows "
+            "follow one another, give it as recording_rows"
+        )
 
 
 def _cells(lines: Iterable[str], separator: str) -> Iterable[list[str]]:
@@ -284,6 +360,22 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
     dates = next((c for c in left if c.is_date), None)
     numeric = [c for c in left if c.is_numeric]
     time = dates or _named(numeric, (*ROLES["time"], "time", "stamp")) or next((c for c in numeric if c.rises), None)
+    unread = _named([c for c in left if not c.is_numeric and c.words], (*ROLES["time"], "time", "stamp"))
+    if time is None and unread is not None and unread.holds_dates:
+        time = unread
+    if time is not None and (still := rows_at_one_time(time.times)):
+        left.remove(time)
+        guess.doubts.append(
+            f"the clock in '{time.key}' stands still ({still} rows in turn have the same time), as where a spreadsheet "
+            "or float32 cut digits off: export its times again, or let row_rate_hz stand instead of it"
+        )
+        time = None
+    elif time is None and unread is not None and re.search(r"\d", next(iter(unread.words))):
+        left.remove(unread)
+        guess.doubts.append(
+            f"the times in '{unread.key}', such as '{next(iter(unread.words))[:30]}', cannot be read: write them as "
+            "2026-03-01 12:01:02.5, as 12:01:02.5, or as numbers"
+        )
     _clock(take("time", time), guess)
     texts = [c for c in left if not c.is_numeric and c.words]
     take("subject", _named([*texts, *left], (*ROLES["subject"], *_PERSON_NAMES)) if len(columns) > 1 else None)
@@ -318,9 +410,8 @@ def _clock(time: _Column | None, guess: _PatternDraft) -> None:
             f"the files have no clock: give the true rate as row_rate_hz and rate_hz, now {_USUAL_HZ:g}"
         )
         return
-    numbers = np.array(time.numbers)
-    if time.is_date:
-        numbers = np.array([datetime.fromisoformat(cell.strip()).timestamp() for cell in time.cells if cell.strip()])
+    numbers = time.times
+    if time.words and time.holds_dates:
         guess.keys["time_unit"], factor = "iso", 1000.0
     else:
         unit, stated = unit_of_time(time.name, numbers, _USUAL_HZ)
@@ -445,6 +536,16 @@ def _role(texts: list[str], several: bool, taken: set[str], at: int) -> str:
     if "label" not in taken and 1 < len(distinct) <= min(_MOST_LABELS, max(2, len(texts) // 2)):
         return "label"
     return "*"
+
+
+def _idle(guess: _PatternDraft) -> None:
+    """Add a doubt about labels that may stand for idle time."""
+    found = [label for label in guess.labels if plain_label(label) in _IDLE_LABELS]
+    if "label" in guess.taken and found:
+        guess.doubts.append(
+            f"rows with the label {', '.join(map(repr, found))} are taken for a gesture: if nothing happens in them, "
+            f"add  idle = {json.dumps(found, ensure_ascii=False)}"
+        )
 
 
 def _aliases(guess: _PatternDraft) -> None:
