@@ -16,63 +16,85 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import plain_label
 from plushsense.core.recorder_csv import parse_name
-from plushsense.dataset.importing.pattern import ENDINGS, PARTS, ROLES, UNITS
+from plushsense.core.toml import loads_json
+from plushsense.dataset.importing.counters import CLOCK, no_reading
+from plushsense.dataset.importing.intervals import interval_columns
+from plushsense.dataset.importing.path_parts import MOST_LABELS, PathParts, guess_paths
+from plushsense.dataset.importing.pattern import ENDINGS, INTERVAL, LABELS, ROLES, UNITS, path_expression
 from plushsense.dataset.importing.sources import source_files, split_regular_files
 from plushsense.dataset.importing.table_files import json_cells, unit_of_time
 
-_FILES, _LINES = 12, 400
+_FILES, _LINES = 12, 2000
+_HEAD, _MOST_BYTES, _MOST_JSON = 16_384, 400_000, 64 << 20
 _USUAL_HZ = 50.0
 # The first with which the rows have the same number of cells; a comma may also be in decimals.
 _SEPARATORS = ("\t", ";", "|", ",", " ")
-_MOST_LABELS = 60
 _MOST_STEPS = 1e7
-_PERSON = re.compile(r"(s|p|subj|subject|sub|participant|person|user|u|id|child|kid)[-_ ]?\d+", re.IGNORECASE)
-_SESSION = re.compile(r"(session|ses|day|visit|run)[-_ ]?\d*", re.IGNORECASE)
-# Words in paths that are no persons: devices, sensors, sides and parts of a data set.
-_NO_PERSON = frozenset(
-    ("phone", "watch", "accel", "acc", "gyro", "left", "right", "train", "test", "raw", "data", "csv", "wrist", "ankle")
-)
-_LABEL_NAMES = ("label", "gesture", "activity", "class", "event", "action", "touch", "kind", "movement")
+_LABEL_NAMES = ("label", "gesture", "activity", *LABELS)
 _PERSON_NAMES = ("subject", "participant", "person", "user", "child", "who")
+# acc_x, x_acc, accX, aX, Accelerometer_x, and x, y, z alone; not accuracy.
+_ACCELERATION = re.compile(r"(?<![a-z])(acc(?!u)|accel|a_?[xyz](?![a-z]))|acc(el)?_?[xyz]?$|^[xyz](_\d+)?$")
 _NO_CHANNEL = re.compile(r"(index|row|frame|sample|no|nr|id|count_?er|unnamed.*|#)?", re.IGNORECASE)
+# Labels as numbers: so many whole numbers, which change from fewer rows to the next than this.
+_CODES, _SELDOM = range(2, 31), 0.02
+# Files of micro:bit CreateAI name no rate; older ones write ID, newer ones id.
+_MICROBIT_HZ = {"recordings.ID": 40.0, "recordings.id": 50.0}
+# Objects around channels in JSON that say nothing about them.
+_AROUND = re.compile(r"^((recordings|payload|data|sensors|values|samples)\.(?!\d+$))+")
 
 
 @dataclass
 class _Column:
-    """A column of the samples: its ``key`` for the pattern and its cells."""
+    """A column of the samples: its ``key`` for the pattern, and its cells in each file or recording."""
 
     name: str
     key: str
-    cells: list[str]
+    parts: list[list[str]]
     decimal: str = "."
-    numbers: list[float] = field(default_factory=list)
-    words: Counter[str] = field(default_factory=Counter)
     of_recording: bool = False
     """Whether there is one cell for each recording, beside columns with many."""
+    numbers: list[NDArray[np.float64]] = field(default_factory=list)
+    """The number in each cell of each part, NaN where there is none."""
+    words: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
-        for cell in self.cells:
-            text = cell.strip().replace(",", ".") if self.decimal == "," else cell.strip()
-            if _is_number(text) and "," not in text:
-                self.numbers.append(float(text))
-            elif text:
-                self.words[text] += 1
+        for cells in self.parts:
+            numbers = np.full(len(cells), np.nan)
+            for k, cell in enumerate(cells):
+                text = cell.strip().replace(",", ".") if self.decimal == "," else cell.strip()
+                if _is_number(text) and "," not in text:
+                    numbers[k] = float(text)
+                elif text:
+                    self.words[text] += 1
+            self.numbers.append(numbers)
+
+    @property
+    def cells(self) -> list[str]:
+        return [cell for cells in self.parts for cell in cells]
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """The numbers of all parts."""
+        joined = np.concatenate([*self.numbers, np.empty(0)])
+        return joined[np.isfinite(joined)]
 
     @property
     def is_numeric(self) -> bool:
-        words = sum(self.words.values())
-        return len(self.numbers) > 0.6 * (len(self.numbers) + words) and len(self.words) <= 3
+        words, numbers = sum(self.words.values()), len(self.values)
+        return numbers > 0.6 * (numbers + words) and len(self.words) <= 3
 
     @property
     def is_bits(self) -> bool:
-        lengths = {len(cell.strip()) for cell in self.cells}
-        digits = all(re.fullmatch("[01]+", cell.strip()) for cell in self.cells)
-        return digits and len(lengths) == 1 and max(lengths) > 1 and any(c.strip()[:1] == "0" for c in self.cells)
+        cells = {cell.strip() for cell in self.cells}
+        same = len({len(cell) for cell in cells}) == 1 and max(map(len, cells)) > 1
+        digits = same and all(re.fullmatch("[01]+", cell) for cell in cells)
+        return digits and any(cell[0] == "0" for cell in cells) and len(cells) > 1 and not self.of_recording
 
     @property
     def is_date(self) -> bool:
@@ -82,9 +104,45 @@ class _Column:
             return False
 
     @property
+    def moments(self) -> list[NDArray[np.float64]]:
+        """The times in each part: numbers, or the seconds of dates."""
+        if not self.is_date:
+            return self.numbers
+        return [
+            np.array([datetime.fromisoformat(cell.strip()).timestamp() if cell.strip() else np.nan for cell in cells])
+            for cells in self.parts
+        ]
+
+    @property
+    def steps(self) -> NDArray[np.float64]:
+        """The differences of neighbouring numbers, within each part."""
+        return np.concatenate([*(np.diff(part[np.isfinite(part)]) for part in self.numbers), np.empty(0)])
+
+    @property
     def rises(self) -> bool:
-        steps = np.diff(self.numbers)
-        return len(steps) > 3 and float(np.mean(steps > 0)) > 0.8
+        return len(self.steps) > 3 and float(np.mean(self.steps > 0)) > 0.8
+
+    @property
+    def codes(self) -> list[int]:
+        """The values, if they are few whole numbers that change rarely, as labels do; otherwise nothing."""
+        distinct = np.unique(self.values)
+        whole = len(distinct) in _CODES and bool(np.all(distinct == np.round(distinct)))
+        cells = set(distinct.tolist()) <= {0.0, 1.0} and not _named([self], _LABEL_NAMES)
+        if not whole or cells or not len(self.steps) or self.of_recording:
+            return []
+        return [int(value) for value in distinct] if float(np.mean(self.steps != 0)) < _SELDOM else []
+
+
+@dataclass(frozen=True)
+class _Form:
+    """Form of a table of text: its column names, "" if it has none, and its first row of data.
+
+    ``head`` is the row of names, None without one.
+    """
+
+    names: tuple[str, ...]
+    head: int | None
+    begin: int
 
 
 @dataclass(frozen=True)
@@ -114,8 +172,14 @@ class _PatternDraft:
     vectors: list[list[str]] = field(default_factory=list)
     labels: Counter[str] = field(default_factory=Counter)
     rate_hz: float = 0.0
+    times: list[NDArray[np.float64]] = field(default_factory=list)
+    """The time of each row of each file or recording; its number without a clock."""
+    codes: dict[str, list[int]] = field(default_factory=dict)
+    """Columns of few whole numbers that change rarely."""
+    is_json: bool = False
     width: int = 1
     separator: str = ""
+    form: _Form | None = None
     doubts: list[str] = field(default_factory=list)
 
 
@@ -145,21 +209,30 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
     guess = _PatternDraft()
     if others := len(files) - len(of_ending):
         guess.doubts.append(f"files that do not end in '{ending}' are left out: {others}")
-    samples = [text for f in mine[:: max(1, len(mine) // _FILES)][:_FILES] if (text := _lines(f, guess))]
-    is_json = ENDINGS.get(ending) == "json" or samples[0][0].lstrip()[:1] in ("{", "[")
-    columns = _json_columns(samples) if is_json else _text_columns(samples, guess)
-    if is_json and ENDINGS.get(ending) != "json":
+    some = mine[:: max(1, len(mine) // _FILES)][:_FILES]
+    guess.is_json = ENDINGS.get(ending) == "json" or _text(some[0], guess, _HEAD).lstrip()[:1] in ("{", "[")
+    if guess.is_json:
+        columns = _json_columns([_json_text(f, guess) for f in some], guess)
+    else:
+        columns = _text_columns([lines for f in some if (lines := _text(f, guess).splitlines()[:_LINES])], guess)
+    if guess.is_json and ENDINGS.get(ending) != "json":
         guess.keys["format"] = "json"
-    if not is_json:
-        mine = [f for f in mine if _has_rows(f, guess.width, guess.separator)] or mine
-    if without := sorted({f.relative_to(base).as_posix() for f in set(of_ending) - set(mine)}):
-        guess.keys["exclude"] = without
-        guess.doubts.append(f"files without such rows are left out: {', '.join(without[:5])}")
+    if not guess.is_json:
+        mine = [f for f in mine if _fits(_text(f, guess, _HEAD).splitlines(), guess)] or mine
+    without = sorted(set(of_ending) - set(mine))
     _roles(columns, guess)
     if not guess.channels:
-        listed = ", ".join(column.name.strip()[:30] for column in columns[:20])
+        listed = ", ".join(column.name.strip()[:30] for column in columns[:20]) or "no columns of one length"
         raise DatasetError(f"No column of numbers that could be a channel was found in '{source}'; it has {listed}.")
-    _paths([f.relative_to(base) for f in mine], ending, guess)
+    relative = [f.relative_to(base) for f in mine]
+    parts = guess_paths(relative, ending, guess.taken, dotted=INTERVAL in guess.columns)
+    guess.keys["paths"] = parts.patterns
+    without = _intervals(base, without, relative, parts, guess)
+    _exclude([f.relative_to(base) for f in without], relative, guess)
+    guess.doubts += parts.doubts
+    if parts.labels:
+        guess.labels = parts.labels
+    _codes(parts, guess)
     _aliases(guess)
     # Names in the files may hold characters that no line of text can show.
     guess.doubts = ["".join(c if c.isprintable() else " " for c in doubt) for doubt in guess.doubts]
@@ -172,32 +245,75 @@ def _is_text(path: Path) -> bool:
     return bool(head.strip()) and b"\x00" not in head and path.suffix.lower() not in (".md", ".toml", ".py", ".pdf")
 
 
-def _has_rows(path: Path, width: int = 1, separator: str = "") -> bool:
-    """Return whether the first lines of a file hold a row of ``width`` cells with a number, or a JSON value."""
+def _has_rows(path: Path) -> bool:
+    """Return whether the first lines of a file hold a row with a number, or a JSON value."""
     with path.open("rb") as file:
         lines = file.read(4096).decode("utf-8-sig", "replace").splitlines()
-    if width > 1:
-        return any(len(row) == width and any(map(_is_number, row)) for row in _cells(lines, separator))
     return any(line.lstrip()[:1] in ("{", "[") or any(map(_is_number, re.split(r"[,;\t| ]", line))) for line in lines)
 
 
-def _lines(path: Path, guess: _PatternDraft) -> list[str]:
+def _text(path: Path, guess: _PatternDraft, most: int = _MOST_BYTES) -> str:
+    """Return the first bytes of a file as text, without the beginning of a line at the end."""
     with path.open("rb") as file:
-        raw = file.read(400_000)
+        raw = file.read(most)
+    cut = len(raw) == most
     try:
-        text = raw.decode("utf-8-sig", "strict" if len(raw) < 400_000 else "ignore")
+        text = raw.decode("utf-8-sig", "ignore" if cut else "strict")
     except UnicodeDecodeError:
         guess.keys["encoding"] = "latin-1"
         text = raw.decode("latin-1")
-    return text.splitlines()[:_LINES]
+    return text[: text.rfind("\n") + 1] or text if cut else text
+
+
+def _json_text(path: Path, guess: _PatternDraft) -> str:
+    """Return some lines of JSON, or a whole document of several lines.
+
+    Raises:
+        DatasetError: for a document that is too long.
+    """
+    text = _text(path, guess)
+    lines = text.splitlines()
+    try:
+        if isinstance(loads_json(lines[0]), dict):
+            return "\n".join(lines[:_LINES])
+    except (ValueError, RecursionError):
+        pass
+    if path.stat().st_size > _MOST_JSON:
+        raise DatasetError(
+            f"'{path}' is one JSON document of {path.stat().st_size >> 20} MB, too long to be guessed from: the most "
+            f"is {_MOST_JSON >> 20} MB. Give a folder with a shorter file of the same form, or write the pattern."
+        )
+    return _text(path, guess, _MOST_JSON + 1)
 
 
 def _is_number(text: str) -> bool:
     return bool(re.fullmatch(r"\s*[-+]?(\d{1,30}([.,]\d*)?|[.,]\d+)([eE][-+]?\d{1,2})?\s*", text))
 
 
+def _form(rows: list[list[str]], width: int) -> _Form:
+    """Find the row of names, and the first row of data, of a table with rows of ``width`` cells."""
+    begin = next((k for k, row in enumerate(rows) if len(row) == width and any(map(_is_number, row))), len(rows))
+    heads = [k for k in range(begin) if len(rows[k]) == width and any(cell.strip() for cell in rows[k])]
+    names = tuple(cell.strip() for cell in rows[heads[0]]) if heads else ("",) * width
+    return _Form(names, heads[0] if heads else None, begin)
+
+
+def _same(names: Sequence[str], others: Sequence[str]) -> bool:
+    return sorted(name.casefold() for name in names) == sorted(name.casefold() for name in others)
+
+
+def _fits(lines: list[str], guess: _PatternDraft) -> bool:
+    """Return whether a file begins with the columns that were found, and has a row of them."""
+    rows = list(_cells(lines, guess.separator))
+    form = _form(rows, guess.width)
+    return guess.form is not None and form.begin < len(rows) and _same(form.names, guess.form.names)
+
+
 def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[_Column]:
-    """Find separator, lines before and after the names, and the columns of tables of text."""
+    """Find separator, lines before and after the names, and the columns of tables of text.
+
+    Files with other columns than most rows have are not used: they may be lists of people or labels.
+    """
     body = [line for lines in samples for line in lines[5:] if line.strip()] or samples[0]
     width, separator = 1, ""
     for candidate in _SEPARATORS:
@@ -209,30 +325,36 @@ def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[_Colum
             width, separator = usual, candidate
             break
     guess.width, guess.separator = width, separator
-    # The header is that of the file with the most such rows; others may be lists of people and the like.
-    samples = sorted(samples, key=lambda lines: -sum(len(row) == width for row in _cells(lines, separator)))
-    rows = list(_cells(samples[0], separator))
+    tables = [list(_cells(lines, separator)) for lines in samples]
+    forms = [_form(rows, width) for rows in tables]
+    data = [[row for row in rows[form.begin :] if len(row) == width] for rows, form in zip(tables, forms, strict=True)]
+    most: Counter[tuple[str, ...]] = Counter()
+    for form, rows in zip(forms, data, strict=True):
+        most[tuple(sorted(name.casefold() for name in form.names))] += len(rows)
+    usual_names = most.most_common(1)[0][0]
+    like = [k for k, form in enumerate(forms) if _same(form.names, usual_names)]
+    guess.form = form = forms[max(like, key=lambda k: len(data[k]))]
+    # The columns of a file may stand in another order.
+    data = [data[k] for k in like if forms[k].names == form.names]
+    rows = tables[like[0]]
     if separator and separator != ",":
         guess.keys["separator"] = separator
     if separator == ";" and any(re.fullmatch(r"-?\d+,\d+", cell) for row in rows for cell in row):
         guess.keys["decimal"] = ","
-    begin = next((k for k, row in enumerate(rows) if len(row) == width and any(map(_is_number, row))), 0)
-    heads = [k for k in range(begin) if len(rows[k]) == width and any(cell.strip() for cell in rows[k])]
-    if heads:
-        names = [cell.strip() for cell in rows[heads[0]]]
-        guess.keys |= {"skip_before": heads[0], "skip_after": begin - heads[0] - 1}
+    names = list(form.names)
+    if form.head is not None:
+        guess.keys |= {"skip_before": form.head, "skip_after": form.begin - form.head - 1}
     else:
         names = [f"c{k + 1}" for k in range(width)]
-        guess.keys |= {"names": names, "skip_before": begin}
+        guess.keys |= {"names": names, "skip_before": form.begin}
         guess.doubts.append("the files have no line of column names: give the columns their names in names")
     counts = Counter(name.casefold() for name in names)
     seen: Counter[str] = Counter()
     columns = []
-    data = [row for lines in samples for row in list(_cells(lines, separator))[begin:] if len(row) == width]
     for k, name in enumerate(names):
         seen[name.casefold()] += 1
         key = f"{name}#{seen[name.casefold()]}" if counts[name.casefold()] > 1 else name or f"#{k + 1}"
-        columns.append(_Column(name, key, [row[k] for row in data], guess.keys.get("decimal", ".")))
+        columns.append(_Column(name, key, [[row[k] for row in rows] for rows in data], guess.keys.get("decimal", ".")))
     return columns
 
 
@@ -244,15 +366,21 @@ def _cells(lines: Iterable[str], separator: str) -> Iterable[list[str]]:
     return csv.reader((line for line in lines if line.strip()), delimiter=separator)
 
 
-def _json_columns(samples: list[list[str]]) -> list[_Column]:
+def _json_columns(samples: list[str], guess: _PatternDraft) -> list[_Column]:
     """Return the values of JSON objects as columns, by their path within an object."""
-    cells: dict[str, list[str]] = {}
+    cells: dict[str, list[list[str]]] = {}
     lists: set[str] = set()
-    for lines in samples:
-        for key, (found, in_list) in json_cells("\n".join(lines)).items():
-            cells.setdefault(key, []).extend(found)
+    for text in samples:
+        for key, (parts, in_list) in json_cells(text).items():
+            cells.setdefault(key, []).extend(parts)
             lists |= {key} if in_list else set()
-    return [_Column(key, key, found, of_recording=bool(lists) and key not in lists) for key, found in cells.items()]
+    guess.rate_hz = next((rate for key, rate in _MICROBIT_HZ.items() if any(_ends(k, key) for k in cells)), 0.0)
+    return [_Column(key, key, parts, of_recording=bool(lists) and key not in lists) for key, parts in cells.items()]
+
+
+def _ends(key: str, end: str) -> bool:
+    """Return whether the path of a value in JSON ends in ``end``."""
+    return key == end or key.endswith(f".{end}")
 
 
 def _named(columns: Sequence[_Column], names: Iterable[str]) -> _Column | None:
@@ -281,46 +409,143 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
         n = sum(len(c.cells[0].strip()) for c in bits)
         guess.channels += [_channel(f"cell{k + 1}", "binary", valid_min=0, valid_max=1) for k in range(n)]
         guess.doubts.append(f"{n} binary channels are named cell1 to cell{n}: give them the names of the cells")
-    dates = next((c for c in left if c.is_date), None)
-    numeric = [c for c in left if c.is_numeric]
+    dates = next((c for c in left if c.is_date and not c.of_recording), None)
+    numeric = [c for c in left if c.is_numeric and not c.of_recording]
     time = dates or _named(numeric, (*ROLES["time"], "time", "stamp")) or next((c for c in numeric if c.rises), None)
-    _clock(take("time", time), guess)
-    texts = [c for c in left if not c.is_numeric and c.words]
+    interval = next((c for c in left if c.of_recording and c.is_numeric and _ends(c.key, INTERVAL)), None)
+    if time is None and interval is not None:
+        take(INTERVAL, interval)
+        guess.rate_hz = float(f"{1000.0 / float(np.median(interval.values)):.3g}")
+    else:
+        _clock(take("time", time), guess)
+    rows = next((c for c in numeric if not c.of_recording), time)
+    guess.times = time.moments if time is not None else [np.arange(float(len(p))) for p in rows.parts] if rows else []
+    texts = [c for c in left if not c.is_numeric and c.words and not c.is_date]
     take("subject", _named([*texts, *left], (*ROLES["subject"], *_PERSON_NAMES)) if len(columns) > 1 else None)
     texts = [c for c in texts if c in left]
-    few = [c for c in texts if 1 < len(c.words) <= _MOST_LABELS]
-    label = take("label", _named(texts, (*ROLES["label"], *_LABEL_NAMES)) or next(iter(few), None))
-    if label is not None:
+    # A device describes itself in texts.
+    few = [c for c in texts if 1 < len(c.words) <= MOST_LABELS and INTERVAL not in guess.columns]
+    called = [c for c in few if _ends(c.key.casefold(), "name")]
+    label = _named(texts, (*ROLES["label"], *_LABEL_NAMES))
+    if label is None and (label := next(iter([*called, *few]), None)) is not None:
+        listed = ", ".join(repr(word) for word in list(label.words)[:2])
+        guess.doubts.append(f"the column '{label.key}' is taken for the label: {listed}")
+    if take("label", label) is not None and label is not None:
         guess.labels = label.words
     for role in ("session", "recording"):
         take(role, next((c for c in left if c.name.casefold() in ROLES[role]), None))
     missing: Counter[str] = Counter()
     for column in [c for c in left if c.is_numeric and not c.of_recording]:
+        kind = no_reading(list(zip(column.numbers, guess.times, strict=False)))
         if _NO_CHANNEL.fullmatch(column.name.strip()):
             guess.doubts.append(f"the column '{column.key}' is taken for a number of the row, not for a channel")
-            continue
-        if column.rises and re.search("time|stamp", column.name.casefold()):
-            guess.doubts.append(f"the column '{column.key}' is taken for a second clock, not for a channel")
-            continue
-        missing += column.words
-        guess.channels.append(_measured(column, guess))
+        elif kind or (column.rises and re.search("time|stamp", column.name.casefold())):
+            guess.doubts.append(f"the column '{column.key}' is taken for {kind or CLOCK}, not for a channel")
+        elif codes := column.codes:
+            guess.codes[column.key] = codes
+        else:
+            missing += column.words
+            guess.channels.append(_measured(column, guess))
     if missing:
         guess.keys["missing"] = sorted(missing)
         guess.doubts.append(f"the words {', '.join(sorted(missing))} are taken for missing values")
     _vectors(guess)
 
 
+def _codes(parts: PathParts, guess: _PatternDraft) -> None:
+    """Take a column of few whole numbers that change rarely for the label, if there is no other; list the others."""
+    codes = dict(sorted(guess.codes.items(), key=lambda item: _named_label(item[0]), reverse=True))
+    if not guess.labels and "intervals" not in guess.keys and codes:
+        key, values = next(iter(codes.items()))
+        guess.columns["label"] = key
+        guess.labels = Counter(map(str, codes.pop(key)))
+        listed = ", ".join(map(str, values[:6]))
+        guess.doubts.append(
+            f"the column '{key}' has few whole numbers that change rarely ({listed}), so that it is taken for the "
+            "label: give the numbers their names under [aliases]"
+        )
+    for key, values in codes.items():
+        listed = ", ".join(map(str, values[:6]))
+        guess.doubts.append(
+            f"the column '{key}' has few whole numbers that change rarely ({listed}), so that it is no channel: if it "
+            "is a sensor, add it to channels"
+        )
+    if not guess.labels and "intervals" not in guess.keys:
+        guess.doubts.append("the label of a recording was not found: put {label} into paths, or give its column")
+
+
+def _named_label(key: str) -> bool:
+    return any(name in key.casefold() for name in _LABEL_NAMES)
+
+
+def _intervals(
+    base: Path, without: list[Path], samples: list[Path], parts: PathParts, guess: _PatternDraft
+) -> list[Path]:
+    """Find files of intervals among those with other columns; return the other files."""
+    found: dict[Path, tuple[list[str], dict[str, int]]] = {}
+    for file in without:
+        lines = [line for line in _text(file, guess, _HEAD).splitlines() if line.strip()]
+        separator = max(",;\t", key=lines[0].count) if lines else ","
+        rows = list(csv.reader(lines, delimiter=separator))
+        if rows and len(rows) > 1 and (at := interval_columns(rows[0])):
+            found[file] = ([name.strip() for name in rows[0]], at)
+    if not found or "label" in parts.found or "label" in guess.taken:
+        return without
+    patterns = {_place_of(file.relative_to(base), samples, parts.patterns) for file in found if file.suffix.lower()}
+    first = next(iter(found)).relative_to(base).as_posix()
+    if len(patterns) > 1 or None in patterns:
+        guess.doubts.append(
+            f"files such as {first} have intervals, but do not fit the paths of the samples: name them in intervals"
+        )
+        return without
+    names, at = next(iter(found.values()))
+    guess.keys["intervals"] = patterns.pop()
+    guess.columns |= {role: names[k] for role, k in at.items()}
+    guess.doubts.append(f"the labels are the intervals in files such as {first}: '{names[at['label']]}'")
+    return [file for file in without if file not in found]
+
+
+def _place_of(path: Path, samples: list[Path], patterns: list[str]) -> str | None:
+    """Return the pattern of the path of a file of intervals, by the parts of a sample whose path has the same texts."""
+    text = path.as_posix()
+    best: list[str] = []
+    for sample in samples:
+        match = next((m for p in patterns if (m := path_expression(p).fullmatch(sample.as_posix()))), None)
+        parts = {part: value for part, value in (match.groupdict() if match else {}).items() if value}
+        if all(re.search(rf"(?<![^\W_]){re.escape(value)}(?![^\W_])", text) for value in parts.values()):
+            made = re.sub("[{}*?]", "?", text)
+            for part, value in sorted(parts.items(), key=lambda item: -len(item[1])):
+                made = re.sub(rf"(?<![^\W_]){re.escape(value)}(?![^\W_])", f"{{{part}}}", made)
+            best.append(made)
+    return max(best, key=lambda made: made.count("{"), default=None)
+
+
+def _exclude(without: list[Path], samples: list[Path], guess: _PatternDraft) -> None:
+    """Leave out files with other columns, by their name if no file of samples has it."""
+    if not without:
+        return
+    names = {path.name for path in samples}
+    texts = [f"**/{path.name}" if path.name not in names and len(without) > 5 else path.as_posix() for path in without]
+    guess.keys["exclude"] = [re.sub("[{}?]", "?", text) for text in dict.fromkeys(texts)]
+    listed = ", ".join(path.as_posix() for path in without[:5]) + (", …" if len(without) > 5 else "")
+    guess.doubts.append(f"files without such rows are left out: {listed}")
+
+
 def _clock(time: _Column | None, guess: _PatternDraft) -> None:
     """Find the unit of the times, and the rate."""
     if time is None:
-        guess.keys["row_rate_hz"] = guess.rate_hz = _USUAL_HZ
         guess.doubts.append(
-            f"the files have no clock: give the true rate as row_rate_hz and rate_hz, now {_USUAL_HZ:g}"
+            "the files have no clock; as micro:bit CreateAI writes them, they are taken for "
+            f"{guess.rate_hz:g} rows a second, as it is meant to record: if recordings of 1.8 s have about 92 rows, or "
+            "those of 1 s about 49, the true rate is 50: give it as row_rate_hz and rate_hz"
+            if guess.rate_hz
+            else f"the files have no clock: give the true rate as row_rate_hz and rate_hz, now {_USUAL_HZ:g}"
         )
+        guess.keys["row_rate_hz"] = guess.rate_hz = guess.rate_hz or _USUAL_HZ
         return
-    numbers = np.array(time.numbers)
+    numbers = np.concatenate([*time.moments, np.empty(0)])
+    numbers = numbers[np.isfinite(numbers)]
     if time.is_date:
-        numbers = np.array([datetime.fromisoformat(cell.strip()).timestamp() for cell in time.cells if cell.strip()])
         guess.keys["time_unit"], factor = "iso", 1000.0
     else:
         unit, stated = unit_of_time(time.name, numbers, _USUAL_HZ)
@@ -340,22 +565,23 @@ def _channel(name: str, kind: str, **more: Any) -> dict[str, Any]:
 
 def _measured(column: _Column, guess: _PatternDraft) -> dict[str, Any]:
     """Return the channel of a column of numbers: its kind, and a step that keeps its decimals."""
-    name = re.sub(r"\W+", "_", column.key.casefold()).strip("_") or f"channel{len(guess.channels) + 1}"
+    key = _AROUND.sub("", column.key) if guess.is_json else column.key
+    name = re.sub(r"\W+", "_", key.casefold()).strip("_") or f"channel{len(guess.channels) + 1}"
     if name != column.name.casefold() or column.key != column.name:
         guess.columns[name] = column.key
-    values = np.array(column.numbers)
+    values = column.values
     texts = [cell.strip().replace(",", ".") for cell in column.cells]
     digits = min(6, max((len(t.partition(".")[2]) for t in texts if _is_number(t) and "e" not in t.lower()), default=0))
-    if set(values.tolist()) <= {0.0, 1.0}:
+    is_acceleration = _ACCELERATION.search(name) is not None
+    if set(values.tolist()) <= {0.0, 1.0} and not digits and not is_acceleration:
         return _channel(name, "binary", valid_min=0, valid_max=1)
     # Whole numbers of steps have to fit 32 bits, and the square of a magnitude of three axes 64.
     while digits and np.abs(values).max() * 10**digits > _MOST_STEPS:
         digits -= 1
     more: dict[str, Any] = {"step": float(f"1e-{digits}")} if digits else {}
-    if "acc" in name or re.fullmatch(r"[xyz](_\d+)?", name):
+    if is_acceleration:
         # A magnitude needs a range; twice the largest value is a guess at that of the sensor.
         limit = float(2 ** int(np.ceil(np.log2(max(2 * np.abs(values).max(), 1.0)))))
-        guess.doubts.append(f"the range of '{name}' is guessed (±{limit:g}): give that of the sensor")
         return _channel(name, "acceleration", **more, valid_min=-limit, valid_max=limit)
     return _channel(name, "sensor", **more)
 
@@ -369,82 +595,19 @@ def _vectors(guess: _PatternDraft) -> None:
             stem = channel["name"][: axis.start()] + "?" + channel["name"][axis.end() :]
             by_stem.setdefault(stem, {})[axis[0]] = channel["name"]
     guess.vectors = [[axes[a] for a in "xyz"] for axes in by_stem.values() if len(axes) == 3]
+    _ranges(guess)
 
 
-def _paths(files: list[Path], ending: str, guess: _PatternDraft) -> None:
-    """Find out which parts of the paths are person, session, label and take."""
-    depth = _usual_least([len(f.parts) for f in files])
-    before = "**/" if any(len(f.parts) > depth for f in files) else ""
-    split = [[*f.parts[-depth:-1], f.name[: len(f.name) - len(ending)]] for f in files if len(f.parts) >= depth]
-    named = [(parts, re.split(r"([_\-. ]+)", parts[-1])) for parts in split]
-    least = _usual_least([len(name) for _, name in named])
-    if others := len(files) - sum(len(name) >= least for _, name in named):
-        guess.doubts.append(f"files whose paths are not like the others do not fit paths: {others}")
-    # Extra separators belong to the first piece, since labels may hold them.
-    pieces = [
-        [*parts[:-1], "".join(n[: len(n) - least + 1]), *n[len(n) - least + 1 :]]
-        for parts, n in named
-        if len(n) >= least
-    ]
-    taken = guess.taken
-    roles: list[str] = []
-    for k in range(len(pieces[0])):
-        texts = [row[k] for row in pieces]
-        roles.append(_role(texts, len(pieces) > 1, taken | set(roles), k))
-    if "recording" in roles and "label" not in roles:
-        # The files hold several recordings each, so that their number is rather that of a session.
-        roles[roles.index("recording")] = "session" if "session" not in roles else "*"
-    if "subject" not in taken | set(roles):
-        values = {k: {row[k] for row in pieces} for k, role in enumerate(roles) if role in ("*", "session")}
-        several = {k: texts for k, texts in values.items() if len(texts) > 1 and not texts & _NO_PERSON}
-        if several:
-            k = max(several, key=lambda k: (len(several[k]), pieces[0][k][0].isalpha()))
-            roles[k] = "subject"
-            guess.doubts.append(f"'{pieces[0][k]}' in the path is taken for a person")
-        else:
-            guess.doubts.append("the person of a recording was not found: put {subject} into paths, or give its column")
-    for k, role in enumerate(roles[: depth - 1]):
-        if role == "*":
-            listed = ", ".join(sorted({row[k] for row in pieces})[:5])
-            guess.doubts.append(
-                f"all of the folders {listed} are imported: if they hold other sensors, name one in paths"
-            )
-    if "label" in roles:
-        at = roles.index("label")
-        guess.labels = Counter(row[at] for row in pieces)
-    elif not guess.labels:
-        guess.doubts.append("the label of a recording was not found: put {label} into paths, or give its column")
-    # What is the same in all paths stands there as it is, but for the characters of patterns; a name of all files tells
-    # nothing apart, and the next recording may have another.
-    texts = [
-        f"{{{role}}}" if role in PARTS else role or re.sub("[{}*?]", "?", pieces[0][k]) for k, role in enumerate(roles)
-    ]
-    folders = "".join(f"{text}/" for text in texts[: depth - 1])
-    name = "*" if len({parts[-1] for parts in split}) == 1 else "".join(texts[depth - 1 :])
-    guess.keys["paths"] = [(before + folders + name if len(pieces) > 1 else "*") + ending]
-
-
-def _usual_least(numbers: Sequence[int]) -> int:
-    """Return the largest number that nine of ten ``numbers`` reach."""
-    return sorted(numbers)[len(numbers) // 10]
-
-
-def _role(texts: list[str], several: bool, taken: set[str], at: int) -> str:
-    """Return the part that a piece of all paths is; "" for text that is the same everywhere, * for anything else."""
-    distinct = set(texts)
-    if not any(c.isalnum() for c in texts[0]):
-        return "" if len(distinct) == 1 else "*"
-    if len(distinct) == 1:
-        return "" if several else "*"
-    if all(_PERSON.fullmatch(t) for t in texts) and "subject" not in taken:
-        return "subject"
-    if all(_SESSION.fullmatch(t) for t in texts) and "session" not in taken:
-        return "session"
-    if all(t.isdecimal() for t in texts):
-        return "recording" if "recording" not in taken and at else "*"
-    if "label" not in taken and 1 < len(distinct) <= min(_MOST_LABELS, max(2, len(texts) // 2)):
-        return "label"
-    return "*"
+def _ranges(guess: _PatternDraft) -> None:
+    """Give the axes of one vector the same range, the largest of theirs."""
+    accelerations = {c["name"]: c for c in guess.channels if c["kind"] == "acceleration"}
+    alone = [[name] for name in accelerations if not any(name in vector for vector in guess.vectors)]
+    for names in [*guess.vectors, *alone]:
+        limit = max(accelerations[name]["valid_max"] for name in names)
+        for name in names:
+            accelerations[name] |= {"valid_min": -limit, "valid_max": limit}
+        listed = ", ".join(f"'{name}'" for name in names)
+        guess.doubts.append(f"the range of {listed} is guessed (±{limit:g}): give that of the sensor")
 
 
 def _aliases(guess: _PatternDraft) -> None:
