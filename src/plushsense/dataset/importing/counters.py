@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.core.sentences import Sentence
 
@@ -45,9 +46,9 @@ def no_reading(columns: Sequence[tuple[Floats, Floats]]) -> str:
 
 def _counts(values: Floats) -> bool:
     """Return whether whole numbers count by one, also if they begin again, as at 256."""
-    if np.any(values != np.round(values)):
+    if np.any(np.abs(values - np.round(values)) > 1e-6):
         return False
-    steps = np.diff(values)
+    steps = np.round(np.diff(values))
     return max(float(np.mean(steps == 1)), float(np.mean(steps == -1))) > _COUNTS
 
 
@@ -69,11 +70,13 @@ def _rates(values: Floats, times: Floats) -> list[float]:
     return rates
 
 
-def counters_note(names: Sequence[str], recordings: Sequence[Frames]) -> list[Sentence]:
+def counters_note(layout: Layout, recordings: Sequence[Frames]) -> list[Sentence]:
     """Return a warning about the channels that are clocks or numbers of rows in every recording, if there are any."""
     kinds = {
-        name: no_reading([(r.values[:, k].astype(np.float64), r.device_ms.astype(np.float64)) for r in recordings])
-        for k, name in enumerate(names)
+        c.name: no_reading(
+            [(r.values[:, k].astype(np.float64) * c.step, r.device_ms.astype(np.float64)) for r in recordings]
+        )
+        for k, c in enumerate(layout.channels)
     }
     found = {name: kind for name, kind in kinds.items() if kind}
     if not found:

@@ -81,7 +81,7 @@ class _Column:
     @property
     def values(self) -> NDArray[np.float64]:
         """The numbers of all parts."""
-        joined = np.concatenate([*self.numbers, np.empty(0)])
+        joined: NDArray[np.float64] = np.concatenate([*self.numbers, np.empty(0)])
         return joined[np.isfinite(joined)]
 
     @property
@@ -225,9 +225,14 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
         listed = ", ".join(column.name.strip()[:30] for column in columns[:20]) or "no columns of one length"
         raise DatasetError(f"No column of numbers that could be a channel was found in '{source}'; it has {listed}.")
     relative = [f.relative_to(base) for f in mine]
-    parts = guess_paths(relative, ending, guess.taken, dotted=INTERVAL in guess.columns)
+    of_labels = _interval_files(base, without, guess)
+    taken = guess.taken | ({"label"} if of_labels else set())
+    parts = guess_paths(relative, ending, taken, dotted=INTERVAL in guess.columns)
+    if of_labels and _intervals(of_labels, relative, parts, guess):
+        without = [file for file in without if file.relative_to(base) not in of_labels]
+    elif of_labels:
+        parts = guess_paths(relative, ending, guess.taken)
     guess.keys["paths"] = parts.patterns
-    without = _intervals(base, without, relative, parts, guess)
     _exclude([f.relative_to(base) for f in without], relative, guess)
     guess.doubts += parts.doubts
     if parts.labels:
@@ -478,35 +483,45 @@ def _named_label(key: str) -> bool:
     return any(name in key.casefold() for name in _LABEL_NAMES)
 
 
-def _intervals(
-    base: Path, without: list[Path], samples: list[Path], parts: PathParts, guess: _PatternDraft
-) -> list[Path]:
-    """Find files of intervals among those with other columns; return the other files."""
-    found: dict[Path, tuple[list[str], dict[str, int]]] = {}
-    for file in without:
+def _interval_files(base: Path, without: list[Path], guess: _PatternDraft) -> dict[Path, dict[str, str]]:
+    """Return the files of intervals among those with other columns, and the names of their columns."""
+    found: dict[Path, dict[str, str]] = {}
+    moments = []
+    for file in without if "label" not in guess.taken else ():
         lines = [line for line in _text(file, guess, _HEAD).splitlines() if line.strip()]
         separator = max(",;\t", key=lines[0].count) if lines else ","
-        rows = list(csv.reader(lines, delimiter=separator))
-        if rows and len(rows) > 1 and (at := interval_columns(rows[0])):
-            found[file] = ([name.strip() for name in rows[0]], at)
-    if not found or "label" in parts.found or "label" in guess.taken:
-        return without
-    patterns = {_place_of(file.relative_to(base), samples, parts.patterns) for file in found if file.suffix.lower()}
-    first = next(iter(found)).relative_to(base).as_posix()
-    if len(patterns) > 1 or None in patterns:
+        names = [name.strip() for name in next(csv.reader(lines, delimiter=separator), [])]
+        if len(lines) > 1 and (at := interval_columns(names)):
+            found[file.relative_to(base)] = {role: names[k] for role, k in at.items()}
+        elif {name.casefold() for name in names} & {*_LABEL_NAMES} and any("time" in n.casefold() for n in names):
+            moments.append(file.relative_to(base).as_posix())
+    if moments and not found:
         guess.doubts.append(
-            f"files such as {first} have intervals, but do not fit the paths of the samples: name them in intervals"
+            f"files such as {moments[0]} have labels of single moments, which cannot be used: give each a start and an "
+            "end (columns start, end, label)"
         )
-        return without
-    names, at = next(iter(found.values()))
-    guess.keys["intervals"] = patterns.pop()
-    guess.columns |= {role: names[k] for role, k in at.items()}
-    guess.doubts.append(f"the labels are the intervals in files such as {first}: '{names[at['label']]}'")
-    return [file for file in without if file not in found]
+    return found
+
+
+def _intervals(found: dict[Path, dict[str, str]], samples: list[Path], parts: PathParts, guess: _PatternDraft) -> bool:
+    """Use files of intervals for the labels; return whether their paths fit those of the samples."""
+    patterns = {_place_of(path, samples, parts.patterns) for path in found}
+    path, columns = next(iter(found.items()))
+    pattern = patterns.pop()
+    if patterns or pattern is None:
+        guess.doubts.append(
+            f"files such as {path.as_posix()} have intervals, but do not fit the paths of the samples: name them in "
+            "intervals"
+        )
+        return False
+    guess.keys["intervals"] = pattern
+    guess.columns |= columns
+    guess.doubts.append(f"the labels are the intervals in files such as {path.as_posix()}: '{columns['label']}'")
+    return True
 
 
 def _place_of(path: Path, samples: list[Path], patterns: list[str]) -> str | None:
-    """Return the pattern of the path of a file of intervals, by the parts of a sample whose path has the same texts."""
+    """Return the pattern of the path of a file of intervals, by the parts of a sample with the same texts."""
     text = path.as_posix()
     best: list[str] = []
     for sample in samples:
@@ -535,9 +550,8 @@ def _clock(time: _Column | None, guess: _PatternDraft) -> None:
     """Find the unit of the times, and the rate."""
     if time is None:
         guess.doubts.append(
-            "the files have no clock; as micro:bit CreateAI writes them, they are taken for "
-            f"{guess.rate_hz:g} rows a second, as it is meant to record: if recordings of 1.8 s have about 92 rows, or "
-            "those of 1 s about 49, the true rate is 50: give it as row_rate_hz and rate_hz"
+            f"the files have no clock: {guess.rate_hz:g} rows a second are taken, as micro:bit CreateAI has with ID (40) "
+            "or id (50). Recordings of 1.8 s with about 92 rows have 50 too: then correct row_rate_hz and rate_hz"
             if guess.rate_hz
             else f"the files have no clock: give the true rate as row_rate_hz and rate_hz, now {_USUAL_HZ:g}"
         )
@@ -590,21 +604,24 @@ def _vectors(guess: _PatternDraft) -> None:
     """Find triples of accelerations whose names differ only in x, y and z."""
     by_stem: dict[str, dict[str, str]] = {}
     for channel in guess.channels:
-        axis = re.search(r"(?<![a-z])[xyz](?![a-z])|[xyz]$", channel["name"].replace("_", " "))
-        if channel["kind"] == "acceleration" and axis is not None:
-            stem = channel["name"][: axis.start()] + "?" + channel["name"][axis.end() :]
-            by_stem.setdefault(stem, {})[axis[0]] = channel["name"]
+        text = channel["name"].replace("_", " ")
+        axis = re.search(r"(?:(?<![a-z])a?|acc|accel)([xyz])(?![a-z])|([xyz])$", text)
+        if channel["kind"] == "acceleration" and axis is not None and (at := axis.lastindex):
+            stem = channel["name"][: axis.start(at)] + "?" + channel["name"][axis.end(at) :]
+            by_stem.setdefault(stem, {})[axis[at]] = channel["name"]
     guess.vectors = [[axes[a] for a in "xyz"] for axes in by_stem.values() if len(axes) == 3]
     _ranges(guess)
 
 
 def _ranges(guess: _PatternDraft) -> None:
-    """Give the axes of one vector the same range, the largest of theirs."""
+    """Give the axes of one vector the same range, the largest of theirs, and the same step."""
     accelerations = {c["name"]: c for c in guess.channels if c["kind"] == "acceleration"}
     alone = [[name] for name in accelerations if not any(name in vector for vector in guess.vectors)]
     for names in [*guess.vectors, *alone]:
         limit = max(accelerations[name]["valid_max"] for name in names)
+        step = min(accelerations[name].get("step", 1.0) for name in names)
         for name in names:
+            accelerations[name] |= {"step": step} if step < 1.0 else {}
             accelerations[name] |= {"valid_min": -limit, "valid_max": limit}
         listed = ", ".join(f"'{name}'" for name in names)
         guess.doubts.append(f"the range of {listed} is guessed (±{limit:g}): give that of the sensor")

@@ -64,9 +64,9 @@ from plushsense.dataset.importing.xdf import person_and_session, read_xdf
 from plushsense.dataset.index import rebuild_index
 from plushsense.dataset.store import (
     HEAD,
+    UNKNOWN_SUBJECT,
     DatasetHead,
     Generation,
-    UNKNOWN_SUBJECT,
     Progress,
     read_people,
 )
@@ -410,7 +410,7 @@ def _propose(done: ImportSummary, adopting: bool = False, added: bool = False) -
     """
     used = done.dataset.used
     some = used[:: max(1, len(used) // _SAMPLED)][:_SAMPLED]
-    done.notes += counters_note(done.dataset.layout.names, [done.dataset.read(recording) for recording in some])
+    done.notes += counters_note(done.dataset.layout, [done.dataset.read(recording) for recording in some])
     sensors = find_sensors(done.dataset)
     done.sensors = [sensor.to_dict() for sensor in sensors]
     found = [p for p in propose_settings(done.dataset, sensors) if not added or p.key == SELF_CALIBRATION]

@@ -80,7 +80,7 @@ def guess_paths(files: Sequence[Path], ending: str, taken: Iterable[str], *, dot
         )
     for k, role in enumerate(roles):
         texts = {row[k] for row in rows}
-        if role == "*" and (k < depth - 1 or _known(texts, _DEVICES)):
+        if role == "*" and (k < depth - 1 or (len(texts) > 1 and _known(texts, _SPLITS, _DEVICES))):
             kind = "folders" if k < depth - 1 else "files with"
             listed = ", ".join(sorted(texts)[:5])
             result.doubts.append(

@@ -71,7 +71,7 @@ def preview(search: SourceScan) -> ImportPreview:
         count = -(-ROWS // len(shown))
         rows += _rows(file, named.get(file.source, ""), read.frames.slice(0, count), search.layout)
     counts = Counter(named.values())
-    notes = [*search.notes, *counters_note(search.layout.names, frames)]
+    notes = [*search.notes, *counters_note(search.layout, frames)]
     if search.gestures is not None and (note := unknown_labels(search.gestures, named.values())):
         notes.append(note)
     return ImportPreview(
