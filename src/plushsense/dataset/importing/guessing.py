@@ -30,7 +30,7 @@ from plushsense.dataset.importing.pattern import ENDINGS, INTERVAL, LABELS, ROLE
 from plushsense.dataset.importing.sources import source_files, split_regular_files
 from plushsense.dataset.importing.table_files import json_cells, unit_of_time
 
-_FILES, _LINES = 12, 2000
+_FILES, _LINES, _FEW = 12, 2000, 5
 _HEAD, _MOST_BYTES, _MOST_JSON = 16_384, 400_000, 64 << 20
 _USUAL_HZ = 50.0
 # The first with which the rows have the same number of cells; a comma may also be in decimals.
@@ -41,8 +41,9 @@ _PERSON_NAMES = ("subject", "participant", "person", "user", "child", "who")
 # acc_x, x_acc, accX, aX, Accelerometer_x, and x, y, z alone; not accuracy.
 _ACCELERATION = re.compile(r"(?<![a-z])(acc(?!u)|accel|a_?[xyz](?![a-z]))|acc(el)?_?[xyz]?$|^[xyz](_\d+)?$")
 _NO_CHANNEL = re.compile(r"(index|row|frame|sample|no|nr|id|count_?er|unnamed.*|#)?", re.IGNORECASE)
-# Labels as numbers: so many whole numbers, which change from fewer rows to the next than this.
-_CODES, _SELDOM = range(2, 31), 0.02
+# Labels as numbers: at most so many whole numbers, which change in a smaller share of the rows than this.
+_MOST_CODES, _SELDOM = 30, 0.05
+_TAKE = re.compile(r"(^|_)(id|sample|take|trial|rep|repetition|recording|segment|window|block|session)", re.IGNORECASE)
 # Files of micro:bit CreateAI name no rate; older ones write ID, newer ones id.
 _MICROBIT_HZ = {"recordings.ID": 40.0, "recordings.id": 50.0}
 # Objects around channels in JSON that say nothing about them.
@@ -124,13 +125,19 @@ class _Column:
 
     @property
     def codes(self) -> list[int]:
-        """The values, if they are few whole numbers that change rarely, as labels do; otherwise nothing."""
+        """The values, if they are whole numbers that change rarely, as labels or numbers of takes do; or nothing."""
         distinct = np.unique(self.values)
-        whole = len(distinct) in _CODES and bool(np.all(distinct == np.round(distinct)))
+        whole = len(distinct) > 1 and bool(np.all(distinct == np.round(distinct)))
         cells = set(distinct.tolist()) <= {0.0, 1.0} and not _named([self], _LABEL_NAMES)
         if not whole or cells or not len(self.steps) or self.of_recording:
             return []
-        return [int(value) for value in distinct] if float(np.mean(self.steps != 0)) < _SELDOM else []
+        seldom = float(np.mean(self.steps != 0)) < _SELDOM
+        return [int(value) for value in distinct] if seldom and (len(distinct) <= _MOST_CODES or self.counts) else []
+
+    @property
+    def counts(self) -> bool:
+        """Whether the numbers go up by one, or stay, as those of takes do."""
+        return bool(np.all(np.isin(self.steps, (0.0, 1.0)))) and len(np.unique(self.values)) > 2
 
 
 @dataclass(frozen=True)
@@ -174,8 +181,8 @@ class _PatternDraft:
     rate_hz: float = 0.0
     times: list[NDArray[np.float64]] = field(default_factory=list)
     """The time of each row of each file or recording; its number without a clock."""
-    codes: dict[str, list[int]] = field(default_factory=dict)
-    """Columns of few whole numbers that change rarely."""
+    codes: dict[str, _Column] = field(default_factory=dict)
+    """Columns of whole numbers that change rarely."""
     is_json: bool = False
     width: int = 1
     separator: str = ""
@@ -204,12 +211,12 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
     mine = [f for f in of_ending if _has_rows(f)]
     if not mine:
         raise DatasetError(f"'{source}' holds no table: its files that end in '{ending}' have no row with a number.")
-    if sum(parse_name(f.name) is not None for f in mine) > 0.8 * len(mine):
+    some = mine[:: max(1, len(mine) // _FILES)][:_FILES]
+    if sum(_is_recorded(f) for f in some) > 0.8 * len(some):
         raise DatasetError(f"'{source}' holds recordings of the GestureRecorder: import it without a pattern.")
     guess = _PatternDraft()
     if others := len(files) - len(of_ending):
         guess.doubts.append(f"files that do not end in '{ending}' are left out: {others}")
-    some = mine[:: max(1, len(mine) // _FILES)][:_FILES]
     guess.is_json = ENDINGS.get(ending) == "json" or _text(some[0], guess, _HEAD).lstrip()[:1] in ("{", "[")
     if guess.is_json:
         columns = _json_columns([_json_text(f, guess) for f in some], guess)
@@ -227,7 +234,8 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
     relative = [f.relative_to(base) for f in mine]
     of_labels = _interval_files(base, without, guess)
     taken = guess.taken | ({"label"} if of_labels else set())
-    parts = guess_paths(relative, ending, taken, dotted=INTERVAL in guess.columns)
+    labels = set(guess.labels)
+    parts = guess_paths(relative, ending, taken, labels, dotted=INTERVAL in guess.columns)
     if of_labels and _intervals(of_labels, relative, parts, guess):
         without = [file for file in without if file.relative_to(base) not in of_labels]
     elif of_labels:
@@ -248,6 +256,16 @@ def _is_text(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(4096)
     return bool(head.strip()) and b"\x00" not in head and path.suffix.lower() not in (".md", ".toml", ".py", ".pdf")
+
+
+def _is_recorded(path: Path) -> bool:
+    """Return whether the name of a file has its number of rows at the end, as those of the GestureRecorder have."""
+    name = parse_name(path.name)
+    if name is None:
+        return False
+    with path.open("rb") as file:
+        rows = sum(1 for _ in file)
+    return abs(rows - name.rows) <= 2
 
 
 def _has_rows(path: Path) -> bool:
@@ -314,21 +332,30 @@ def _fits(lines: list[str], guess: _PatternDraft) -> bool:
     return guess.form is not None and form.begin < len(rows) and _same(form.names, guess.form.names)
 
 
+def _separator(samples: list[list[str]]) -> tuple[int, str]:
+    """Return the number of cells of most rows, and the separator with which each file has rows of one width."""
+    for separator in _SEPARATORS:
+        fitting: Counter[int] = Counter()
+        total = 0
+        for lines in samples:
+            body = [line for line in lines[5:] if line.strip()] or lines
+            width, count = Counter(len(row) for row in _cells(body, separator)).most_common(1)[0]
+            # A separator at the end of every line only ends it.
+            ends_line = width == 2 and all(line.rstrip().endswith(separator) for line in body)
+            total += len(body)
+            if count >= 0.8 * len(body) and width > 1 and not ends_line:
+                fitting[width] += len(body)
+        if sum(fitting.values()) >= 0.8 * total:
+            return fitting.most_common(1)[0][0], separator
+    return 1, ""
+
+
 def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[_Column]:
     """Find separator, lines before and after the names, and the columns of tables of text.
 
     Files with other columns than most rows have are not used: they may be lists of people or labels.
     """
-    body = [line for lines in samples for line in lines[5:] if line.strip()] or samples[0]
-    width, separator = 1, ""
-    for candidate in _SEPARATORS:
-        widths = Counter(len(row) for row in _cells(body, candidate))
-        usual, count = widths.most_common(1)[0]
-        # A separator at the end of every line only ends it.
-        ends_line = usual == 2 and all(line.rstrip().endswith(candidate) for line in body)
-        if count >= 0.8 * len(body) and usual > 1 and not ends_line:
-            width, separator = usual, candidate
-            break
+    width, separator = _separator(samples)
     guess.width, guess.separator = width, separator
     tables = [list(_cells(lines, separator)) for lines in samples]
     forms = [_form(rows, width) for rows in tables]
@@ -428,26 +455,19 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
     texts = [c for c in left if not c.is_numeric and c.words and not c.is_date]
     take("subject", _named([*texts, *left], (*ROLES["subject"], *_PERSON_NAMES)) if len(columns) > 1 else None)
     texts = [c for c in texts if c in left]
-    # A device describes itself in texts.
-    few = [c for c in texts if 1 < len(c.words) <= MOST_LABELS and INTERVAL not in guess.columns]
-    called = [c for c in few if _ends(c.key.casefold(), "name")]
-    label = _named(texts, (*ROLES["label"], *_LABEL_NAMES))
-    if label is None and (label := next(iter([*called, *few]), None)) is not None:
-        listed = ", ".join(repr(word) for word in list(label.words)[:2])
-        guess.doubts.append(f"the column '{label.key}' is taken for the label: {listed}")
-    if take("label", label) is not None and label is not None:
-        guess.labels = label.words
     for role in ("session", "recording"):
         take(role, next((c for c in left if c.name.casefold() in ROLES[role]), None))
+    texts = [c for c in texts if c in left]
+    take("label", _label(texts, left, guess))
     missing: Counter[str] = Counter()
     for column in [c for c in left if c.is_numeric and not c.of_recording]:
         kind = no_reading(list(zip(column.numbers, guess.times, strict=False)))
         if _NO_CHANNEL.fullmatch(column.name.strip()):
             guess.doubts.append(f"the column '{column.key}' is taken for a number of the row, not for a channel")
+        elif column.codes and (not kind or _TAKE.search(column.name)):
+            guess.codes[column.key] = column
         elif kind or (column.rises and re.search("time|stamp", column.name.casefold())):
             guess.doubts.append(f"the column '{column.key}' is taken for {kind or CLOCK}, not for a channel")
-        elif codes := column.codes:
-            guess.codes[column.key] = codes
         else:
             missing += column.words
             guess.channels.append(_measured(column, guess))
@@ -457,30 +477,52 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
     _vectors(guess)
 
 
+def _label(texts: list[_Column], left: list[_Column], guess: _PatternDraft) -> _Column | None:
+    """Return the column of labels: by its name, or else the first one of few texts, a ``name`` before others."""
+    label = _named(texts, (*ROLES["label"], *_LABEL_NAMES))
+    numbers = next((c for c in left if c.name.strip().casefold() in _LABEL_NAMES and c.codes), None)
+    if label is None and numbers is not None:
+        guess.labels = Counter(map(str, numbers.codes))
+        guess.doubts.append(f"the labels in '{numbers.key}' are numbers: give them their names in [aliases]")
+        return numbers
+    if label is None:
+        # A device describes itself in texts, and what differs in every file is an identifier.
+        few = [
+            c
+            for c in texts
+            if 1 < len(c.words) <= MOST_LABELS and INTERVAL not in guess.columns
+            if len(c.words) < len(c.parts) or any(len(set(cells)) > 1 for cells in c.parts)
+        ]
+        label = next(iter([*(c for c in few if _ends(c.key.casefold(), "name")), *few]), None)
+        if label is not None:
+            listed = ", ".join(repr(word) for word in list(label.words)[:2])
+            guess.doubts.append(f"the column '{label.key}' is taken for the label: {listed}")
+    if label is not None:
+        guess.labels = label.words
+    return label
+
+
 def _codes(parts: PathParts, guess: _PatternDraft) -> None:
-    """Take a column of few whole numbers that change rarely for the label, if there is no other; list the others."""
-    codes = dict(sorted(guess.codes.items(), key=lambda item: _named_label(item[0]), reverse=True))
-    if not guess.labels and "intervals" not in guess.keys and codes:
-        key, values = next(iter(codes.items()))
-        guess.columns["label"] = key
-        guess.labels = Counter(map(str, codes.pop(key)))
-        listed = ", ".join(map(str, values[:6]))
-        guess.doubts.append(
-            f"the column '{key}' has few whole numbers that change rarely ({listed}), so that it is taken for the "
-            "label: give the numbers their names under [aliases]"
-        )
-    for key, values in codes.items():
-        listed = ", ".join(map(str, values[:6]))
-        guess.doubts.append(
-            f"the column '{key}' has few whole numbers that change rarely ({listed}), so that it is no channel: if it "
-            "is a sensor, add it to channels"
-        )
-    if not guess.labels and "intervals" not in guess.keys:
+    """Take whole numbers that change rarely for the label or the take, if there is no other; list the others."""
+    labelled = bool(guess.labels) or "intervals" in guess.keys
+    takes = [c for c in guess.codes.values() if c.counts and (labelled or _TAKE.search(c.name))]
+    may_be = [c for c in guess.codes.values() if c not in takes and len(c.codes) <= _MOST_CODES]
+    for column in sorted(guess.codes.values(), key=lambda c: not _named([c], _LABEL_NAMES)):
+        values = ", ".join(map(str, column.codes[:6]))
+        seen = f"the column '{column.key}' has whole numbers that change rarely ({values}), so that it is"
+        if column in may_be and not labelled:
+            labelled = True
+            guess.columns["label"] = column.key
+            guess.labels = Counter(map(str, column.codes))
+            guess.doubts.append(f"{seen} taken for the label: give them names in [aliases]")
+        elif column in takes and "recording" not in guess.taken | parts.found:
+            guess.taken.add("recording")
+            guess.columns["recording"] = column.key
+            guess.doubts.append(f"{seen} taken for the take: a recording ends where it changes")
+        else:
+            guess.doubts.append(f"{seen} no channel: if it is a sensor, add it to channels")
+    if not labelled:
         guess.doubts.append("the label of a recording was not found: put {label} into paths, or give its column")
-
-
-def _named_label(key: str) -> bool:
-    return any(name in key.casefold() for name in _LABEL_NAMES)
 
 
 def _interval_files(base: Path, without: list[Path], guess: _PatternDraft) -> dict[Path, dict[str, str]]:
@@ -537,12 +579,18 @@ def _place_of(path: Path, samples: list[Path], patterns: list[str]) -> str | Non
 
 def _exclude(without: list[Path], samples: list[Path], guess: _PatternDraft) -> None:
     """Leave out files with other columns, by their name if no file of samples has it."""
+    if len(without) > _FEW:
+        fit = [path_expression(text) for text in guess.keys["paths"]]
+        excluded = [path for path in without if any(e.fullmatch(path.as_posix()) for e in fit)]
+    else:
+        excluded = without
     if not without:
         return
     names = {path.name for path in samples}
-    texts = [f"**/{path.name}" if path.name not in names and len(without) > 5 else path.as_posix() for path in without]
+    many = len(excluded) > _FEW
+    texts = [f"**/{path.name}" if many and path.name not in names else path.as_posix() for path in excluded]
     guess.keys["exclude"] = [re.sub("[{}?]", "?", text) for text in dict.fromkeys(texts)]
-    listed = ", ".join(path.as_posix() for path in without[:5]) + (", …" if len(without) > 5 else "")
+    listed = ", ".join(path.as_posix() for path in without[:_FEW]) + (", …" if len(without) > _FEW else "")
     guess.doubts.append(f"files without such rows are left out: {listed}")
 
 
@@ -550,8 +598,8 @@ def _clock(time: _Column | None, guess: _PatternDraft) -> None:
     """Find the unit of the times, and the rate."""
     if time is None:
         guess.doubts.append(
-            f"the files have no clock: {guess.rate_hz:g} rows a second are taken, as micro:bit CreateAI has with ID (40) "
-            "or id (50). Recordings of 1.8 s with about 92 rows have 50 too: then correct row_rate_hz and rate_hz"
+            f"the files have no clock; micro:bit CreateAI has {guess.rate_hz:g} rows a second with this key (40 with ID, 50 "
+            "with id): if recordings of 1.8 s have about 92 rows, correct row_rate_hz and rate_hz to 50"
             if guess.rate_hz
             else f"the files have no clock: give the true rate as row_rate_hz and rate_hz, now {_USUAL_HZ:g}"
         )

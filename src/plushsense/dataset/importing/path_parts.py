@@ -41,12 +41,15 @@ class PathParts:
     doubts: list[str] = field(default_factory=list)
 
 
-def guess_paths(files: Sequence[Path], ending: str, taken: Iterable[str], *, dotted: bool = False) -> PathParts:
+def guess_paths(
+    files: Sequence[Path], ending: str, taken: Iterable[str], labels: Iterable[str] = (), *, dotted: bool = False
+) -> PathParts:
     """Find out which parts of the paths are person, session, label and take.
 
     Args:
         files: paths below the source.
         taken: parts that have a column.
+        labels: labels in columns; they may stand in paths, too.
         dotted: whether the label ends at the first full stop of a name, as in files of Edge Impulse.
     """
     result = PathParts([])
@@ -59,7 +62,6 @@ def guess_paths(files: Sequence[Path], ending: str, taken: Iterable[str], *, dot
         roles.append(_role([row[k] for row in rows], len(rows) > 1, taken | set(roles), k))
     label_at = depth - 1 if dotted and "label" not in taken else _label_at(rows, roles, taken)
     if label_at is not None:
-        roles = ["*" if role == "label" else role for role in roles]
         roles[label_at] = "label"
     if dotted and len(rows[0]) > depth and "recording" not in taken:
         roles = ["*" if role == "recording" else role for role in roles]
@@ -69,7 +71,7 @@ def guess_paths(files: Sequence[Path], ending: str, taken: Iterable[str], *, dot
         # The files hold several recordings each, so that their number is rather that of a session.
         roles[roles.index("recording")] = "session" if "session" not in taken | set(roles) else "*"
     if "subject" not in taken | set(roles):
-        _person(rows, roles)
+        _person(rows, roles, set(labels))
     for part, what in (("label", "the label"), ("subject", "the person")):
         if part in roles:
             result.doubts.append(_examples(what, [row[roles.index(part)] for row in rows], used))
@@ -86,7 +88,8 @@ def guess_paths(files: Sequence[Path], ending: str, taken: Iterable[str], *, dot
             result.doubts.append(
                 f"the {kind} {listed} are parts of a data set, neither labels nor people"
                 if _known(texts, _SPLITS)
-                else f"all of the {kind} {listed} are imported: if they hold other sensors, name one in paths"
+                else f"all of the {kind} {listed} are imported: if they hold other sensors, or the same recordings "
+                "twice, name one in paths"
             )
     result.found = set(roles) & set(PARTS)
     if "label" in roles:
@@ -152,21 +155,27 @@ def _role(texts: list[str], several: bool, taken: set[str], at: int) -> str:
         return "session"
     if all(t.isdecimal() or _TAKE.fullmatch(t) for t in texts):
         return "recording" if "recording" not in taken and at else "*"
-    if "label" not in taken and 1 < len(distinct) <= min(MOST_LABELS, max(2, len(texts) // 2)):
-        return "label"
     return "*"
 
 
 def _label_at(rows: list[list[str]], roles: list[str], taken: set[str]) -> int | None:
-    """Return the piece that holds words of gestures, if it is one of several that may be the label."""
-    if "label" in taken:
-        return None
-    for k, role in enumerate(roles):
+    """Return the piece that is the label; None if there is none.
+
+    The first one with words of gestures is taken, else the first one whose texts are those of several people, else the
+    first.
+    """
+    person = roles.index("subject") if "subject" in roles else None
+    found: dict[int, tuple[bool, bool]] = {}
+    for k in [k for k, role in enumerate(roles) if role == "*"]:
         texts = {row[k] for row in rows}
-        words = {word for text in texts for word in re.split(r"[\W\d_]+|(?<=[a-z])(?=[A-Z])", text) if word}
-        if role in ("label", "*") and 1 < len(texts) <= MOST_LABELS and any(map(_GESTURES.fullmatch, words)):
-            return k
-    return None
+        words = {w for text in texts for w in re.split(r"[\W\d_]+|(?<=[a-z])(?=[A-Z])", text) if w}
+        of_gesture = any(map(_GESTURES.fullmatch, words))
+        few = 1 < len(texts) <= (MOST_LABELS if of_gesture else min(MOST_LABELS, max(2, len(rows) // 2)))
+        other = _known(texts, _SPLITS, _DEVICES) or all(t.isdecimal() or _TAKE.fullmatch(t) for t in texts)
+        if few and not other and re.search(r"[^\W_]", rows[0][k]):
+            of_one = person is not None and len({(row[k], row[person]) for row in rows}) == len(texts)
+            found[k] = (of_gesture, not of_one)
+    return max(found, key=lambda k: found[k], default=None) if "label" not in taken else None
 
 
 def _different(rows: list[list[str]], roles: list[str], taken: set[str], doubts: list[str]) -> None:
@@ -183,12 +192,16 @@ def _different(rows: list[list[str]], roles: list[str], taken: set[str], doubts:
         )
 
 
-def _person(rows: list[list[str]], roles: list[str]) -> None:
+def _person(rows: list[list[str]], roles: list[str], labels: set[str]) -> None:
     """Make the piece with the most texts the person, if there is one that stands in several files."""
     several = {}
+    label = roles.index("label") if "label" in roles else None
     for k, role in enumerate(roles):
         texts = {row[k] for row in rows}
         other = all(_TAKE.fullmatch(text) for text in texts) or _known(texts, _SPLITS, _DEVICES)
+        # A person has several gestures; a text with one gesture each is another word for it.
+        of_label = label is not None and len({(row[k], row[label]) for row in rows}) == len(texts)
+        other = other or texts <= labels or of_label
         if role in ("*", "session") and 1 < len(texts) < len(rows) and not other and re.search(r"[^\W_]", rows[0][k]):
             several[k] = texts
     if several:
