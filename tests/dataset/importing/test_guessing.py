@@ -207,6 +207,7 @@ def test_actions_of_microbit_createai(tmp_path: Path, key: str, rate_hz: float) 
     assert seen.rows[1].time_ms == 1000 / rate_hz
     assert seen.warnings == []
     assert any("micro:bit CreateAI" in doubt for doubt in guess.doubts)
+    assert "lists within objects are taken for recordings: 12 in 6 objects" in guess.doubts
     assert any("'name' is taken for the label: 'hug', 'tap'" in doubt for doubt in guess.doubts)
 
 

@@ -28,7 +28,12 @@ from plushsense.dataset.importing.intervals import interval_columns
 from plushsense.dataset.importing.path_parts import MOST_LABELS, PathParts, guess_paths
 from plushsense.dataset.importing.pattern import ENDINGS, INTERVAL, LABELS, ROLES, UNITS, path_expression
 from plushsense.dataset.importing.sources import source_files, split_regular_files
-from plushsense.dataset.importing.table_files import json_cells, unit_of_time
+from plushsense.dataset.importing.table_files import (
+    json_cells,
+    json_objects,
+    one_recording_each,
+    unit_of_time,
+)
 
 _FILES, _LINES, _FEW = 12, 2000, 5
 _HEAD, _MOST_BYTES, _MOST_JSON = 16_384, 400_000, 64 << 20
@@ -402,10 +407,16 @@ def _json_columns(samples: list[str], guess: _PatternDraft) -> list[_Column]:
     """Return the values of JSON objects as columns, by their path within an object."""
     cells: dict[str, list[list[str]]] = {}
     lists: set[str] = set()
+    objects = recordings = 0
     for text in samples:
-        for key, (parts, in_list) in json_cells(text).items():
+        whole = json_objects(text)
+        each = one_recording_each(whole)
+        objects, recordings = objects + len(whole), recordings + len(each)
+        for key, (parts, in_list) in json_cells(each).items():
             cells.setdefault(key, []).extend(parts)
             lists |= {key} if in_list else set()
+    if recordings > objects:
+        guess.doubts.append(f"lists within objects are taken for recordings: {recordings} in {objects} objects")
     guess.rate_hz = next((rate for key, rate in _MICROBIT_HZ.items() if any(_ends(k, key) for k in cells)), 0.0)
     return [_Column(key, key, parts, of_recording=bool(lists) and key not in lists) for key, parts in cells.items()]
 
@@ -598,8 +609,8 @@ def _clock(time: _Column | None, guess: _PatternDraft) -> None:
     """Find the unit of the times, and the rate."""
     if time is None:
         guess.doubts.append(
-            f"the files have no clock; micro:bit CreateAI has {guess.rate_hz:g} rows a second with this key (40 with ID, 50 "
-            "with id): if recordings of 1.8 s have about 92 rows, correct row_rate_hz and rate_hz to 50"
+            f"the files have no clock; micro:bit CreateAI has {guess.rate_hz:g} rows a second with this key (40: ID, "
+            "50: id): if recordings of 1.8 s have about 92 rows, correct row_rate_hz and rate_hz to 50"
             if guess.rate_hz
             else f"the files have no clock: give the true rate as row_rate_hz and rate_hz, now {_USUAL_HZ:g}"
         )

@@ -328,7 +328,7 @@ def read_json(file: TableFile) -> ImportedColumns:
     except UnicodeError:
         raise file.error("is not UTF-8: save it as UTF-8", reason="table_not_utf8", file=file.display_name) from None
     try:
-        objects = _one_recording_each(list(_objects(text)))
+        objects = one_recording_each(json_objects(text))
         first = next((item for _, item in objects if isinstance(item, dict)), None)
         there = list(dict.fromkeys(_paths(first)))
     except RecursionError:
@@ -364,8 +364,12 @@ def read_json(file: TableFile) -> ImportedColumns:
     return rows.columns(numbers, own_recordings=lists)
 
 
+def json_objects(text: str) -> list[tuple[int, Any]]:
+    """Return the line, from 1 (in a list the number of the item), and the value of each object; a text if damaged."""
+    return list(_objects(text))
+
+
 def _objects(text: str) -> Iterator[tuple[int, Any]]:
-    """Yield the line, from 1 (in a list the number of the item), and the value of each object; a text if damaged."""
     if text.lstrip()[:1] == "[":
         try:
             yield from enumerate(loads_json(text), 1)
@@ -392,7 +396,7 @@ def _objects(text: str) -> Iterator[tuple[int, Any]]:
 _SERIES = 8
 
 
-def _one_recording_each(objects: list[tuple[int, Any]]) -> list[tuple[int, Any]]:
+def one_recording_each(objects: list[tuple[int, Any]]) -> list[tuple[int, Any]]:
     """Replace objects with lists of recordings by one object for each recording, with the values around it.
 
     micro:bit CreateAI nests them so: ``{"name": …, "recordings": [{"data": {"x": […], …}}, …]}``. Sensors that a list
@@ -405,7 +409,7 @@ def _one_recording_each(objects: list[tuple[int, Any]]) -> list[tuple[int, Any]]
         lists = {k: value for k, value in held.items() if listed and isinstance(value, list)}
         inner = [(k, value) for k, value in held.items() if isinstance(value, dict)]
         inner += [(k, one) for k, value in lists.items() for one in value]
-        outer = _one_recording_each(inner) if inner else []
+        outer = one_recording_each(inner) if inner else []
         if listed or any(one is not held[k] for k, one in outer):
             others = [item for k, item in enumerate(objects) if k not in {*lists, *(k for k, _ in inner)}]
             return others + [(objects[k][0], {**found[k], key: one}) for k, one in outer]
@@ -450,13 +454,13 @@ def _by_sensor(item: Any) -> Any:
     return {**item, "sensors": {name: [row[k] for row in rows] for k, name in enumerate(names)}}
 
 
-def json_cells(text: str) -> dict[str, tuple[list[list[str]], bool]]:
+def json_cells(objects: Iterable[tuple[int, Any]]) -> dict[str, tuple[list[list[str]], bool]]:
     """Return the cells of each value in JSON objects by its path, and whether an object has a list of them.
 
     The cells of each list are apart; those of single values are together.
     """
     found: dict[str, tuple[list[list[str]], bool]] = {}
-    for _, item in _one_recording_each(list(_objects(text))):
+    for _, item in objects:
         values = {path: _value(item, path.split(".")) for path in _paths(item)} if isinstance(item, dict) else {}
         rows: Counter[int] = Counter()
         for value in values.values():
