@@ -296,3 +296,24 @@ def test_names_that_end_in_a_date_are_not_those_of_the_gesture_recorder(tmp_path
     found, _, seen = guessed(tmp_path / "src")
     assert names(found) == ["left"]
     assert (seen.recordings, sorted(seen.gestures)) == (6, ["0", "1", "2"])
+
+
+def test_a_number_of_the_row_is_no_clock(tmp_path: Path) -> None:
+    for seed, (person, gesture) in enumerate((p, g) for p in ("P1", "P2") for g in GESTURES):
+        table(tmp_path / "src" / person / f"{gesture}.csv", {"n": list(range(60)), "left": noise(60, seed)})
+    found, guess, _ = guessed(tmp_path / "src")
+    assert (found["row_rate_hz"], names(found)) == (50.0, ["left"])
+    assert any("have no clock" in doubt for doubt in guess.doubts)
+
+
+def test_recordings_of_which_one_lacks_a_channel_can_be_guessed_from(tmp_path: Path) -> None:
+    (tmp_path / "src").mkdir()
+    recordings = [
+        {"label": GESTURES[k % 2], "t_ms": list(range(0, 600 + 20 * k, 20)), "left": noise(30 + k, k)} for k in range(4)
+    ]
+    recordings[0]["right"], recordings[2]["right"] = noise(30, 7), noise(32, 8)
+    recordings[1]["tags"] = ["a", "b"]
+    (tmp_path / "src" / "P1.jsonl").write_text("\n".join(map(json.dumps, recordings)))
+    found, _, seen = guessed(tmp_path / "src")
+    assert names(found) == ["left", "right"]
+    assert any("without a number in every column left out" in note for note in seen.warnings)

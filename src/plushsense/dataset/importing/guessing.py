@@ -16,14 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import plain_label
 from plushsense.core.recorder_csv import parse_name
 from plushsense.core.toml import loads_json
-from plushsense.dataset.importing.counters import CLOCK, no_reading
+from plushsense.dataset.importing.counters import CLOCK, COUNTER, Floats, no_reading
 from plushsense.dataset.importing.intervals import interval_columns
 from plushsense.dataset.importing.path_parts import MOST_LABELS, PathParts, guess_paths
 from plushsense.dataset.importing.pattern import ENDINGS, INTERVAL, LABELS, ROLES, UNITS, path_expression
@@ -42,10 +41,14 @@ _USUAL_HZ = 50.0
 _SEPARATORS = ("\t", ";", "|", ",", " ")
 _MOST_STEPS = 1e7
 _LABEL_NAMES = ("label", "gesture", "activity", *LABELS)
+# Numbers with these names are labels; "touch" may be a sensor.
+_CODE_NAMES = ("label", "gesture", "activity", "class", "event", "action")
 _PERSON_NAMES = ("subject", "participant", "person", "user", "child", "who")
 # acc_x, x_acc, accX, aX, Accelerometer_x, and x, y, z alone; not accuracy.
 _ACCELERATION = re.compile(r"(?<![a-z])(acc(?!u)|accel|a_?[xyz](?![a-z]))|acc(el)?_?[xyz]?$|^[xyz](_\d+)?$")
 _NO_CHANNEL = re.compile(r"(index|row|frame|sample|no|nr|id|count_?er|unnamed.*|#)?", re.IGNORECASE)
+# The share of its rows that a recording of the GestureRecorder keeps when it is cut is above 1 / this.
+_MOST_CUT = 20
 # Labels as numbers: at most so many whole numbers, which change in a smaller share of the rows than this.
 _MOST_CODES, _SELDOM = 30, 0.05
 _TAKE = re.compile(r"(^|_)(id|sample|take|trial|rep|repetition|recording|segment|window|block|session)", re.IGNORECASE)
@@ -65,7 +68,7 @@ class _Column:
     decimal: str = "."
     of_recording: bool = False
     """Whether there is one cell for each recording, beside columns with many."""
-    numbers: list[NDArray[np.float64]] = field(default_factory=list)
+    numbers: list[Floats] = field(default_factory=list)
     """The number in each cell of each part, NaN where there is none."""
     words: Counter[str] = field(default_factory=Counter)
 
@@ -85,9 +88,9 @@ class _Column:
         return [cell for cells in self.parts for cell in cells]
 
     @property
-    def values(self) -> NDArray[np.float64]:
+    def values(self) -> Floats:
         """The numbers of all parts."""
-        joined: NDArray[np.float64] = np.concatenate([*self.numbers, np.empty(0)])
+        joined: Floats = np.concatenate([*self.numbers, np.empty(0)])
         return joined[np.isfinite(joined)]
 
     @property
@@ -110,7 +113,7 @@ class _Column:
             return False
 
     @property
-    def moments(self) -> list[NDArray[np.float64]]:
+    def moments(self) -> list[Floats]:
         """The times in each part: numbers, or the seconds of dates."""
         if not self.is_date:
             return self.numbers
@@ -120,7 +123,7 @@ class _Column:
         ]
 
     @property
-    def steps(self) -> NDArray[np.float64]:
+    def steps(self) -> Floats:
         """The differences of neighbouring numbers, within each part."""
         return np.concatenate([*(np.diff(part[np.isfinite(part)]) for part in self.numbers), np.empty(0)])
 
@@ -133,7 +136,7 @@ class _Column:
         """The values, if they are whole numbers that change rarely, as labels or numbers of takes do; or nothing."""
         distinct = np.unique(self.values)
         whole = len(distinct) > 1 and bool(np.all(distinct == np.round(distinct)))
-        cells = set(distinct.tolist()) <= {0.0, 1.0} and not _named([self], _LABEL_NAMES)
+        cells = set(distinct.tolist()) <= {0.0, 1.0} and not _named([self], _CODE_NAMES)
         if not whole or cells or not len(self.steps) or self.of_recording:
             return []
         seldom = float(np.mean(self.steps != 0)) < _SELDOM
@@ -184,8 +187,8 @@ class _PatternDraft:
     vectors: list[list[str]] = field(default_factory=list)
     labels: Counter[str] = field(default_factory=Counter)
     rate_hz: float = 0.0
-    times: list[NDArray[np.float64]] = field(default_factory=list)
-    """The time of each row of each file or recording; its number without a clock."""
+    times: list[Floats] = field(default_factory=list)
+    """The time of each row of each file or recording; empty without a clock."""
     codes: dict[str, _Column] = field(default_factory=dict)
     """Columns of whole numbers that change rarely."""
     is_json: bool = False
@@ -222,7 +225,7 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
     guess = _PatternDraft()
     if others := len(files) - len(of_ending):
         guess.doubts.append(f"files that do not end in '{ending}' are left out: {others}")
-    guess.is_json = ENDINGS.get(ending) == "json" or _text(some[0], guess, _HEAD).lstrip()[:1] in ("{", "[")
+    guess.is_json = ENDINGS.get(ending) == "json" or _text(some[0], None, _HEAD).lstrip()[:1] in ("{", "[")
     if guess.is_json:
         columns = _json_columns([_json_text(f, guess) for f in some], guess)
     else:
@@ -230,7 +233,7 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
     if guess.is_json and ENDINGS.get(ending) != "json":
         guess.keys["format"] = "json"
     if not guess.is_json:
-        mine = [f for f in mine if _fits(_text(f, guess, _HEAD).splitlines(), guess)] or mine
+        mine = [f for f in mine if _fits(_text(f, None, _HEAD).splitlines(), guess)] or mine
     without = sorted(set(of_ending) - set(mine))
     _roles(columns, guess)
     if not guess.channels:
@@ -264,13 +267,16 @@ def _is_text(path: Path) -> bool:
 
 
 def _is_recorded(path: Path) -> bool:
-    """Return whether the name of a file has its number of rows at the end, as those of the GestureRecorder have."""
+    """Return whether the name of a file may have its number of rows at the end, as those of the GestureRecorder have.
+
+    The authors' script has cut rows away; a date in place of the rows is a far larger number.
+    """
     name = parse_name(path.name)
     if name is None:
         return False
     with path.open("rb") as file:
         rows = sum(1 for _ in file)
-    return abs(rows - name.rows) <= 2
+    return rows - 2 <= name.rows <= _MOST_CUT * rows
 
 
 def _has_rows(path: Path) -> bool:
@@ -280,15 +286,19 @@ def _has_rows(path: Path) -> bool:
     return any(line.lstrip()[:1] in ("{", "[") or any(map(_is_number, re.split(r"[,;\t| ]", line))) for line in lines)
 
 
-def _text(path: Path, guess: _PatternDraft, most: int = _MOST_BYTES) -> str:
-    """Return the first bytes of a file as text, without the beginning of a line at the end."""
+def _text(path: Path, guess: _PatternDraft | None = None, most: int = _MOST_BYTES) -> str:
+    """Return the first bytes of a file as text, without the beginning of a line at the end.
+
+    The encoding of a file that is used for ``guess`` is that of the pattern.
+    """
     with path.open("rb") as file:
         raw = file.read(most)
     cut = len(raw) == most
     try:
         text = raw.decode("utf-8-sig", "ignore" if cut else "strict")
     except UnicodeDecodeError:
-        guess.keys["encoding"] = "latin-1"
+        if guess is not None:
+            guess.keys["encoding"] = "latin-1"
         text = raw.decode("latin-1")
     return text[: text.rfind("\n") + 1] or text if cut else text
 
@@ -454,15 +464,14 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
         guess.doubts.append(f"{n} binary channels are named cell1 to cell{n}: give them the names of the cells")
     dates = next((c for c in left if c.is_date and not c.of_recording), None)
     numeric = [c for c in left if c.is_numeric and not c.of_recording]
-    time = dates or _named(numeric, (*ROLES["time"], "time", "stamp")) or next((c for c in numeric if c.rises), None)
+    time = dates or _named(numeric, (*ROLES["time"], "time", "stamp")) or next(filter(_may_be_clock, numeric), None)
     interval = next((c for c in left if c.of_recording and c.is_numeric and _ends(c.key, INTERVAL)), None)
-    if time is None and interval is not None:
+    if time is None and interval is not None and min(interval.values) > 0:
         take(INTERVAL, interval)
         guess.rate_hz = float(f"{1000.0 / float(np.median(interval.values)):.3g}")
     else:
         _clock(take("time", time), guess)
-    rows = next((c for c in numeric if not c.of_recording), time)
-    guess.times = time.moments if time is not None else [np.arange(float(len(p))) for p in rows.parts] if rows else []
+    guess.times = time.moments if time is not None else []
     texts = [c for c in left if not c.is_numeric and c.words and not c.is_date]
     take("subject", _named([*texts, *left], (*ROLES["subject"], *_PERSON_NAMES)) if len(columns) > 1 else None)
     texts = [c for c in texts if c in left]
@@ -472,7 +481,7 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
     take("label", _label(texts, left, guess))
     missing: Counter[str] = Counter()
     for column in [c for c in left if c.is_numeric and not c.of_recording]:
-        kind = no_reading(list(zip(column.numbers, guess.times, strict=False)))
+        kind = no_reading(_with_times(column, guess.times))
         if _NO_CHANNEL.fullmatch(column.name.strip()):
             guess.doubts.append(f"the column '{column.key}' is taken for a number of the row, not for a channel")
         elif column.codes and (not kind or _TAKE.search(column.name)):
@@ -488,10 +497,21 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
     _vectors(guess)
 
 
+def _with_times(column: _Column, times: list[Floats]) -> list[tuple[Floats, Floats]]:
+    """Return the numbers of a column in each file or recording, and their times, or the numbers of the rows."""
+    fits = [len(a) for a in column.numbers] == [len(b) for b in times]
+    return list(zip(column.numbers, times if fits else [np.arange(float(len(a))) for a in column.numbers], strict=True))
+
+
+def _may_be_clock(column: _Column) -> bool:
+    """Return whether a column rises, and does not only count the rows."""
+    return column.rises and no_reading(_with_times(column, [])) != COUNTER
+
+
 def _label(texts: list[_Column], left: list[_Column], guess: _PatternDraft) -> _Column | None:
     """Return the column of labels: by its name, or else the first one of few texts, a ``name`` before others."""
     label = _named(texts, (*ROLES["label"], *_LABEL_NAMES))
-    numbers = next((c for c in left if c.name.strip().casefold() in _LABEL_NAMES and c.codes), None)
+    numbers = next((c for c in left if c.name.strip().casefold() in _CODE_NAMES and c.codes), None)
     if label is None and numbers is not None:
         guess.labels = Counter(map(str, numbers.codes))
         guess.doubts.append(f"the labels in '{numbers.key}' are numbers: give them their names in [aliases]")
@@ -518,7 +538,7 @@ def _codes(parts: PathParts, guess: _PatternDraft) -> None:
     labelled = bool(guess.labels) or "intervals" in guess.keys
     takes = [c for c in guess.codes.values() if c.counts and (labelled or _TAKE.search(c.name))]
     may_be = [c for c in guess.codes.values() if c not in takes and len(c.codes) <= _MOST_CODES]
-    for column in sorted(guess.codes.values(), key=lambda c: not _named([c], _LABEL_NAMES)):
+    for column in sorted(guess.codes.values(), key=lambda c: not _named([c], _CODE_NAMES)):
         values = ", ".join(map(str, column.codes[:6]))
         seen = f"the column '{column.key}' has whole numbers that change rarely ({values}), so that it is"
         if column in may_be and not labelled:
@@ -541,7 +561,7 @@ def _interval_files(base: Path, without: list[Path], guess: _PatternDraft) -> di
     found: dict[Path, dict[str, str]] = {}
     moments = []
     for file in without if "label" not in guess.taken else ():
-        lines = [line for line in _text(file, guess, _HEAD).splitlines() if line.strip()]
+        lines = [line for line in _text(file, None, _HEAD).splitlines() if line.strip()]
         separator = max(",;\t", key=lines[0].count) if lines else ","
         names = [name.strip() for name in next(csv.reader(lines, delimiter=separator), [])]
         if len(lines) > 1 and (at := interval_columns(names)):
@@ -577,7 +597,7 @@ def _place_of(path: Path, samples: list[Path], patterns: list[str]) -> str | Non
     """Return the pattern of the path of a file of intervals, by the parts of a sample with the same texts."""
     text = path.as_posix()
     best: list[str] = []
-    for sample in samples:
+    for sample in [s for s in samples if s.parent == path.parent] or samples:
         match = next((m for p in patterns if (m := path_expression(p).fullmatch(sample.as_posix()))), None)
         parts = {part: value for part, value in (match.groupdict() if match else {}).items() if value}
         if all(re.search(rf"(?<![^\W_]){re.escape(value)}(?![^\W_])", text) for value in parts.values()):
