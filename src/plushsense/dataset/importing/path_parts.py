@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -52,11 +52,36 @@ def guess_paths(
         labels: labels in columns; they may stand in paths, too.
         dotted: whether the label ends at the first full stop of a name, as in files of Edge Impulse.
     """
-    result = PathParts([])
     taken = set(taken)
+    doubts: list[str] = []
     depth = _usual_least([len(f.parts) for f in files])
     before = "**/" if any(len(f.parts) > depth for f in files) else ""
-    rows, used = _pieces(files, ending, depth, dotted, result.doubts)
+    rows, used = _pieces(files, ending, depth, dotted, doubts)
+    roles = _roles(rows, depth, taken, set(labels), dotted, doubts)
+    doubts += _to_check(rows, used, roles, depth)
+    if "subject" not in taken | set(roles):
+        doubts.append(
+            "the person of a recording was not found: put {subject} into paths, give its column, or import with "
+            "--subjects map.csv (file,subject)"
+        )
+    # What is the same in all paths stands there as it is, but for the characters of patterns; a name of all files tells
+    # nothing apart, and the next recording may have another.
+    limits = {"label": ":[^.]+"} if dotted else {}
+    texts = [
+        f"{{{role}{limits.get(role, '')}}}" if role in PARTS else role or re.sub("[{}*?]", "?", rows[0][k])
+        for k, role in enumerate(roles)
+    ]
+    folders = before + "".join(f"{text}/" for text in texts[: depth - 1])
+    name = "*" if len({path.name for path in used}) == 1 else "".join(texts[depth - 1 :])
+    found = Counter(row[roles.index("label")] for row in rows) if "label" in roles else Counter[str]()
+    pattern = (folders + name if len(rows) > 1 else "*") + ending
+    return PathParts([pattern], found, set(roles) & set(PARTS), doubts)
+
+
+def _roles(
+    rows: list[list[str]], depth: int, taken: set[str], labels: set[str], dotted: bool, doubts: list[str]
+) -> list[str]:
+    """Return the part that each piece of the paths is; "" for text that is the same everywhere, * for anything else."""
     roles: list[str] = []
     for k in range(len(rows[0])):
         roles.append(_role([row[k] for row in rows], len(rows) > 1, taken | set(roles), k))
@@ -66,47 +91,32 @@ def guess_paths(
     if dotted and len(rows[0]) > depth and "recording" not in taken:
         roles = ["*" if role == "recording" else role for role in roles]
         roles[depth + 1] = "recording"
-    _different(rows, roles, taken, result.doubts)
+    _different(rows, roles, taken, doubts)
     if "recording" in roles and "label" not in roles:
         # The files hold several recordings each, so that their number is rather that of a session.
         roles[roles.index("recording")] = "session" if "session" not in taken | set(roles) else "*"
     if "subject" not in taken | set(roles):
-        _person(rows, roles, set(labels))
+        _person(rows, roles, labels)
+    return roles
+
+
+def _to_check(rows: list[list[str]], files: Sequence[Path], roles: list[str], depth: int) -> Iterator[str]:
+    """Yield what to check in the parts of the paths."""
     for part, what in (("label", "the label"), ("subject", "the person")):
         if part in roles:
-            result.doubts.append(_examples(what, [row[roles.index(part)] for row in rows], used))
-    if "subject" not in taken | set(roles):
-        result.doubts.append(
-            "the person of a recording was not found: put {subject} into paths, give its column, or import with "
-            "--subjects map.csv (file,subject)"
-        )
+            yield _examples(what, [row[roles.index(part)] for row in rows], files)
     for k, role in enumerate(roles):
         texts = {row[k] for row in rows}
-        if role == "*" and (k < depth - 1 or (len(texts) > 1 and _known(texts, _SPLITS, _DEVICES))):
-            kind = "folders" if k < depth - 1 else "files with"
-            listed = ", ".join(sorted(texts)[:5])
-            result.doubts.append(
-                f"the {kind} {listed} are parts of a data set, neither labels nor people"
-                if _known(texts, _SPLITS)
-                else f"all of the {kind} {listed} are imported: if they hold other sensors, or the same recordings "
-                "twice, name one in paths"
+        if role != "*" or (k >= depth - 1 and (len(texts) == 1 or not _known(texts, _SPLITS, _DEVICES))):
+            continue
+        listed = f"{'folders' if k < depth - 1 else 'files with'} {', '.join(sorted(texts)[:5])}"
+        if _known(texts, _SPLITS):
+            yield f"the {listed} are parts of a data set, neither labels nor people"
+        else:
+            yield (
+                f"all of the {listed} are imported: if they hold other sensors, or the same recordings twice, name one "
+                "in paths"
             )
-    result.found = set(roles) & set(PARTS)
-    if "label" in roles:
-        result.labels = Counter(row[roles.index("label")] for row in rows)
-    # What is the same in all paths stands there as it is, but for the characters of patterns; a name of all files tells
-    # nothing apart, and the next recording may have another.
-    limit = ":[^.]+" if dotted else ""
-    texts_of = [
-        f"{{{role}{limit if role == 'label' else ''}}}" if role in PARTS else role or re.sub("[{}*?]", "?", rows[0][k])
-        for k, role in enumerate(roles)
-    ]
-    folders = before + "".join(f"{text}/" for text in texts_of[: depth - 1])
-    names = "".join(texts_of[depth - 1 :])
-    if len({path.name for path in used}) == 1:
-        names = "*"
-    result.patterns = [(folders + names if len(rows) > 1 else "*") + ending]
-    return result
 
 
 def _pieces(
@@ -141,7 +151,7 @@ def _known(texts: Iterable[str], *words: re.Pattern[str]) -> bool:
 
 
 def _role(texts: list[str], several: bool, taken: set[str], at: int) -> str:
-    """Return the part that a piece of all paths is; "" for text that is the same everywhere, * for anything else."""
+    """Return the part that a piece of all paths is, as `_roles`, unless it is the label."""
     distinct = set(texts)
     if not any(c.isalnum() for c in texts[0]):
         return "" if len(distinct) == 1 else "*"
