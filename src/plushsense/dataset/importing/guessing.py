@@ -239,17 +239,7 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
     if not guess.channels:
         listed = ", ".join(column.name.strip()[:30] for column in columns[:20]) or "no columns of one length"
         raise DatasetError(f"No column of numbers that could be a channel was found in '{source}'; it has {listed}.")
-    relative = [f.relative_to(base) for f in mine]
-    of_labels = _interval_files(base, without, guess)
-    taken = guess.taken | ({"label"} if of_labels else set())
-    labels = set(guess.labels)
-    parts = guess_paths(relative, ending, taken, labels, dotted=INTERVAL in guess.columns)
-    if of_labels and _intervals(of_labels, relative, parts, guess):
-        without = [file for file in without if file.relative_to(base) not in of_labels]
-    elif of_labels:
-        parts = guess_paths(relative, ending, guess.taken)
-    guess.keys["paths"] = parts.patterns
-    _exclude([f.relative_to(base) for f in without], relative, guess)
+    parts = _paths(base, mine, without, ending, guess)
     guess.doubts += parts.doubts
     if parts.labels:
         guess.labels = parts.labels
@@ -258,6 +248,21 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
     # Names in the files may hold characters that no line of text can show.
     guess.doubts = ["".join(c if c.isprintable() else " " for c in doubt) for doubt in guess.doubts]
     return GuessedPattern(_toml(guess, source.resolve().stem), guess.doubts)
+
+
+def _paths(base: Path, mine: list[Path], without: list[Path], ending: str, guess: _PatternDraft) -> PathParts:
+    """Find the parts of the paths of the tables ``mine``, and files of intervals among those ``without`` such rows."""
+    relative = [f.relative_to(base) for f in mine]
+    of_labels = _interval_files(base, without, guess)
+    taken = guess.taken | ({"label"} if of_labels else set())
+    parts = guess_paths(relative, ending, taken, set(guess.labels), dotted=INTERVAL in guess.columns)
+    if of_labels and _intervals(of_labels, relative, parts, guess):
+        without = [file for file in without if file.relative_to(base) not in of_labels]
+    elif of_labels:
+        parts = guess_paths(relative, ending, guess.taken)
+    guess.keys["paths"] = parts.patterns
+    _exclude([f.relative_to(base) for f in without], relative, guess)
+    return parts
 
 
 def _is_text(path: Path) -> bool:
