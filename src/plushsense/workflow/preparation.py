@@ -22,7 +22,7 @@ from plushsense.models.arch import Arch, parse_symbol, symbol_within
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere, idle_candidates
-from plushsense.windows.cut import ANYWHERE, WindowSet, WindowSpec, cut_windows, shared_gestures
+from plushsense.windows.cut import ANYWHERE, WindowSet, WindowSpec, constant_windows, cut_windows, shared_gestures
 from plushsense.workflow.config import ALL, SHARED, RunConfig
 
 Warn = Callable[[str], None]
@@ -126,6 +126,9 @@ def windows_for(
         cut = cut_windows(dataset, spec, gestures)
     for line in cut.left_out:
         warn(Sentence(f"left out: {line}", line.reason, **line.values))
+    # Cells that nothing touches are constant without a fault.
+    if not any(c.is_discrete for c in dataset.layout.channels) and (note := constant_windows(cut)) is not None:
+        warn(note)
     return cut
 
 

@@ -29,7 +29,7 @@ from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.quality.checking import CHECKS, Check, CheckReport, check
 from plushsense.dataset.quality.findings import CheckLimits, Issue
-from plushsense.dataset.quality.measurements import Examination, backward_steps
+from plushsense.dataset.quality.measurements import Examination, backward_steps, rows_at_one_time
 from plushsense.dataset.store import Dataset
 from plushsense.recording.simulate import simulate
 from plushsense.studio.app.words import Words
@@ -300,6 +300,20 @@ def one_row(folder: Path) -> str:
     return path.relative_to(folder / "recordings").with_suffix("").as_posix()
 
 
+def standing(folder: Path) -> str:
+    return clocked(folder, lambda t: t // 10**6 * 10**6)
+
+
+def stalling(folder: Path) -> str:
+    return clocked(folder, lambda t: t // 1000 * 1000)
+
+
+def clocked(folder: Path, clock: Callable[[np.ndarray], np.ndarray]) -> str:
+    path = recording(folder)
+    change(path, lambda f: Frames(f.values, clock(f.device_ms), f.host_ms))
+    return path.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
 def too_long(folder: Path) -> str:
     path = recording(folder)
     change(path, lambda f: join(f, *[f.slice(0, 50)] * 4))
@@ -411,6 +425,8 @@ PLANTS: list[tuple[str, Callable[[Path], str]]] = [
     ("cut-line", cut),
     ("resumed", resumed),
     ("resumed", next_day),
+    ("clock-still", standing),
+    ("clock-still", stalling),
     ("clock-reset", reset),
     ("clock-reset", leap),
     ("out-of-order", overtaken),
@@ -465,6 +481,28 @@ def test_rows_that_came_late_are_no_reset_of_the_clock(copy: Path) -> None:
 )
 def test_late_rows_are_told_from_resets(times: np.ndarray, resets: list[int], late: list[int]) -> None:
     assert [found.tolist() for found in backward_steps(times)] == [resets, late]
+
+
+@pytest.mark.parametrize(
+    ("times", "rows"),
+    [
+        (np.full(100, 1.5e12), 100),
+        (np.full(4, 0.0), 0),
+        (np.float32(1_700_000_000 + 0.01 * np.arange(300)), 300),
+        (np.repeat(np.arange(6), 50), 50),
+        (np.repeat(np.arange(10), 10), 0),
+        (np.arange(100), 0),
+        (np.array([]), 0),
+    ],
+)
+def test_a_clock_that_stands_still_is_told_from_packets(times: np.ndarray, rows: int) -> None:
+    assert rows_at_one_time(times) == rows
+
+
+def test_a_clock_that_stands_still_is_not_called_too_short(copy: Path) -> None:
+    standing(copy)
+    assert {f.severity for f in check(open_dataset(copy), only=["clock-still"]).findings} == {"error"}
+    assert check(open_dataset(copy), only=["too-short"]).findings == ()
 
 
 def test_every_check_has_a_planted_fault() -> None:

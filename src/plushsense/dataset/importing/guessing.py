@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +25,27 @@ from plushsense.core.toml import loads_json
 from plushsense.dataset.importing.counters import CLOCK, COUNTER, Floats, no_reading
 from plushsense.dataset.importing.intervals import interval_columns
 from plushsense.dataset.importing.path_parts import MOST_LABELS, PathParts, guess_paths
-from plushsense.dataset.importing.pattern import ENDINGS, INTERVAL, LABELS, ROLES, UNITS, path_expression
+from plushsense.dataset.importing.pattern import (
+    ENDINGS,
+    INTERVAL,
+    LABELS,
+    ROLES,
+    UNITS,
+    ImportPattern,
+    path_expression,
+)
 from plushsense.dataset.importing.sources import source_files, split_regular_files
 from plushsense.dataset.importing.table_files import (
+    date_ms,
+    is_between,
+    is_text,
     json_cells,
     json_objects,
+    number_blocks,
     one_recording_each,
     unit_of_time,
 )
+from plushsense.dataset.quality.measurements import rows_at_one_time
 
 _FILES, _LINES, _FEW = 12, 2000, 5
 _HEAD, _MOST_BYTES, _MOST_JSON = 16_384, 400_000, 64 << 20
@@ -40,6 +53,8 @@ _USUAL_HZ = 50.0
 # The first with which the rows have the same number of cells; a comma may also be in decimals.
 _SEPARATORS = ("\t", ";", "|", ",", " ")
 _MOST_STEPS = 1e7
+_LEAST_ROWS, _COUNTED = 20, 200
+_IDLE_LABELS = frozenset(("0", "null", "null class", "none", "idle", "nothing", "background", "no gesture", "noise"))
 _LABEL_NAMES = ("label", "gesture", "activity", *LABELS)
 # Numbers with these names are labels; "touch" may be a sensor.
 _CODE_NAMES = ("label", "gesture", "activity", "class", "event", "action")
@@ -107,20 +122,24 @@ class _Column:
 
     @property
     def is_date(self) -> bool:
-        try:
-            return all(datetime.fromisoformat(word) for word in self.words) and len(self.words) > 3
-        except ValueError:
-            return False
+        return len(self.words) > 3 and self.holds_dates
+
+    @property
+    def holds_dates(self) -> bool:
+        return not any(map(math.isnan, map(date_ms, self.words)))
 
     @property
     def moments(self) -> list[Floats]:
         """The times in each part: numbers, or the seconds of dates."""
-        if not self.is_date:
+        if not self.words or not self.holds_dates:
             return self.numbers
-        return [
-            np.array([datetime.fromisoformat(cell.strip()).timestamp() if cell.strip() else np.nan for cell in cells])
-            for cells in self.parts
-        ]
+        return [np.array([date_ms(cell) / 1000.0 for cell in cells]) for cells in self.parts]
+
+    @property
+    def times(self) -> Floats:
+        """The times of all parts."""
+        joined: Floats = np.concatenate([*self.moments, np.empty(0)])
+        return joined[np.isfinite(joined)]
 
     @property
     def steps(self) -> Floats:
@@ -195,6 +214,7 @@ class _PatternDraft:
     width: int = 1
     separator: str = ""
     form: _Form | None = None
+    in_blocks: bool = False
     doubts: list[str] = field(default_factory=list)
 
 
@@ -244,6 +264,9 @@ def guess_pattern(source: str | Path) -> GuessedPattern:
     if parts.labels:
         guess.labels = parts.labels
     _codes(parts, guess)
+    if "row_rate_hz" in guess.keys and "label" not in guess.taken and not guess.is_json:
+        _equal_recordings(mine, guess)
+    _idle(guess)
     _aliases(guess)
     # Names in the files may hold characters that no line of text can show.
     guess.doubts = ["".join(c if c.isprintable() else " " for c in doubt) for doubt in guess.doubts]
@@ -403,11 +426,67 @@ def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[_Colum
     counts = Counter(name.casefold() for name in names)
     seen: Counter[str] = Counter()
     columns = []
+    head = list(form.names) if form.head is not None else []
+    data = [
+        [row for row in rows if not is_between(row, head, ImportPattern()) and not _is_marker(row)] for rows in data
+    ]
+    _row_blocks([samples[k] for k in like], head, guess)
     for k, name in enumerate(names):
         seen[name.casefold()] += 1
         key = f"{name}#{seen[name.casefold()]}" if counts[name.casefold()] > 1 else name or f"#{k + 1}"
         columns.append(_Column(name, key, [[row[k] for row in rows] for rows in data], guess.keys.get("decimal", ".")))
     return columns
+
+
+def _row_blocks(samples: list[list[str]], head: list[str], guess: _PatternDraft) -> None:
+    """Add a doubt if empty lines, comments or lines of column names separate blocks of rows."""
+    blocks, markers = 0, Counter[str]()
+    for lines in samples:
+        between, rows = dict[int, float](), 0
+        for line in lines:
+            row = next(iter(_cells([line], guess.separator)), [])
+            if is_between(row, head, ImportPattern()):
+                between[rows] = between.get(rows, 0) + (math.inf if row and row[0].strip() else 1)
+            elif rows and _is_marker(row):
+                markers[row[0].strip()] += 1
+            else:
+                rows += len(row) == guess.width and any(map(_is_number, row))
+        blocks = max(blocks, int(number_blocks(between, rows).max(initial=0)) + 1)
+    if blocks > 1:
+        guess.doubts.append(
+            "empty lines, comments or repeated column names separate blocks of rows: each block is taken for a "
+            f'recording (up to {blocks} in the first lines of a file); if they are no recordings, add  between = "none"'
+        )
+        guess.in_blocks = True
+    if markers:
+        line = markers.most_common(1)[0][0][:40]
+        guess.doubts.append(
+            f"lines of text stand between rows, such as '{line}': if they separate recordings, describe them with a "
+            f"regular expression, such as  between = '{re.escape(line.split()[0])}.*'"
+        )
+
+
+def _is_marker(row: Sequence[str]) -> bool:
+    """Return whether a line has text in its first cell only."""
+    return bool(row) and bool(row[0].strip()) and is_text(row) and not any(cell.strip() for cell in row[1:])
+
+
+def _equal_recordings(files: Sequence[Path], guess: _PatternDraft) -> None:
+    """Add a doubt if the numbers of rows of the files suggest recordings of equal length, one after the other."""
+    if guess.in_blocks:
+        return
+    counts, separator = set[int](), guess.separator.strip().encode() or None
+    for file in files[:_COUNTED]:
+        with file.open("rb") as opened:
+            cells = (line.split(separator, 1)[0].decode("latin-1") for line in opened if line.strip())
+            counts.add(sum(map(_is_number, cells)))
+    common = math.gcd(*counts)
+    if common >= _LEAST_ROWS and len(counts) > 1:
+        listed = ", ".join(str(n) for n in sorted(counts)[:4]) + (", …" if len(counts) > 4 else "")
+        guess.doubts.append(
+            f"the files have {listed} rows, all of them multiples of {common}: if recordings of a fixed number of rows "
+            "follow one another, give it as recording_rows"
+        )
 
 
 def _cells(lines: Iterable[str], separator: str) -> Iterable[list[str]]:
@@ -470,6 +549,7 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
     dates = next((c for c in left if c.is_date and not c.of_recording), None)
     numeric = [c for c in left if c.is_numeric and not c.of_recording]
     time = dates or _named(numeric, (*ROLES["time"], "time", "stamp")) or next(filter(_may_be_clock, numeric), None)
+    time = _readable_clock(time, left, guess)
     interval = next((c for c in left if c.of_recording and c.is_numeric and _ends(c.key, INTERVAL)), None)
     if time is None and interval is not None and min(interval.values) > 0:
         take(INTERVAL, interval)
@@ -500,6 +580,28 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
         guess.keys["missing"] = sorted(missing)
         guess.doubts.append(f"the words {', '.join(sorted(missing))} are taken for missing values")
     _vectors(guess)
+
+
+def _readable_clock(time: _Column | None, left: list[_Column], guess: _PatternDraft) -> _Column | None:
+    """Return the clock, or a column of few dates without one; None with a doubt if it stands still or is unreadable."""
+    words = [c for c in left if not c.is_numeric and c.words and not c.of_recording]
+    unread = _named(words, (*ROLES["time"], "time", "stamp"))
+    if time is None and unread is not None and unread.holds_dates:
+        time = unread
+    if time is not None and (still := rows_at_one_time(time.times)):
+        left.remove(time)
+        guess.doubts.append(
+            f"the clock in '{time.key}' stands still ({still} rows in turn have the same time), as where a spreadsheet "
+            "or float32 cut digits off: export its times again, or let row_rate_hz stand instead of it"
+        )
+        return None
+    if time is None and unread is not None and re.search(r"\d", next(iter(unread.words))):
+        left.remove(unread)
+        guess.doubts.append(
+            f"the times in '{unread.key}', such as '{next(iter(unread.words))[:30]}', cannot be read: write them as "
+            "2026-03-01 12:01:02.5, as 12:01:02.5, or as numbers"
+        )
+    return time
 
 
 def _with_times(column: _Column, times: list[Floats]) -> list[tuple[Floats, Floats]]:
@@ -641,9 +743,8 @@ def _clock(time: _Column | None, guess: _PatternDraft) -> None:
         )
         guess.keys["row_rate_hz"] = guess.rate_hz = guess.rate_hz or _USUAL_HZ
         return
-    numbers = np.concatenate([*time.moments, np.empty(0)])
-    numbers = numbers[np.isfinite(numbers)]
-    if time.is_date:
+    numbers = time.times
+    if time.words and time.holds_dates:
         guess.keys["time_unit"], factor = "iso", 1000.0
     else:
         unit, stated = unit_of_time(time.name, numbers, _USUAL_HZ)
@@ -709,6 +810,16 @@ def _ranges(guess: _PatternDraft) -> None:
             accelerations[name] |= {"valid_min": -limit, "valid_max": limit}
         listed = ", ".join(f"'{name}'" for name in names)
         guess.doubts.append(f"the range of {listed} is guessed (±{limit:g}): give that of the sensor")
+
+
+def _idle(guess: _PatternDraft) -> None:
+    """Add a doubt about labels that may stand for idle time."""
+    found = [label for label in guess.labels if plain_label(label) in _IDLE_LABELS]
+    if "label" in guess.taken and found:
+        guess.doubts.append(
+            f"rows with the label {', '.join(map(repr, found))} are taken for a gesture: if nothing happens in them, "
+            f"add  idle = {json.dumps(found, ensure_ascii=False)}"
+        )
 
 
 def _aliases(guess: _PatternDraft) -> None:

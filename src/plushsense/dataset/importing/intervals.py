@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from math import isfinite
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import FileFormatError
 from plushsense.dataset.importing.pattern import INTERVAL_COLUMNS, LABELS, ROLES, UNITS, ImportPattern
-from plushsense.dataset.importing.table_files import ImportedColumns, unit_in_name
+from plushsense.dataset.importing.table_files import ImportedColumns, date_ms, unit_in_name
 
 # BIDS measures onsets in seconds from the first sample.
 _ONSET = "onset"
@@ -85,42 +85,31 @@ def read_intervals(path: Path, name: str, pattern: ImportPattern, place: Mapping
     unit = unit_in_name(header[at["start"]]) or ("s" if header[at["start"]].strip().casefold() == _ONSET else "")
     found = []
     for row in (row for row in rows if len(row) == len(header)):
-        start, last = _moment(row[at["start"]], pattern), _moment(row[at.get("end", at.get("duration", 0))], pattern)
+        start, is_date = _moment(row[at["start"]], pattern)
+        last, _ = _moment(row[at["end"] if "end" in at else at["duration"]], pattern)
         end = last if "end" in at else start + last
+        unit = "ms" if is_date else unit
         if isfinite(start) and isfinite(end) and end > start:
             found.append((start, end, row[at["label"]].strip()))
     if not found:
         raise FileFormatError(f"'{name}' has no interval whose end is after its start")
     found.sort()
-    dates = any(not _is_number(row[at["start"]], pattern) for row in rows[:1])
     return IntervalFile(
         name,
         place,
         np.array([start for start, _, _ in found]),
         np.array([end for _, end, _ in found]),
         [label for _, _, label in found],
-        "ms" if dates else unit,
+        unit,
         header[at["start"]].strip().casefold() == _ONSET,
     )
 
 
-def _is_number(text: str, pattern: ImportPattern) -> bool:
-    try:
-        float(text.replace(",", ".") if pattern.decimal == "," else text)
-    except ValueError:
-        return False
-    return True
-
-
-def _moment(text: str, pattern: ImportPattern) -> float:
-    """Return the number in a cell, or the milliseconds of a date; NaN for anything else."""
-    if _is_number(text, pattern):
-        return float(text.replace(",", ".") if pattern.decimal == "," else text)
-    try:
-        found = datetime.fromisoformat(text.strip())
-    except ValueError:
-        return float("nan")
-    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp() * 1000.0
+def _moment(text: str, pattern: ImportPattern) -> tuple[float, bool]:
+    """Return the number in a cell, or the milliseconds of a date, and whether it is a date; NaN for anything else."""
+    with contextlib.suppress(ValueError):
+        return float(text.replace(",", ".") if pattern.decimal == "," else text), False
+    return date_ms(text), True
 
 
 def label_rows(

@@ -40,7 +40,7 @@ INTERVAL_COLUMNS: dict[str, tuple[str, ...]] = {
     "end": ("end", "end_time", "stop", "stop_time", "finish", "to", "t_end"),
     "duration": ("duration", "length"),
 }
-UNITS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1000.0}
+UNITS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1000.0, "d": 86_400_000.0}
 ENDINGS = {".parquet": "parquet", ".jsonl": "json", ".ndjson": "json", ".json": "json"}
 """Formats by the ending of a file; any other is a table of text, ``csv``."""
 
@@ -110,9 +110,14 @@ class ImportPattern:
             value counts as invalid, so that readers repeat the last valid one (default: such rows are left out).
         bits: columns whose characters, joined in this order, are one digit for each channel without its own column,
             such as ``00101100``.
+        between: regular expression of whole lines that separate recordings, such as ``START.*``; ``none``: no line does
+            (default: empty lines, rows of empty cells, comments with #, % or //, and repeated lines of column names).
+        recording_rows: number of rows that are one recording, in files that hold recordings of equal length one after
+            the other (0 or from 2; 0: recordings have any length).
         row_rate_hz: rows for each second, for files without a clock. Rows that are left out take their time, too; 0:
             there is a column of times (from 0).
-        time_unit: unit of times; ``iso`` for dates (default: by the name of the column, else by the rate).
+        time_unit: unit of times; ``iso`` for dates and for times such as ``12:01:02.5``, ``d`` for days, as those of
+            spreadsheets (default: by the name of the column, else by the rate).
         intervals: pattern of the paths of files that label the rows of other files: each of their rows has ``start``
             and ``end`` (or ``duration``), in the unit of the clock or in that of the column's name, and ``label``. A
             file belongs to the samples whose path has the same parts (default: there are none).
@@ -120,6 +125,8 @@ class ImportPattern:
             ``host_ms``, ``interval_ms`` (ms to the next row, in place of a time), and ``start``, ``end`` and
             ``duration`` of intervals: its name, ``x#2`` for the second column ``x``, ``#3`` for the third column,
             ``a.b`` for a value within a JSON object (default: the columns of those names, as for one table).
+        idle: labels in a column that mean that nothing happens, such as ``null``: these rows belong to no recording,
+            but to the stream of the session (default: none; a gesture with ``idle = true`` keeps such recordings).
         aliases: for each label, a list of other spellings of it in the source. Case, ``_`` and spaces never make a
             difference.
     """
@@ -137,10 +144,13 @@ class ImportPattern:
     decimal: Literal[".", ","] = "."
     missing: tuple[str, ...] = ()
     bits: tuple[str, ...] = ()
+    between: str = ""
+    recording_rows: int = 0
     row_rate_hz: float = 0.0
-    time_unit: Literal["", "s", "ms", "us", "ns", "iso"] = ""
+    time_unit: Literal["", "d", "s", "ms", "us", "ns", "iso"] = ""
     intervals: str = ""
     columns: dict[str, str] = field(default_factory=dict)
+    idle: tuple[str, ...] = ()
     aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -153,6 +163,12 @@ class ImportPattern:
         for key in ("skip_before", "skip_after"):
             if getattr(self, key) < 0:
                 yield key, f"{key} is {getattr(self, key)}: accepted are 0 and more lines."
+        if self.recording_rows < 0 or self.recording_rows == 1:
+            yield "recording_rows", f"recording_rows is {self.recording_rows}: accepted are 0 and 2 or more rows."
+        try:
+            re.compile(self.between)
+        except re.error as cause:
+            yield "between", f"between is '{self.between}', an expression that is not valid: {cause}."
         if self.row_rate_hz < 0:
             yield "row_rate_hz", f"row_rate_hz is {self.row_rate_hz:g}: accepted is a number above 0."
         if self.row_rate_hz and (self.time_unit or {"time", INTERVAL} & set(self.columns)):
@@ -203,6 +219,10 @@ class ImportPattern:
     def label_of(self, text: str) -> str:
         """Return the label of which ``text`` is a spelling; other labels stay as they are."""
         return self._spellings.get(text) or self._spellings.get(plain_label(text), text)
+
+    def names_gesture(self, label: str) -> bool:
+        """Return whether ``label`` names a gesture, not idle time."""
+        return bool(plain_label(label)) and plain_label(label) not in map(plain_label, self.idle)
 
     @functools.cached_property
     def _spellings(self) -> dict[str, str]:

@@ -8,12 +8,13 @@ from __future__ import annotations
 import contextlib
 import csv
 import itertools
+import re
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from math import isfinite
+from math import inf, isfinite, isnan
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -27,6 +28,10 @@ from plushsense.dataset.importing.pattern import INTERVAL, PARTS, ROLES, UNITS, 
 
 _NOT_A_NUMBER, _MISSING = float("nan"), float("inf")
 _SEPARATORS = ",;\t"
+# Beginnings of lines that are no rows, but comments and rulers between recordings.
+_COMMENTS = ("#", "%", "//", "--", "==", "**")
+# Time between two blocks of rows, of which nothing is known without a clock.
+_APART_MS = 10_000.0
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,9 @@ class ImportedColumns:
         lines: line of the file of each row, from 1; empty if the format has no lines.
         in_ms: whether the times were dates and are milliseconds now.
         own_recordings: whether the file tells recordings apart itself, as by objects that hold whole recordings.
+        row_numbers: number of each row, from 0, with those that are left out; empty if no row is left out.
+        blocks: number of the block of each row, from 0: lines between recordings separate blocks; empty for one block.
+        text_lines: number of malformed rows that hold text only.
     """
 
     names: dict[str, str]
@@ -54,6 +62,37 @@ class ImportedColumns:
     lines: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     in_ms: bool = False
     own_recordings: bool = False
+    row_numbers: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    blocks: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    text_lines: int = 0
+
+    @property
+    def block_of_row(self) -> NDArray[np.int64]:
+        """Number of the block of each row (T,)."""
+        return self.blocks if len(self.blocks) else np.zeros(len(self.numbers["time"]), dtype=np.int64)
+
+    @property
+    def number_of_row(self) -> NDArray[np.int64]:
+        """Number of each row (T,), with those that are left out."""
+        return self.row_numbers if len(self.row_numbers) else np.arange(len(self.numbers["time"]), dtype=np.int64)
+
+
+_TIME_OF_DAY = re.compile(r"(?:(\d+):)?(\d+):(\d+(?:[.,]\d+)?)")
+
+
+def date_ms(text: str) -> float:
+    """Return the milliseconds of a date in ISO form, in UTC if it names no zone, or of a time; NaN if ``text`` is none.
+
+    Times are ``12:01:02.5`` and, as spreadsheets show them, minutes and seconds with decimals: ``01:02.5``.
+    """
+    text = text.strip()
+    with contextlib.suppress(ValueError):
+        found = datetime.fromisoformat(text)
+        return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp() * 1000.0
+    time = _TIME_OF_DAY.fullmatch(text)
+    if time is None or (time[1] is None and time[3].isdecimal()):
+        return _NOT_A_NUMBER
+    return 1000.0 * (3600.0 * int(time[1] or 0) + 60.0 * int(time[2]) + float(time[3].replace(",", ".")))
 
 
 @dataclass(frozen=True)
@@ -148,7 +187,7 @@ class TableFile:
     def parser(self, role: str) -> Callable[[str], float]:
         """Return the function that reads the number in a cell: NaN if it holds none, infinite for a missing-value word.
 
-        Dates in a column of times become milliseconds, in UTC if they name no zone.
+        Dates in a column of times become milliseconds, see `date_ms`.
         """
         missing, comma = self.pattern.missing, self.pattern.decimal == ","
 
@@ -165,11 +204,8 @@ class TableFile:
             return value if isfinite(value) and "_" not in text else _NOT_A_NUMBER
 
         def date(text: str) -> float:
-            try:
-                found = datetime.fromisoformat(text.strip())
-            except ValueError:
-                return number(text)
-            return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp() * 1000.0
+            found = date_ms(text)
+            return number(text) if isnan(found) else found
 
         return date if self.pattern.time_unit == "iso" and role in ("time", HOST_MS) else number
 
@@ -191,7 +227,8 @@ class _Rows:
         self.texts: dict[str, list[str]] = {role: [] for role in self.roles if role in PARTS}
         self.numbers = {role: array("d") for role in (*self.roles, *self._by_digit) if role not in PARTS}
         self.lines = array("q")
-        self.malformed, self.first = 0, ""
+        self.malformed, self.first, self.text_lines = 0, "", 0
+        self._between: dict[int, float] = {}
         self.why_malformed = ImportedColumns.why_malformed
         same: dict[str, str] = {}
 
@@ -218,17 +255,22 @@ class _Rows:
         self.lines.append(line)
         return True
 
-    def leave_out(self, line: int, text: str) -> None:
+    def pass_over(self, lines: float) -> None:
+        """Count ``lines`` that are no rows, before the next row; infinitely many always separate recordings."""
+        self._between[len(self.lines)] = self._between.get(len(self.lines), 0) + lines
+
+    def leave_out(self, line: int, text: str, *, is_text: bool = False) -> None:
         self.malformed += 1
+        self.text_lines += is_text
         if not self.first:
             self.first = f"line {line}: '{text.strip()[:60]}'"
 
     def columns(self, row_numbers: Sequence[int], own_recordings: bool = False) -> ImportedColumns:
         """Return the columns; ``row_numbers`` are the numbers of all rows, from which times follow without a clock."""
         numbers = {role: np.array(values, dtype=np.float64) for role, values in self.numbers.items()}
-        rate = self._file.pattern.row_rate_hz
+        rate, blocks = self._file.pattern.row_rate_hz, number_blocks(self._between, len(self.lines))
         if rate:
-            numbers["time"] = np.array(row_numbers, dtype=np.float64) * (1000.0 / rate)
+            numbers["time"] = np.array(row_numbers, dtype=np.float64) * (1000.0 / rate) + blocks * _APART_MS
         return ImportedColumns(
             self.names | ({"time": "row number"} if rate else {}),
             self.texts,
@@ -239,6 +281,9 @@ class _Rows:
             np.array(self.lines, dtype=np.int64),
             bool(rate) or self._file.pattern.time_unit == "iso",
             own_recordings,
+            np.array(row_numbers, dtype=np.int64),
+            blocks,
+            self.text_lines,
         )
 
 
@@ -275,16 +320,20 @@ def read_csv(file: TableFile) -> ImportedColumns:
             for line, row in _numbered(text, begin, separator, skipped):
                 while len(row) > len(there) and not row[-1].strip():
                     row.pop()
+                if is_between(row, there, pattern):
+                    rows.pass_over(inf if row and row[0].strip() else 1)
+                    continue
                 if not row:
                     continue
                 if row[-1].endswith(";"):
                     # Some loggers end each line so.
                     row[-1] = row[-1].rstrip("; ")
-                whole = len(row) == len(there)
+                # Spreadsheets save a line of text as a row with text in its first cell only.
+                whole = len(row) == len(there) and (bool(row[-1] or any(row[1:])) or not (row[0] and is_text(row)))
                 if whole and rows.add(line, [row[k] for k in places], [row[k] for k in bits_at]):
                     numbers.append(row_number)
                 else:
-                    rows.leave_out(line, separator.join(row))
+                    rows.leave_out(line, separator.join(row), is_text=is_text(row))
                 # Rows that are left out have taken their time too.
                 row_number += 1
     except UnicodeError:
@@ -294,6 +343,41 @@ def read_csv(file: TableFile) -> ImportedColumns:
     except csv.Error as cause:
         raise file.error(f"is no CSV table: {cause}", reason="table_damaged", file=file.display_name) from None
     return rows.columns(numbers)
+
+
+def is_between(row: Sequence[str], there: Sequence[str], pattern: ImportPattern) -> bool:
+    """Return whether the cells of a line are no row, but separate recordings; see ``between`` of `ImportPattern`.
+
+    Args:
+        there: the names of the columns.
+    """
+    if pattern.between:
+        return re.fullmatch(pattern.between, (pattern.separator or ",").join(row).strip()) is not None
+    if not row or not row[0].strip():
+        # A row of empty cells may have missing values.
+        return not any(cell.strip() for cell in row) and not (row and "" in pattern.missing)
+    return row[0].lstrip().startswith(_COMMENTS) or row == there
+
+
+def number_blocks(between: Mapping[int, float], rows: int) -> NDArray[np.int64]:
+    """Return the number of the block of each of ``rows`` rows, from 0.
+
+    If every line of a file has two line ends, as after a wrong conversion, there is an empty line between any two rows:
+    a block ends where there are more of them than usual.
+
+    Args:
+        between: number of lines that are no rows before a row; infinite for lines that always end a block.
+    """
+    inside = {row: lines for row, lines in between.items() if 0 < row < rows}
+    usual = float(np.median(list(inside.values()))) if 2 * len(inside) > rows else 0.0
+    begins = np.zeros(rows, dtype=np.int64)
+    begins[[row for row, lines in inside.items() if lines > usual]] = 1
+    return np.cumsum(begins)
+
+
+def is_text(row: Sequence[str]) -> bool:
+    """Return whether no cell begins with a number."""
+    return not any(re.match(r"\s*[-+.,]?\d", cell) for cell in row)
 
 
 def _split(lines: Iterable[str], separator: str) -> Iterator[list[str]]:

@@ -59,6 +59,23 @@ def backward_steps(times: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray
     return back[~late], back[late]
 
 
+_STILL_ROWS = 20
+_FEWEST_ROWS = 5
+
+
+def rows_at_one_time(times: NDArray[np.int64] | NDArray[np.float64]) -> int:
+    """Return how many rows in turn usually have one time (T,), if the clock stands still for so long; else 0.
+
+    A clock stands still if all of at least 5 rows have one time, or the median row shares its time with 20 neighbours.
+    Such times have lost digits, as 1.5E+12 in a spreadsheet or seconds since 1970 in float32, or are one for each
+    recording or second. Packets of some radios have one time for a few rows.
+    """
+    edges = [0, *(np.flatnonzero(times[1:] != times[:-1]) + 1).tolist(), len(times)]
+    lengths = np.diff(edges)
+    usual = int(np.median(np.repeat(lengths, lengths))) if len(times) else 0
+    return usual if usual > _STILL_ROWS or usual == len(times) >= _FEWEST_ROWS else 0
+
+
 def in_order(times: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the indices (T,) that bring rows that came late into the order of their times.
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.quality.findings import CheckLimits, Issue, Severity
-from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, Examination, duration_s
+from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, Examination, duration_s, rows_at_one_time
 
 _FEW = 0.01
 _SPIKE_ROWS = 20
@@ -56,7 +56,8 @@ def never_stopped(s: Examination) -> Iterator[Issue]:
 def too_short(s: Examination) -> Iterator[Issue]:
     rows = len(s.frames)
     seconds = duration_s(s.frames) * rows / max(1, rows - 1)
-    if seconds < s.limits.short_s:
+    # A clock that stands still gives no duration.
+    if seconds < s.limits.short_s and not rows_at_one_time(s.frames.device_ms):
         message = f"holds {_plural(rows, 'row')} ({seconds:.2f} s): too short for a gesture"
         yield Issue(Sentence(message, "too_short", rows=rows, seconds=round(seconds, 3)))
 
@@ -136,6 +137,17 @@ def format_duration(ms: float) -> str:
         if ms < limit_ms:
             return f"{ms / unit_ms:.0f} {unit}"
     return f"{ms / 3_600_000:.0f} h"
+
+
+def clock_still(s: Examination) -> Iterator[Issue]:
+    n, of = rows_at_one_time(s.frames.device_ms), len(s.frames)
+    if n:
+        share = f"all {of} rows have one time" if n == of else f"{n} rows in turn have one time"
+        message = (
+            f"the clock stands still: {share} (were digits lost in a spreadsheet, or as float32? export the times "
+            "again, or give row_rate_hz in a pattern)"
+        )
+        yield Issue(Sentence(message, "clock_still" if n == of else "clock_stalls", n=n))
 
 
 def clock_reset(s: Examination) -> Iterator[Issue]:
