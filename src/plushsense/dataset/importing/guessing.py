@@ -22,6 +22,14 @@ from plushsense.core.files import write_file
 from plushsense.core.gestures import plain_label
 from plushsense.core.recorder_csv import parse_name
 from plushsense.core.toml import loads_json
+from plushsense.dataset.importing.columns import (
+    CODE_NAMES,
+    MOST_CODES,
+    SampledColumn,
+    TableForm,
+    is_number,
+    named_column,
+)
 from plushsense.dataset.importing.counters import CLOCK, COUNTER, Floats, no_reading
 from plushsense.dataset.importing.intervals import interval_columns
 from plushsense.dataset.importing.path_parts import MOST_LABELS, PathParts, guess_paths
@@ -36,7 +44,6 @@ from plushsense.dataset.importing.pattern import (
 )
 from plushsense.dataset.importing.sources import source_files, split_regular_files
 from plushsense.dataset.importing.table_files import (
-    date_ms,
     is_between,
     is_text,
     json_cells,
@@ -56,127 +63,17 @@ _MOST_STEPS = 1e7
 _LEAST_ROWS, _COUNTED = 20, 200
 _IDLE_LABELS = frozenset(("0", "null", "null class", "none", "idle", "nothing", "background", "no gesture", "noise"))
 _LABEL_NAMES = ("label", "gesture", "activity", *LABELS)
-# Numbers with these names are labels; "touch" may be a sensor.
-_CODE_NAMES = ("label", "gesture", "activity", "class", "event", "action")
 _PERSON_NAMES = ("subject", "participant", "person", "user", "child", "who")
 # acc_x, x_acc, accX, aX, Accelerometer_x, and x, y, z alone; not accuracy.
 _ACCELERATION = re.compile(r"(?<![a-z])(acc(?!u)|accel|a_?[xyz](?![a-z]))|acc(el)?_?[xyz]?$|^[xyz](_\d+)?$")
 _NO_CHANNEL = re.compile(r"(index|row|frame|sample|no|nr|id|count_?er|unnamed.*|#)?", re.IGNORECASE)
 # The share of its rows that a recording of the GestureRecorder keeps when it is cut is above 1 / this.
 _MOST_CUT = 20
-# Labels as numbers: at most so many whole numbers, which change in a smaller share of the rows than this.
-_MOST_CODES, _SELDOM = 30, 0.05
 _TAKE = re.compile(r"(^|_)(id|sample|take|trial|rep|repetition|recording|segment|window|block|session)", re.IGNORECASE)
 # Files of micro:bit CreateAI name no rate; older ones write ID, newer ones id.
 _MICROBIT_HZ = {"recordings.ID": 40.0, "recordings.id": 50.0}
 # Objects around channels in JSON that say nothing about them.
 _AROUND = re.compile(r"^((recordings|payload|data|sensors|values|samples)\.(?!\d+$))+")
-
-
-@dataclass
-class _Column:
-    """A column of the samples: its ``key`` for the pattern, and its cells in each file or recording."""
-
-    name: str
-    key: str
-    parts: list[list[str]]
-    decimal: str = "."
-    of_recording: bool = False
-    """Whether there is one cell for each recording, beside columns with many."""
-    numbers: list[Floats] = field(default_factory=list)
-    """The number in each cell of each part, NaN where there is none."""
-    words: Counter[str] = field(default_factory=Counter)
-
-    def __post_init__(self) -> None:
-        for cells in self.parts:
-            numbers = np.full(len(cells), np.nan)
-            for k, cell in enumerate(cells):
-                text = cell.strip().replace(",", ".") if self.decimal == "," else cell.strip()
-                if _is_number(text) and "," not in text:
-                    numbers[k] = float(text)
-                elif text:
-                    self.words[text] += 1
-            self.numbers.append(numbers)
-
-    @property
-    def cells(self) -> list[str]:
-        return [cell for cells in self.parts for cell in cells]
-
-    @property
-    def values(self) -> Floats:
-        """The numbers of all parts."""
-        joined: Floats = np.concatenate([*self.numbers, np.empty(0)])
-        return joined[np.isfinite(joined)]
-
-    @property
-    def is_numeric(self) -> bool:
-        words, numbers = sum(self.words.values()), len(self.values)
-        return numbers > 0.6 * (numbers + words) and len(self.words) <= 3
-
-    @property
-    def is_bits(self) -> bool:
-        cells = {cell.strip() for cell in self.cells}
-        same = len({len(cell) for cell in cells}) == 1 and max(map(len, cells)) > 1
-        digits = same and all(re.fullmatch("[01]+", cell) for cell in cells)
-        return digits and any(cell[0] == "0" for cell in cells) and len(cells) > 1 and not self.of_recording
-
-    @property
-    def is_date(self) -> bool:
-        return len(self.words) > 3 and self.holds_dates
-
-    @property
-    def holds_dates(self) -> bool:
-        return not any(map(math.isnan, map(date_ms, self.words)))
-
-    @property
-    def moments(self) -> list[Floats]:
-        """The times in each part: numbers, or the seconds of dates."""
-        if not self.words or not self.holds_dates:
-            return self.numbers
-        return [np.array([date_ms(cell) / 1000.0 for cell in cells]) for cells in self.parts]
-
-    @property
-    def times(self) -> Floats:
-        """The times of all parts."""
-        joined: Floats = np.concatenate([*self.moments, np.empty(0)])
-        return joined[np.isfinite(joined)]
-
-    @property
-    def steps(self) -> Floats:
-        """The differences of neighbouring numbers, within each part."""
-        return np.concatenate([*(np.diff(part[np.isfinite(part)]) for part in self.numbers), np.empty(0)])
-
-    @property
-    def rises(self) -> bool:
-        return len(self.steps) > 3 and float(np.mean(self.steps > 0)) > 0.8
-
-    @property
-    def codes(self) -> list[int]:
-        """The values, if they are whole numbers that change rarely, as labels or numbers of takes do; or nothing."""
-        distinct = np.unique(self.values)
-        whole = len(distinct) > 1 and bool(np.all(distinct == np.round(distinct)))
-        cells = set(distinct.tolist()) <= {0.0, 1.0} and not _named([self], _CODE_NAMES)
-        if not whole or cells or not len(self.steps) or self.of_recording:
-            return []
-        seldom = float(np.mean(self.steps != 0)) < _SELDOM
-        return [int(value) for value in distinct] if seldom and (len(distinct) <= _MOST_CODES or self.counts) else []
-
-    @property
-    def counts(self) -> bool:
-        """Whether the numbers go up by one, or stay, as those of takes do."""
-        return bool(np.all(np.isin(self.steps, (0.0, 1.0)))) and len(np.unique(self.values)) > 2
-
-
-@dataclass(frozen=True)
-class _Form:
-    """Form of a table of text: its column names, "" if it has none, and its first row of data.
-
-    ``head`` is the row of names, None without one.
-    """
-
-    names: tuple[str, ...]
-    head: int | None
-    begin: int
 
 
 @dataclass(frozen=True)
@@ -208,12 +105,12 @@ class _PatternDraft:
     rate_hz: float = 0.0
     times: list[Floats] = field(default_factory=list)
     """The time of each row of each file or recording; empty without a clock."""
-    codes: dict[str, _Column] = field(default_factory=dict)
+    codes: dict[str, SampledColumn] = field(default_factory=dict)
     """Columns of whole numbers that change rarely."""
     is_json: bool = False
     width: int = 1
     separator: str = ""
-    form: _Form | None = None
+    form: Form | None = None
     in_blocks: bool = False
     doubts: list[str] = field(default_factory=list)
 
@@ -311,7 +208,7 @@ def _has_rows(path: Path) -> bool:
     """Return whether the first lines of a file hold a row with a number, or a JSON value."""
     with path.open("rb") as file:
         lines = file.read(4096).decode("utf-8-sig", "replace").splitlines()
-    return any(line.lstrip()[:1] in ("{", "[") or any(map(_is_number, re.split(r"[,;\t| ]", line))) for line in lines)
+    return any(line.lstrip()[:1] in ("{", "[") or any(map(is_number, re.split(r"[,;\t| ]", line))) for line in lines)
 
 
 def _text(path: Path, guess: _PatternDraft | None = None, most: int = _MOST_BYTES) -> str:
@@ -352,16 +249,12 @@ def _json_text(path: Path, guess: _PatternDraft) -> str:
     return _text(path, guess, _MOST_JSON + 1)
 
 
-def _is_number(text: str) -> bool:
-    return bool(re.fullmatch(r"\s*[-+]?(\d{1,30}([.,]\d*)?|[.,]\d+)([eE][-+]?\d{1,2})?\s*", text))
-
-
-def _form(rows: list[list[str]], width: int) -> _Form:
+def _form(rows: list[list[str]], width: int) -> TableForm:
     """Find the row of names, and the first row of data, of a table with rows of ``width`` cells."""
-    begin = next((k for k, row in enumerate(rows) if len(row) == width and any(map(_is_number, row))), len(rows))
+    begin = next((k for k, row in enumerate(rows) if len(row) == width and any(map(is_number, row))), len(rows))
     heads = [k for k in range(begin) if len(rows[k]) == width and any(cell.strip() for cell in rows[k])]
     names = tuple(cell.strip() for cell in rows[heads[0]]) if heads else ("",) * width
-    return _Form(names, heads[0] if heads else None, begin)
+    return TableForm(names, heads[0] if heads else None, begin)
 
 
 def _same(names: Sequence[str], others: Sequence[str]) -> bool:
@@ -393,7 +286,7 @@ def _separator(samples: list[list[str]]) -> tuple[int, str]:
     return 1, ""
 
 
-def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[_Column]:
+def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[SampledColumn]:
     """Find separator, lines before and after the names, and the columns of tables of text.
 
     Files with other columns than most rows have are not used: they may be lists of people or labels.
@@ -434,7 +327,9 @@ def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[_Colum
     for k, name in enumerate(names):
         seen[name.casefold()] += 1
         key = f"{name}#{seen[name.casefold()]}" if counts[name.casefold()] > 1 else name or f"#{k + 1}"
-        columns.append(_Column(name, key, [[row[k] for row in rows] for rows in data], guess.keys.get("decimal", ".")))
+        columns.append(
+            SampledColumn(name, key, [[row[k] for row in rows] for rows in data], guess.keys.get("decimal", "."))
+        )
     return columns
 
 
@@ -450,7 +345,7 @@ def _row_blocks(samples: list[list[str]], head: list[str], guess: _PatternDraft)
             elif rows and _is_marker(row):
                 markers[row[0].strip()] += 1
             else:
-                rows += len(row) == guess.width and any(map(_is_number, row))
+                rows += len(row) == guess.width and any(map(is_number, row))
         blocks = max(blocks, int(number_blocks(between, rows).max(initial=0)) + 1)
     if blocks > 1:
         guess.doubts.append(
@@ -479,7 +374,7 @@ def _equal_recordings(files: Sequence[Path], guess: _PatternDraft) -> None:
     for file in files[:_COUNTED]:
         with file.open("rb") as opened:
             cells = (line.split(separator, 1)[0].decode("latin-1") for line in opened if line.strip())
-            counts.add(sum(map(_is_number, cells)))
+            counts.add(sum(map(is_number, cells)))
     common = math.gcd(*counts)
     if common >= _LEAST_ROWS and len(counts) > 1:
         listed = ", ".join(str(n) for n in sorted(counts)[:4]) + (", …" if len(counts) > 4 else "")
@@ -497,7 +392,7 @@ def _cells(lines: Iterable[str], separator: str) -> Iterable[list[str]]:
     return csv.reader((line for line in lines if line.strip()), delimiter=separator)
 
 
-def _json_columns(samples: list[str], guess: _PatternDraft) -> list[_Column]:
+def _json_columns(samples: list[str], guess: _PatternDraft) -> list[SampledColumn]:
     """Return the values of JSON objects as columns, by their path within an object."""
     cells: dict[str, list[list[str]]] = {}
     lists: set[str] = set()
@@ -512,7 +407,9 @@ def _json_columns(samples: list[str], guess: _PatternDraft) -> list[_Column]:
     if recordings > objects:
         guess.doubts.append(f"lists within objects are taken for recordings: {recordings} in {objects} objects")
     guess.rate_hz = next((rate for key, rate in _MICROBIT_HZ.items() if any(_ends(k, key) for k in cells)), 0.0)
-    return [_Column(key, key, parts, of_recording=bool(lists) and key not in lists) for key, parts in cells.items()]
+    return [
+        SampledColumn(key, key, parts, of_recording=bool(lists) and key not in lists) for key, parts in cells.items()
+    ]
 
 
 def _ends(key: str, end: str) -> bool:
@@ -520,19 +417,11 @@ def _ends(key: str, end: str) -> bool:
     return key == end or key.endswith(f".{end}")
 
 
-def _named(columns: Sequence[_Column], names: Iterable[str]) -> _Column | None:
-    """Return the first column whose name is, or else contains, one of ``names``."""
-    known = tuple(names)
-    plain = [(c, c.name.strip().casefold()) for c in columns]
-    exact = next((c for c, name in plain if {name, *name.split(".")} & set(known)), None)
-    return exact or next((c for c, name in plain if any(k in name for k in known if len(k) > 3)), None)
-
-
-def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
+def _roles(columns: list[SampledColumn], guess: _PatternDraft) -> None:
     """Decide which columns are time, person, label and channels."""
     left = list(columns)
 
-    def take(role: str, column: _Column | None) -> _Column | None:
+    def take(role: str, column: SampledColumn | None) -> SampledColumn | None:
         if column is not None:
             left.remove(column)
             guess.taken.add(role)
@@ -548,7 +437,9 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
         guess.doubts.append(f"{n} binary channels are named cell1 to cell{n}: give them the names of the cells")
     dates = next((c for c in left if c.is_date and not c.of_recording), None)
     numeric = [c for c in left if c.is_numeric and not c.of_recording]
-    time = dates or _named(numeric, (*ROLES["time"], "time", "stamp")) or next(filter(_may_be_clock, numeric), None)
+    time = (
+        dates or named_column(numeric, (*ROLES["time"], "time", "stamp")) or next(filter(_may_be_clock, numeric), None)
+    )
     time = _readable_clock(time, left, guess)
     interval = next((c for c in left if c.of_recording and c.is_numeric and _ends(c.key, INTERVAL)), None)
     if time is None and interval is not None and min(interval.values) > 0:
@@ -558,7 +449,7 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
         _clock(take("time", time), guess)
     guess.times = time.moments if time is not None else []
     texts = [c for c in left if not c.is_numeric and c.words and not c.is_date]
-    take("subject", _named([*texts, *left], (*ROLES["subject"], *_PERSON_NAMES)) if len(columns) > 1 else None)
+    take("subject", named_column([*texts, *left], (*ROLES["subject"], *_PERSON_NAMES)) if len(columns) > 1 else None)
     texts = [c for c in texts if c in left]
     for role in ("session", "recording"):
         take(role, next((c for c in left if c.name.casefold() in ROLES[role]), None))
@@ -582,10 +473,12 @@ def _roles(columns: list[_Column], guess: _PatternDraft) -> None:
     _vectors(guess)
 
 
-def _readable_clock(time: _Column | None, left: list[_Column], guess: _PatternDraft) -> _Column | None:
+def _readable_clock(
+    time: SampledColumn | None, left: list[SampledColumn], guess: _PatternDraft
+) -> SampledColumn | None:
     """Return the clock, or a column of few dates without one; None with a doubt if it stands still or is unreadable."""
     words = [c for c in left if not c.is_numeric and c.words and not c.of_recording]
-    unread = _named(words, (*ROLES["time"], "time", "stamp"))
+    unread = named_column(words, (*ROLES["time"], "time", "stamp"))
     if time is None and unread is not None and unread.holds_dates:
         time = unread
     if time is not None and (still := rows_at_one_time(time.times)):
@@ -604,21 +497,21 @@ def _readable_clock(time: _Column | None, left: list[_Column], guess: _PatternDr
     return time
 
 
-def _with_times(column: _Column, times: list[Floats]) -> list[tuple[Floats, Floats]]:
+def _with_times(column: SampledColumn, times: list[Floats]) -> list[tuple[Floats, Floats]]:
     """Return the numbers of a column in each file or recording, and their times, or the numbers of the rows."""
     fits = [len(a) for a in column.numbers] == [len(b) for b in times]
     return list(zip(column.numbers, times if fits else [np.arange(float(len(a))) for a in column.numbers], strict=True))
 
 
-def _may_be_clock(column: _Column) -> bool:
+def _may_be_clock(column: SampledColumn) -> bool:
     """Return whether a column rises, and does not only count the rows."""
     return column.rises and no_reading(_with_times(column, [])) != COUNTER
 
 
-def _label(texts: list[_Column], left: list[_Column], guess: _PatternDraft) -> _Column | None:
+def _label(texts: list[SampledColumn], left: list[SampledColumn], guess: _PatternDraft) -> SampledColumn | None:
     """Return the column of labels: by its name, or else the first one of few texts, a ``name`` before others."""
-    label = _named(texts, (*ROLES["label"], *_LABEL_NAMES))
-    numbers = next((c for c in left if c.name.strip().casefold() in _CODE_NAMES and c.codes), None)
+    label = named_column(texts, (*ROLES["label"], *_LABEL_NAMES))
+    numbers = next((c for c in left if c.name.strip().casefold() in CODE_NAMES and c.codes), None)
     if label is None and numbers is not None:
         guess.labels = Counter(map(str, numbers.codes))
         guess.doubts.append(f"the labels in '{numbers.key}' are numbers: give them their names in [aliases]")
@@ -644,8 +537,8 @@ def _codes(parts: PathParts, guess: _PatternDraft) -> None:
     """Take whole numbers that change rarely for the label or the take, if there is no other; list the others."""
     labelled = bool(guess.labels) or "intervals" in guess.keys
     takes = [c for c in guess.codes.values() if c.counts and (labelled or _TAKE.search(c.name))]
-    may_be = [c for c in guess.codes.values() if c not in takes and len(c.codes) <= _MOST_CODES]
-    for column in sorted(guess.codes.values(), key=lambda c: not _named([c], _CODE_NAMES)):
+    may_be = [c for c in guess.codes.values() if c not in takes and len(c.codes) <= MOST_CODES]
+    for column in sorted(guess.codes.values(), key=lambda c: not named_column([c], CODE_NAMES)):
         values = ", ".join(map(str, column.codes[:6]))
         seen = f"the column '{column.key}' has whole numbers that change rarely ({values}), so that it is"
         if column in may_be and not labelled:
@@ -732,7 +625,7 @@ def _exclude(without: list[Path], samples: list[Path], guess: _PatternDraft) -> 
     guess.doubts.append(f"files without such rows are left out: {listed}")
 
 
-def _clock(time: _Column | None, guess: _PatternDraft) -> None:
+def _clock(time: SampledColumn | None, guess: _PatternDraft) -> None:
     """Find the unit of the times, and the rate."""
     if time is None:
         guess.doubts.append(
@@ -762,7 +655,7 @@ def _channel(name: str, kind: str, **more: Any) -> dict[str, Any]:
     return {"name": name, "unit": "", "kind": kind, **more}
 
 
-def _measured(column: _Column, guess: _PatternDraft) -> dict[str, Any]:
+def _measured(column: SampledColumn, guess: _PatternDraft) -> dict[str, Any]:
     """Return the channel of a column of numbers: its kind, and a step that keeps its decimals."""
     key = _AROUND.sub("", column.key) if guess.is_json else column.key
     name = re.sub(r"\W+", "_", key.casefold()).strip("_") or f"channel{len(guess.channels) + 1}"
@@ -770,7 +663,7 @@ def _measured(column: _Column, guess: _PatternDraft) -> dict[str, Any]:
         guess.columns[name] = column.key
     values = column.values
     texts = [cell.strip().replace(",", ".") for cell in column.cells]
-    digits = min(6, max((len(t.partition(".")[2]) for t in texts if _is_number(t) and "e" not in t.lower()), default=0))
+    digits = min(6, max((len(t.partition(".")[2]) for t in texts if is_number(t) and "e" not in t.lower()), default=0))
     is_acceleration = _ACCELERATION.search(name) is not None
     if set(values.tolist()) <= {0.0, 1.0} and not digits and not is_acceleration:
         return _channel(name, "binary", valid_min=0, valid_max=1)
