@@ -110,7 +110,7 @@ class _PatternDraft:
     is_json: bool = False
     width: int = 1
     separator: str = ""
-    form: Form | None = None
+    form: TableForm | None = None
     in_blocks: bool = False
     doubts: list[str] = field(default_factory=list)
 
