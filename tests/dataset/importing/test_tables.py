@@ -27,7 +27,7 @@ def table(path: Path, rows: list[str], header: str = "subject,session,label,time
 
 
 def rows(subject: str, label: str, start: int, count: int, session: str = "1") -> list[str]:
-    return [f"{subject},{session},{label},{(start + i) * 10},{i},{i + 1},{-i}" for i in range(count)]
+    return [f"{subject},{session},{label},{(start + i) * 10},{i % 7},{i % 7 + 1},{-(i % 7)}" for i in range(count)]
 
 
 def got(done: ImportSummary) -> list[tuple[str, str, str, int]]:

@@ -22,12 +22,15 @@ from plushsense.core.sentences import Sentence, plural
 from plushsense.dataset.importing.adding import add_to_dataset
 from plushsense.dataset.importing.archives import UnpackLimits, unpack
 from plushsense.dataset.importing.build import (
+    PATTERN,
     WINDOWS,
     ImportSummary,
     create_dataset,
     folder_name,
     group_flags,
 )
+from plushsense.dataset.importing.counters import counters_note
+from plushsense.dataset.importing.intervals import read_intervals
 from plushsense.dataset.importing.pattern import ImportPattern, check_roles, read_pattern
 from plushsense.dataset.importing.preview import ImportPreview, preview
 from plushsense.dataset.importing.proposals import (
@@ -61,6 +64,7 @@ from plushsense.dataset.importing.xdf import ENDINGS, is_xdf, person_and_session
 from plushsense.dataset.index import rebuild_index
 from plushsense.dataset.store import (
     HEAD,
+    UNKNOWN_SUBJECT,
     DatasetHead,
     Generation,
     Progress,
@@ -68,8 +72,14 @@ from plushsense.dataset.store import (
 )
 
 FOLDER = "folder"
-PATTERN = "pattern"
 SHOWN = 5
+# Recordings in which channels that are no readings are looked for.
+_SAMPLED = 40
+NO_PEOPLE_OF_PATTERN = Sentence(
+    "the pattern finds no person, so the people are not known, and splits by subject are not possible: put {subject} "
+    "into paths, give its column, or import again with --subjects map.csv (columns file,subject)",
+    reason="people_unknown",
+)
 
 
 @dataclass(frozen=True)
@@ -203,7 +213,8 @@ def scan_pattern(source: Path, options: ImportOptions, *, around: Path | None = 
     search.found += [replace(f, origin=printable_path(f.source.relative_to(base))) for f in refused]
     tables = TableImport(options.new_folder("converted"), layout, pattern)
     remarks: list[tuple[str, str]] = []
-    for file in files:
+    of_labels = _add_intervals(base, files, pattern, tables, search)
+    for file in (f for f in files if f not in of_labels):
         relative = file.relative_to(base).as_posix()
         name = printable_path(file.relative_to(base))
         place = pattern.match(relative)
@@ -214,7 +225,7 @@ def scan_pattern(source: Path, options: ImportOptions, *, around: Path | None = 
             )
             search.found.append(SourceFile(file, LEFT_OUT, origin=name, reason=reason))
             continue
-        person = options.person or None
+        person = options.person or (UNKNOWN_SUBJECT if options.person is None else None)
         if options.mapping is not None:
             person = options.mapping.get(relative, options.mapping.get(file.name))
         try:
@@ -227,7 +238,29 @@ def scan_pattern(source: Path, options: ImportOptions, *, around: Path | None = 
             search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
     search.found += tables.origins()
     search.notes += group_flags(remarks, "files")
+    if any(f.subject == UNKNOWN_SUBJECT for f in search.found):
+        search.notes.append(NO_PEOPLE_OF_PATTERN)
     return search
+
+
+def _add_intervals(
+    base: Path, files: Iterable[Path], pattern: ImportPattern, tables: TableImport, search: SourceScan
+) -> set[Path]:
+    """Read the files of intervals that the pattern describes; return their paths."""
+    found: set[Path] = set()
+    for file in files:
+        place = pattern.interval_place(file.relative_to(base).as_posix())
+        if place is None:
+            continue
+        found.add(file)
+        name = printable_path(file.relative_to(base))
+        try:
+            tables.intervals.append(read_intervals(file, name, pattern, place))
+        except FileFormatError as cause:
+            search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
+        else:
+            search.found.append(SourceFile(file, LEFT_OUT, origin=name, reason="its intervals label other files"))
+    return found
 
 
 def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
@@ -384,11 +417,14 @@ _OF_ADDED = (SELF_CALIBRATION, "valid_min", "valid_max")
 def propose(done: ImportSummary, adopting: bool = False, added: bool = False) -> None:
     """Measure the data set of an import; add what fits it better to the summary, and if ``adopting`` to its layout.
 
-    A layout adopts only what is proven, and a note says what that was.
+    A layout adopts only what is proven, and a note says what that was. Warn of channels that are no readings.
 
     If recordings were ``added``, only failed readings and sensors that differ are proposed on: the layout has been
     chosen.
     """
+    used = done.dataset.used
+    some = used[:: max(1, len(used) // _SAMPLED)][:_SAMPLED]
+    done.notes += counters_note(done.dataset.layout, [done.dataset.read(recording) for recording in some])
     sensors = find_sensors(done.dataset)
     done.sensors = [sensor.to_dict() for sensor in sensors]
     found = [p for p in propose_settings(done.dataset, sensors) if not added or p.key in _OF_ADDED]

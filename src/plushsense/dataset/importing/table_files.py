@@ -10,8 +10,9 @@ import csv
 import itertools
 import re
 from array import array
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from math import inf, isfinite, isnan
 from pathlib import Path
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import FileFormatError, need
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, Layout
 from plushsense.core.toml import loads_json
-from plushsense.dataset.importing.pattern import PARTS, ROLES, UNITS, ImportPattern
+from plushsense.dataset.importing.pattern import INTERVAL, PARTS, ROLES, UNITS, ImportPattern
 
 _NOT_A_NUMBER, _MISSING = float("nan"), float("inf")
 _SEPARATORS = ",;\t"
@@ -129,7 +130,10 @@ class TableFile:
         for key, role in ((DEVICE_MS, "time"), (HOST_MS, HOST_MS)):
             candidates[role] = (*candidates[role], headers.get(key, key))
         needed = {"label", "time", *layout.names} - set(self.place or ())
-        if self.pattern.row_rate_hz:
+        if self.pattern.intervals:
+            needed -= {"label"}
+            del candidates["label"]
+        if self.pattern.row_rate_hz or INTERVAL in given:
             needed -= {"time"}
             del candidates["time"]
         chosen: dict[str, int] = {}
@@ -407,25 +411,25 @@ def read_json(file: TableFile) -> ImportedColumns:
         text = path.read_text(encoding=file.pattern.text_encoding)
     except UnicodeError:
         raise file.error("is not UTF-8: save it as UTF-8", reason="table_not_utf8", file=file.display_name) from None
-    objects = list(_objects(text))
-    first = next((item for _, item in objects if isinstance(item, dict)), None)
-    if first is None:
-        raise file.error("holds no JSON object: accepted is one object a line, or a list of objects")
     try:
+        objects = one_recording_each(json_objects(text))
+        first = next((item for _, item in objects if isinstance(item, dict)), None)
         there = list(dict.fromkeys(_paths(first)))
     except RecursionError:
         raise file.error("holds JSON objects that are nested too deeply") from None
+    if first is None:
+        raise file.error("holds no JSON object: accepted is one object a line, or a list of objects")
     at = file.choose_columns(there)
     for name in file.pattern.bits:
         _bit_column(file, name, there)
     paths = [there[k].split(".") for k in at.values()]
     in_objects = _length([_value(first, path) for path in paths]) is not None
-    # An object that holds a whole recording tells it apart from others by its line.
+    # An object that holds a whole recording tells it apart from others by its number.
     numbered = ("recording",) if in_objects and "recording" not in at else ()
     rows = _Rows(file, at, there, numbered)
     rows.why_malformed = "without a JSON object whose lists have one length"
     numbers, row_number, lists = array("q"), 0, False
-    for line, item in objects:
+    for number, (line, item) in enumerate(objects):
         values = [_value(item, path) for path in paths] if isinstance(item, dict) else []
         bits = [_value(item, name.split(".")) for name in file.pattern.bits]
         length = _length([*values, *bits]) if isinstance(item, dict) else -1
@@ -435,7 +439,7 @@ def read_json(file: TableFile) -> ImportedColumns:
             row_number += 1
             continue
         for k in range(1 if length is None else length):
-            cells = [_cell(value, k) for value in values] + [str(line) for _ in numbered]
+            cells = [_cell(value, k) for value in values] + [str(number) for _ in numbered]
             if rows.add(line, cells, [_cell(b, k) for b in bits]):
                 numbers.append(row_number)
             else:
@@ -444,8 +448,12 @@ def read_json(file: TableFile) -> ImportedColumns:
     return rows.columns(numbers, own_recordings=lists)
 
 
+def json_objects(text: str) -> list[tuple[int, Any]]:
+    """Return the line, from 1 (in a list the number of the item), and the value of each object; a text if damaged."""
+    return list(_objects(text))
+
+
 def _objects(text: str) -> Iterator[tuple[int, Any]]:
-    """Yield the line, from 1 (in a list the number of the item), and the value of each object; a text if damaged."""
     if text.lstrip()[:1] == "[":
         try:
             yield from enumerate(loads_json(text), 1)
@@ -468,18 +476,101 @@ def _objects(text: str) -> Iterator[tuple[int, Any]]:
         yield line, value
 
 
-def json_cells(text: str) -> dict[str, tuple[list[str], bool]]:
-    """Return the cells of each value in JSON objects by its path, and whether an object has a list of them."""
-    found: dict[str, tuple[list[str], bool]] = {}
-    for _, item in _objects(text):
-        for path in dict.fromkeys(_paths(item)) if isinstance(item, dict) else ():
-            value = _value(item, path.split("."))
+# Lists of so many values are series of samples; shorter ones are rather the axes of one sample.
+_SERIES = 8
+
+
+def one_recording_each(objects: list[tuple[int, Any]]) -> list[tuple[int, Any]]:
+    """Replace objects with lists of recordings by one object for each recording, with the values around it.
+
+    micro:bit CreateAI nests them so: ``{"name": …, "recordings": [{"data": {"x": […], …}}, …]}``. Sensors that a list
+    names beside rows of values, as in the data acquisition format of Edge Impulse, become ``sensors.NAME``.
+    """
+    found = {k: item for k, (_, item) in enumerate(objects) if isinstance(item, dict)}
+    for key in dict.fromkeys(key for item in found.values() for key in item):
+        held = {k: item[key] for k, item in found.items() if key in item}
+        listed = any(map(_are_recordings, held.values()))
+        lists = {k: value for k, value in held.items() if listed and isinstance(value, list)}
+        inner = [(k, value) for k, value in held.items() if isinstance(value, dict)]
+        inner += [(k, one) for k, value in lists.items() for one in value]
+        outer = one_recording_each(inner) if inner else []
+        if listed or any(one is not held[k] for k, one in outer):
+            others = [item for k, item in enumerate(objects) if k not in {*lists, *(k for k, _ in inner)}]
+            return others + [(objects[k][0], {**found[k], key: one}) for k, one in outer]
+    return [(line, _by_sensor(item)) for line, item in objects]
+
+
+def _are_recordings(value: Any) -> bool:
+    """Return whether a JSON value is a list of objects with series of samples, and not of single samples."""
+    if not isinstance(value, list) or not value or not all(isinstance(inner, dict) for inner in value):
+        return False
+    if any(_are_recordings(held) for inner in value for held in inner.values()):
+        return True
+    series = [list(_lengths(inner)) for inner in value]
+    longest = {max(lengths, default=0) for lengths in series}
+    # Samples of many cells have one length; a recording has several channels, or another length than the next.
+    several = any(sum(n == max(lengths) for n in lengths) > 1 for lengths in series if lengths)
+    return max(longest) >= _SERIES and (several or len(longest) > 1)
+
+
+def _lengths(item: Any) -> Iterator[int]:
+    """Yield the lengths of the lists in a JSON object, also of objects within it."""
+    for value in item.values() if isinstance(item, dict) else ():
+        if isinstance(value, list):
+            yield len(value)
+        else:
+            yield from _lengths(value)
+
+
+def _by_sensor(item: Any) -> Any:
+    """Return an object whose list ``sensors`` names the columns of ``values`` with the series of each sensor."""
+    if not isinstance(item, dict):
+        return item
+    sensors, values = item.get("sensors"), item.get("values")
+    if not isinstance(sensors, list) or not isinstance(values, list):
+        return item
+    names = [sensor.get("name") if isinstance(sensor, dict) else None for sensor in sensors]
+    if not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
+        return item
+    rows = [row if isinstance(row, list) else [row] for row in values]
+    if not names or any(len(row) != len(names) for row in rows):
+        return item
+    return {**item, "sensors": {name: [row[k] for row in rows] for k, name in enumerate(names)}}
+
+
+def json_cells(objects: Iterable[tuple[int, Any]]) -> dict[str, tuple[list[list[str]], bool]]:
+    """Return the cells of each value in JSON objects by its path, and whether an object has a list of them.
+
+    The cells of each list are apart; those of single values are together.
+    """
+    found: dict[str, tuple[list[list[str]], bool]] = {}
+    for _, item in objects:
+        values = {path: _value(item, path.split(".")) for path in _paths(item)} if isinstance(item, dict) else {}
+        rows: Counter[int] = Counter()
+        for value in values.values():
+            if isinstance(value, list) and not any(isinstance(cell, list | dict) for cell in value):
+                rows[len(value)] += len(value)
+        # A list of another length than the series describes something else.
+        length = max(rows, key=lambda n: (rows[n], n), default=0)
+        for path, value in values.items():
             in_list = isinstance(value, list)
             cells = value if in_list else [value]
-            if not any(isinstance(cell, list | dict) for cell in cells):
-                found.setdefault(path, ([], in_list))[0].extend(_cell(cell, 0) for cell in cells)
-    # The items of a list of plain values are its cells already.
-    return {path: cells for path, cells in found.items() if path.rpartition(".")[0] not in found}
+            if any(isinstance(cell, list | dict) for cell in cells) or (in_list and len(cells) != length):
+                continue
+            parts, _ = found.setdefault(path, ([], in_list))
+            texts = [_cell(cell, 0) for cell in cells]
+            if in_list or not parts:
+                parts.append(texts)
+            else:
+                parts[0] += texts
+    # The items of a list of plain values are its cells already, and sensors with names need no numbers.
+    lists = {path for path, (_, in_list) in found.items() if in_list}
+    numbered = {path.replace(".sensors.", ".values.").rpartition(".")[0] for path in found if ".sensors." in path}
+    return {
+        path: cells
+        for path, cells in found.items()
+        if path.rpartition(".")[0] not in lists | numbered and path not in numbered
+    }
 
 
 def _paths(item: Any, before: str = "") -> Iterator[str]:
@@ -598,7 +689,12 @@ def read_rows(file: TableFile) -> ImportedColumns:
         FileFormatError: for a table that cannot be read or lacks a column.
         MissingExtraError: for Parquet without polars.
     """
-    return READERS[file.pattern.format_of(file.path)](file)
+    columns = READERS[file.pattern.format_of(file.path)](file)
+    if INTERVAL not in columns.numbers:
+        return columns
+    times = np.cumsum(columns.numbers[INTERVAL])
+    numbers = {**columns.numbers, "time": np.concatenate([[0.0], times[:-1]]) if len(times) else times}
+    return replace(columns, numbers=numbers, names=columns.names | {"time": columns.names[INTERVAL]}, in_ms=True)
 
 
 def forward_steps(times: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -608,15 +704,19 @@ def forward_steps(times: NDArray[np.float64]) -> NDArray[np.float64]:
     return steps[np.isfinite(steps) & (steps > 0)]
 
 
+def unit_in_name(name: str) -> str:
+    """Return the unit of time that the name of a column ends in, as ``t_ms`` and ``t (ms)`` do; "" without one."""
+    plain = name.strip().casefold().rstrip(")")
+    return next((unit for unit in UNITS if plain.endswith((f"_{unit}", f"({unit}", f"[{unit}]"))), "")
+
+
 def unit_of_time(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple[str, bool]:
     """Return the unit of a column of times, and whether its name states it.
 
     Otherwise the unit is the one that agrees best with the layout's rate.
     """
-    plain = name.strip().casefold().rstrip(")")
-    for unit in UNITS:
-        if plain.endswith((f"_{unit}", f"({unit}", f"[{unit}]")):
-            return unit, True
+    if unit := unit_in_name(name):
+        return unit, True
     forward = forward_steps(times[:100_000])
     if not len(forward):
         return "ms", False

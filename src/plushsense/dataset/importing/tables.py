@@ -38,6 +38,7 @@ from plushsense.core.recorder_csv import (
 )
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.files import sha256_of
+from plushsense.dataset.importing.intervals import IntervalFile, label_rows
 from plushsense.dataset.importing.pattern import UNITS, ImportPattern
 from plushsense.dataset.importing.sources import COMPANIONS, SourceFile
 from plushsense.dataset.importing.table_files import ImportedColumns, TableFile, forward_steps, read_rows, unit_of_time
@@ -209,12 +210,14 @@ class _TableSamples:
 class TableImport:
     """Conversion of tables into recordings below the new ``folder``.
 
-    ``person`` is the person of files that name none, None if it is not known.
+    ``person`` is the person of files that name none, None if it is not known. ``intervals`` are the files that label
+    the rows of tables, if the pattern names such files.
     """
 
     folder: Path
     layout: Layout
     pattern: ImportPattern
+    intervals: list[IntervalFile] = field(default_factory=list)
     _taken: dict[tuple[str, str], set[str]] = field(default_factory=dict)
     _origins: dict[tuple[str, str], list[dict[str, Any]]] = field(default_factory=dict)
     _spellings: dict[str, list[str]] = field(default_factory=dict)
@@ -234,6 +237,9 @@ class TableImport:
         table = TableFile(path, display_name, self.layout, self.pattern, place)
         columns = read_rows(table)
         place = place or {}
+        notes: list[Sentence] = []
+        if self.pattern.intervals:
+            columns = self._labelled(table, columns, notes)
         subject = place.get("subject", person)
         if "subject" not in columns.names and subject is None:
             raise table.error(
@@ -241,7 +247,6 @@ class TableImport:
                 "(file,subject)",
                 reason="person_unknown",
             )
-        notes: list[Sentence] = []
         samples = self._samples(table, columns, subject or "", notes)
         yield from notes
         if not len(samples.frames):
@@ -263,6 +268,21 @@ class TableImport:
                 yield about_file(display_name, f"{n} rows put into the order of their times")
                 mine = mine[moved]
             yield from self._write(table, original, samples, mine, apart)
+
+    def _labelled(self, table: TableFile, columns: ImportedColumns, notes: list[Sentence]) -> ImportedColumns:
+        """Label the rows of a table by the file of intervals that belongs to it."""
+        mine = [intervals for intervals in self.intervals if intervals.fits(table.place or {})]
+        if len(mine) != 1:
+            listed = f"several files of intervals ({', '.join(i.name for i in mine[:3])})" if mine else "no such file"
+            raise table.error(
+                f"has its labels in another file, and {listed} belongs to it: intervals in the pattern, now "
+                f"'{self.pattern.intervals}', needs the same parts as paths"
+            )
+        times = columns.numbers["time"]
+        factor, _ = self._factor(columns, times)
+        labelled, found = label_rows(columns, times * factor, mine[0], factor)
+        notes += [about_file(table.display_name, note) for note in found]
+        return labelled
 
     def _samples(
         self, table: TableFile, columns: ImportedColumns, subject: str, notes: list[Sentence]
