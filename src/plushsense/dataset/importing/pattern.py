@@ -113,7 +113,7 @@ class ImportPattern:
         between: regular expression of whole lines that separate recordings, such as ``START.*``; ``none``: no line does
             (default: empty lines, rows of empty cells, comments with #, % or //, and repeated lines of column names).
         recording_rows: number of rows that are one recording, in files that hold recordings of equal length one after
-            the other (0 or from 2; 0: recordings have any length).
+            the other; 1 is refused, 0: recordings have any length (from 0).
         row_rate_hz: rows for each second, for files without a clock. Rows that are left out take their time, too; 0:
             there is a column of times (from 0).
         time_unit: unit of times; ``iso`` for dates and for times such as ``12:01:02.5``, ``d`` for days, as those of
