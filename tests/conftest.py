@@ -293,7 +293,7 @@ def lsl_possible() -> None:
 @pytest.fixture(scope="session")
 def publish_tools() -> None:
     """The validators of a package (extra publish), and scikit-learn (extra baselines)."""
-    for module in ("mlcroissant", "frictionless", "rocrate", "datacite", "sklearn"):
+    for module in ("mlcroissant", "frictionless", "datacite", "sklearn"):
         if importlib.util.find_spec(module) is None:
             missing("publish", f"{module} is not installed")
 

@@ -7,7 +7,8 @@ import sys
 
 import pytest
 
-from plushsense.cli.terminal import KeyRepeatFilter, interrupt_on_signals
+from plushsense.cli.signals import interrupt_on_signals
+from plushsense.cli.terminal import KeyRepeatFilter
 
 
 def pressed(*keys: tuple[float, str]) -> list[str]:
@@ -41,3 +42,23 @@ def test_a_request_to_end_is_an_interrupt_and_only_once(name: str) -> None:
             signal.raise_signal(number)
         signal.raise_signal(number)
     assert signal.getsignal(number) is before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="os.kill ends a program on Windows")
+@pytest.mark.parametrize("own", [True, False])
+def test_a_request_to_end_does_what_ctrl_c_does_here(own: bool) -> None:
+    """A server has its own way to end; in the background of a shell, Ctrl-C is ignored, but not ``kill``."""
+    if signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        pytest.skip("SIGTERM is taken here")
+    asked: list[int] = []
+    before = signal.signal(signal.SIGINT, (lambda number, _: asked.append(number)) if own else signal.SIG_IGN)
+    try:
+        with interrupt_on_signals():
+            if own:
+                signal.raise_signal(signal.SIGTERM)
+            else:
+                with pytest.raises(KeyboardInterrupt):
+                    signal.raise_signal(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert asked == [signal.SIGINT] * own

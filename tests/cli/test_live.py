@@ -96,7 +96,8 @@ def test_over_tcp(plush_bundle: Path, tmp_path: Path) -> None:
 def test_a_toy_of_another_layout_says_which_one_fits(plush_bundle: Path) -> None:
     with toy("--tcp", "0", "--layout", "plush-14") as url:
         lines, summary = live("--device", url, "--model", str(plush_bundle), "--seconds", "1")
-        assert [line["state"] for line in lines] == ["no signal"]
+        assert [line["state"] for line in lines] == ["unreadable"]
+        assert lines[0]["warnings"] == summary["warnings"] == [lines[0]["mismatch"]]
         assert lines[0]["mismatch"].endswith(f"'plush-14' has 14: open it as {url}?layout=plush-14")
         assert (summary["counters"]["frames"], summary["no_signal"]) == (0, 1)
         lines, _ = live("--device", f"{url}?layout=plush-14", "--model", str(plush_bundle), "--seconds", "1")
@@ -186,3 +187,22 @@ def test_events_only_and_text_for_people(plush_bundle: Path, tmp_path: Path) -> 
         [*COMMAND, "live", *words, "--text", "--events"], capture_output=True, text=True, check=False, timeout=60
     )
     assert both.returncode == 2 and "Traceback" not in both.stderr
+
+
+def test_what_was_assumed_about_a_stream_is_said(
+    plush_bundle: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from plushsense.cli.main import main
+    from plushsense.devices import opening
+    from plushsense.devices.base import Device
+
+    open_virtual = opening.open_device
+
+    def open_unnamed(*args: Any, **settings: Any) -> Device:
+        device = open_virtual(*args, **settings)
+        device.notes = ("its channels have no names",)
+        return device
+
+    monkeypatch.setattr(opening, "open_device", open_unnamed)
+    assert main(["live", "--device", "virtual://?speed=0&seconds=1", "--model", str(plush_bundle)]) == 0
+    assert "warning: virtual://?speed=0&seconds=1: its channels have no names" in capsys.readouterr().err

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import LayoutError
-from plushsense.core.layouts import Layout, layout_names, load_layout
+from plushsense.core.layouts import Layout, StreamColumns, layout_names, load_layout
 
 OWN = """
 name = "pad"
@@ -131,20 +131,34 @@ def test_a_range_that_nobody_gave_is_that_of_the_integers(tmp_path: Path) -> Non
 def test_columns_by_label_by_header_and_by_position() -> None:
     plush, accel = load_layout("plush-15"), load_layout("accel-3")
     names, first = plush.names, tuple(range(13))
-    assert plush.match_columns([*reversed(names)], 13) == (tuple(reversed(first)), None)
-    assert plush.match_columns([" Device_MS", "other", *(n.upper() for n in names)], 15) == (tuple(range(2, 15)), 0)
-    assert accel.match_columns(["Arduino Timestamp (ms)", "Z", "Y", "X"], 4) == ((3, 2, 1), 0)
-    assert plush.match_columns([], 13) == plush.match_columns([f"Ch{i}" for i in first], 13) == (first, None)
-    assert plush.match_columns(["?"] * 15, 15) == (first, 13)
-    assert load_layout("plush-14").match_columns([], 14) == (first, None)
-    assert accel.match_columns([], 4) == ((1, 2, 3), 0), "device_ms comes first on this layout's wire"
+
+    def match(layout: Layout, labels: list[str], width: int, exact: bool = True) -> tuple[object, ...]:
+        found = layout.match_columns(labels, width, exact)
+        assert isinstance(found, StreamColumns)
+        return found.channels, found.clock, len(found.notes)
+
+    assert match(plush, [*reversed(names)], 13) == (tuple(reversed(first)), None, 0)
+    headed = [" Device_MS", "other", *(n.upper() for n in names)]
+    assert match(plush, headed, 15) == (tuple(range(2, 15)), 0, 0)
+    assert match(plush, headed, 15, exact=False) == (tuple(range(2, 15)), None, 1)
+    assert match(accel, ["Arduino Timestamp (ms)", "Z", "Y", "X"], 4) == ((3, 2, 1), 0, 0)
+    assert match(plush, [], 13) == match(plush, [f"Ch{i}" for i in first], 13) == (first, None, 1)
+    assert match(plush, ["?"] * 15, 15) == match(plush, [f"Channel {i}" for i in range(15)], 15) == (first, 13, 1)
+    assert match(load_layout("plush-14"), [], 14) == (first, None, 1)
+    assert match(accel, [], 4) == ((1, 2, 3), 0, 1), "device_ms comes first on this layout's wire"
+    found = accel.match_columns(["1", "2", "3"], 3)
+    assert isinstance(found, StreamColumns)
+    assert found.notes[0] == "its channels have no names: its 3 values are taken for x, y, z, in this order"
 
 
 @pytest.mark.parametrize(
     ("labels", "width", "reason"),
     [
         ([], 8, "it has 8 channels, and layout 'accel-3' needs 3, or the 4 of its wire format"),
-        (["Fp1", "Fp2"], 2, "it has 2 channels (Fp1, Fp2), and layout 'accel-3' needs 3"),
+        (["Fp1", "Fp2"], 2, "its 2 channels are Fp1, Fp2, and those of layout 'accel-3' x, y, z"),
+        (["gx", "gy", "gz"], 3, "its 3 channels are gx, gy, gz, and those of layout 'accel-3' x, y, z"),
+        (["device_ms", "gx", "gy", "gz"], 4, "its 4 channels are device_ms, gx, gy, gz, and those of"),
+        (["x", "y", "z"], 4, "its header names 3 channels (x, y, z), and its samples have 4 values"),
         (["x", "y", "q"], 3, "its labels do not name z exactly once"),
         (["x", "y", "z", "x"], 4, "its labels do not name x exactly once"),
     ],

@@ -80,23 +80,25 @@ class XdfStream:
     labels: Sequence[str] = ()
     rate: float = 100.0
     offset: float = 0.0
+    source: str = ""
+    uid: str = ""
 
     @property
     def width(self) -> int:
-        return 1 if self.format == "string" else len(self.samples[0])
+        return len(self.samples[0]) if isinstance(self.samples[0], (list, tuple)) else 1
 
     def header(self) -> str:
         channels = "".join(f"<channel><label>{name}</label></channel>" for name in self.labels)
         return (
             f"<?xml version='1.0'?><info><name>{self.name}</name><type>x</type>"
             f"<channel_count>{self.width}</channel_count><nominal_srate>{self.rate}</nominal_srate>"
-            f"<channel_format>{self.format}</channel_format><desc><channels>{channels}</channels></desc></info>"
+            f"<channel_format>{self.format}</channel_format><source_id>{self.source}</source_id><uid>{self.uid}</uid><desc><channels>{channels}</channels></desc></info>"
         )
 
     def sample(self, row: Any) -> bytes:
         if self.format == "string":
-            text = str(row).encode()
-            return b"\x04" + struct.pack("<I", len(text)) + text
+            texts = [str(text).encode() for text in (row if isinstance(row, (list, tuple)) else [row])]
+            return b"".join(b"\x04" + struct.pack("<I", len(text)) + text for text in texts)
         return np.asarray(row, dtype={"float32": "<f4", "double64": "<f8", "int32": "<i4"}[self.format]).tobytes()
 
 

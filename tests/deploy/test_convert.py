@@ -14,7 +14,7 @@ import pytest
 
 from plushsense.core.errors import ArchError, BadInput, BundleError, ConfigError, MissingExtraError
 from plushsense.core.gestures import load_gestures
-from plushsense.core.layouts import load_layout
+from plushsense.core.layouts import Derived, load_layout
 from plushsense.core.recorder_csv import read_stream
 from plushsense.deploy.convert import ConversionJob, compared, convert, describe, made_up_windows
 from plushsense.deploy.convert import onnx as as_onnx
@@ -25,7 +25,7 @@ from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
 from plushsense.runtime.integer import deployable
-from plushsense.windows.features import Scaler, network_inputs
+from plushsense.windows.features import InputUnits, Scaler, network_inputs
 from support.exports import bundle_of
 
 # symbol, filters, layout, settings: every padding and normalisation, one layer to four, one reflection and several.
@@ -65,6 +65,11 @@ def others(bundle: Bundle, n: int = 20, seed: int = 5) -> np.ndarray[Any, np.dty
     return raw
 
 
+def values(bundle: Bundle, raw: Any) -> Any:
+    """Whole numbers as the values that a file reads, in the units of the layout."""
+    return InputUnits.of(bundle.layout).values(raw)
+
+
 def assert_floats(found: Any, bundle: Bundle, raw: Any) -> None:
     expected = bundle.network().forward(bundle.scaler.apply(raw))
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * max(1.0, np.abs(expected).max()))
@@ -78,7 +83,7 @@ def test_onnx_answers_as_the_network(net: Any, tmp_path: Path, onnx_here: None) 
     assert done.bytes == done.path.stat().st_size and done.path.name == "model.onnx"
     assert done.largest_difference is not None and done.largest_difference < 1e-3
     raw = others(bundle)
-    assert_floats(as_onnx.run_model(done.path.read_bytes(), raw), bundle, raw)
+    assert_floats(as_onnx.run_model(done.path.read_bytes(), values(bundle, raw)), bundle, raw)
     assert [p.name for p in done.path.parent.iterdir()] == ["model.onnx"], "something was left behind"
 
 
@@ -88,7 +93,7 @@ def test_litert_answers_as_the_network(net: Any, tmp_path: Path, litert_here: No
     done = convert(bundle, tmp_path / "model.tflite", "tflite")
     assert done.largest_difference is not None and done.largest_difference < 1e-3
     raw = others(bundle)
-    assert_floats(as_tflite.run_model(done.path.read_bytes(), raw), bundle, raw)
+    assert_floats(as_tflite.run_model(done.path.read_bytes(), values(bundle, raw)), bundle, raw)
 
 
 @pytest.mark.parametrize("net", DEPLOYABLE, ids=str)
@@ -104,7 +109,7 @@ def test_int8_comes_close_to_the_integers(name: str, net: Any, tmp_path: Path, r
     done = convert(bundle, tmp_path / "m", name)
     raw = others(bundle, 60)
     room = as_onnx if name == "onnx-int8" else as_tflite
-    found, expected = room.run_model(done.path.read_bytes(), raw), integer.forward(raw) / 256
+    found, expected = room.run_model(done.path.read_bytes(), values(bundle, raw)), integer.forward(raw) / 256
     assert found is not None
     # A code that rounds the other way moves a logit by little; a wrong scale or shift by much.
     assert np.abs(found - expected).max() < 0.01 * max(1.0, np.abs(expected).max())
@@ -114,12 +119,90 @@ def test_int8_comes_close_to_the_integers(name: str, net: Any, tmp_path: Path, r
     assert done.bytes < len(bundle.to_bytes()) + 6000
 
 
+@pytest.mark.parametrize("level", ["ORT_DISABLE_ALL", "ORT_ENABLE_BASIC", "ORT_ENABLE_EXTENDED", "ORT_ENABLE_ALL"])
+def test_int8_answers_alike_in_the_sessions_that_others_open(level: str, onnx_here: None) -> None:
+    import onnxruntime
+
+    settings = onnxruntime.SessionOptions()
+    settings.graph_optimization_level = getattr(onnxruntime.GraphOptimizationLevel, level)
+    for bundle in (*map(made, DEPLOYABLE), bundle_of("plush-15", "v9_5d2", "4,6")):
+        network, raw = integer_network(bundle), others(bundle, 60)[:-1]
+        model = as_onnx.integer_model(bundle, network)
+        session = onnxruntime.InferenceSession(model, settings, providers=["CPUExecutionProvider"])
+        (found,) = session.run(["logits"], {"raw": values(bundle, raw)})
+        expected = network.forward(raw) / 256
+        assert np.abs(found - expected).max() < 0.01 * max(1.0, np.abs(expected).max()), bundle.arch.title
+
+
+@pytest.mark.parametrize("symbol", ["9d1_5d2", "v9_5d2"])
+def test_8_bit_weights_of_onnx_are_unsigned(symbol: str, onnx_here: None) -> None:
+    """Pairs of uint8 times int8 saturate in 16 bits without VNNI, which a test sees on such processors only."""
+    import onnx
+
+    bundle = bundle_of("plush-15", symbol, "4,6")
+    network = integer_network(bundle)
+    graph = onnx.load_model_from_string(as_onnx.integer_model(bundle, network)).graph
+    constants = {each.name: onnx.numpy_helper.to_array(each) for each in graph.initializer}
+    read = {n.output[0]: [constants.get(name) for name in n.input] for n in graph.node if n.op_type[:3] == "Deq"}
+    layers = [node for node in graph.node if node.op_type in ("Conv", "Gemm") and node.input[1] in read]
+    for node, part in zip(layers, [*network.layers, network.dense], strict=True):
+        codes, _, zeros = read[node.input[1]]
+        assert codes is not None and codes.dtype == np.uint8 and set(zeros.tolist()) == {128}
+        np.testing.assert_array_equal(codes.astype(int) - 128, part.weights)
+
+
+@pytest.mark.parametrize("name", ["onnx", "onnx-int8"])
+@pytest.mark.parametrize("symbol", ["9d1_5d2", "v9_5d2"])
+def test_small_compilers_and_other_evaluators_can_read_the_graph(symbol: str, name: str, onnx_here: None) -> None:
+    import onnx
+
+    bundle = bundle_of("plush-15", symbol, "4,6")
+    job = ConversionJob.of(bundle, None)
+    model = onnx.load_model_from_string((as_onnx.to_onnx if name == "onnx" else as_onnx.to_integer_onnx)(job).data)
+    assert model.opset_import[0].version == 13 and model.ir_version == 7
+    kinds = [node.op_type for node in model.graph.node]
+    assert kinds[kinds.index("GlobalAveragePool") + 1] == "Flatten"
+    assert not {"ReduceMean", "ReduceSumSquare", "BatchNormalization"} & set(kinds)
+    # Of 8-bit codes (N, F, T), OpenVINO 2026.4 has the mean of the first F windows only.
+    before = {node.output[0]: node.op_type for node in model.graph.node}
+    assert before[model.graph.node[kinds.index("GlobalAveragePool")].input[0]] != "DequantizeLinear"
+    # Clip and the scales and zeros of QuantizeLinear take scalars: a shape (1,) is an axis of its own to some readers.
+    rank = {each.name: len(each.dims) for each in model.graph.initializer}
+    scalars = [n.input[1:] for n in model.graph.node if n.op_type in ("Clip", "QuantizeLinear")]
+    assert {rank[part] for parts in scalars for part in parts} <= {0}
+
+
+@pytest.mark.parametrize("net", [n for n in NETS if n[3]], ids=str)
+def test_the_evaluator_of_onnx_gives_the_same_answers(net: Any, onnx_here: None) -> None:
+    from onnx.reference import ReferenceEvaluator
+
+    bundle = made(net)
+    raw = others(bundle, 3)
+    (found,) = ReferenceEvaluator(as_onnx.float_model(bundle)).run(["logits"], {"raw": values(bundle, raw)})
+    assert_floats(found, bundle, raw)
+
+
+def test_onnxruntime_infers_the_shapes_of_vector_networks(onnx_here: None) -> None:
+    """As the first step of its quantization, `quant_pre_process`, does."""
+    pytest.importorskip("sympy")
+    import onnx
+    from onnxruntime.tools.symbolic_shape_infer import SymbolicShapeInference
+
+    bundle = bundle_of("plush-15", "v9_5d2", "4,6")
+    model = onnx.load_model_from_string(as_onnx.float_model(bundle))
+    inferred = SymbolicShapeInference.infer_shapes(model, auto_merge=True)
+    shapes = {each.name: each.type.tensor_type.shape.dim for each in inferred.graph.value_info}
+    assert [d.dim_param or d.dim_value for d in shapes["pooled"]] == ["N", 6]
+
+
 @pytest.mark.parametrize("layout", ["plush-15", "phone-6"])
 def test_a_vector_layer_is_written_to_onnx_only(layout: str, tmp_path: Path, onnx_here: None) -> None:
     bundle = bundle_of(layout, "v9_5d2", "4,6")
     raw = others(bundle)[:-1]
-    assert_floats(as_onnx.run_model(convert(bundle, tmp_path / "m", "onnx").path.read_bytes(), raw), bundle, raw)
-    found = as_onnx.run_model(convert(bundle, tmp_path / "n", "onnx-int8").path.read_bytes(), raw)
+    assert_floats(
+        as_onnx.run_model(convert(bundle, tmp_path / "m", "onnx").path.read_bytes(), values(bundle, raw)), bundle, raw
+    )
+    found = as_onnx.run_model(convert(bundle, tmp_path / "n", "onnx-int8").path.read_bytes(), values(bundle, raw))
     expected = integer_network(bundle).forward(raw) / 256
     assert found is not None and np.abs(found - expected).max() < 0.01 * max(1.0, np.abs(expected).max())
     for name in ("tflite", "tflite-int8", "espdl"):
@@ -130,19 +213,76 @@ def test_a_vector_layer_is_written_to_onnx_only(layout: str, tmp_path: Path, onn
 def test_real_windows(real_data: Path, onnx_here: None, litert_here: None) -> None:
     bundle = made(("14d1_19d2_19d4", (8, 12, 16), "accel-3", {}))
     stream = real_data / "makeability-gestures" / "P07" / "fulldatastream.csv"
-    values = network_inputs(read_stream(stream, bundle.layout).frames.values, bundle.layout)
-    raw = np.stack([values[at : at + bundle.arch.span].T for at in range(0, len(values) - bundle.arch.span, 400)])
+    rows = network_inputs(read_stream(stream, bundle.layout).frames.values, bundle.layout)
+    raw = np.stack([rows[at : at + bundle.arch.span].T for at in range(0, len(rows) - bundle.arch.span, 400)])
     assert len(raw) > 10
     fitted = Bundle(bundle.arch, bundle.weights, bundle.layout, Scaler.fit(raw), bundle.gestures)
-    assert_floats(as_onnx.run_model(as_onnx.float_model(fitted), raw), fitted, raw)
-    assert_floats(as_tflite.run_model(as_tflite.float_model(fitted), raw), fitted, raw)
+    assert_floats(as_onnx.run_model(as_onnx.float_model(fitted), values(fitted, raw)), fitted, raw)
+    assert_floats(as_tflite.run_model(as_tflite.float_model(fitted), values(fitted, raw)), fitted, raw)
+
+
+# A force of which 512 is none and 4 are a newton, an acceleration in m/s² with an offset, and its magnitude.
+UNITS = """
+name = "units-4"
+rate_hz = 50
+channels = [
+    { name = "force", unit = "N", kind = "force", offset = 512, scale = 0.25 },
+    { name = "x", unit = "m/s²", kind = "acceleration", offset = 0.5, step = 0.01, valid_min = -99, valid_max = 99 },
+    { name = "y", unit = "m/s²", kind = "acceleration", step = 0.01, valid_min = -99, valid_max = 99 },
+]
+wire = ["device_ms", "force", "x", "y"]
+derived = [{ name = "size", kind = "magnitude", of = ["x", "y"] }]
+inputs = ["force", "x", "size"]
+"""
+
+
+@pytest.mark.parametrize("name", ["onnx", "onnx-int8", "tflite", "tflite-int8"])
+def test_a_file_reads_values_as_the_toy_sends_them(
+    name: str, tmp_path: Path, onnx_here: None, litert_here: None
+) -> None:
+    (tmp_path / "units.toml").write_text(UNITS, encoding="utf-8")
+    layout = load_layout(tmp_path / "units.toml")
+    rng = np.random.default_rng(2)
+    sent = np.cumsum(rng.normal(size=(20, 60, 3)), axis=1) * (20, 0.3, 0.3) + (600, 1, 9)
+    sent = np.round(sent * (1, 100, 100)) / (1, 100, 100)
+    raw = np.stack([network_inputs(np.rint(w * (1, 100, 100)).astype(np.int64), layout) for w in sent])
+    raw = raw.transpose(0, 2, 1)
+    arch = Arch.parse("5d1_3d2", (4, 5), channels=3, classes=5, window=40)
+    gestures = load_gestures("plush-18")
+    bundle = Bundle(arch, random_weights(arch, 3), layout, Scaler.fit(raw), gestures.subset(gestures.labels[:5]))
+    bundle = calibrated(bundle, raw)
+    size = np.sqrt((sent[:, :, 1] - 0.5) ** 2 + sent[:, :, 2] ** 2)
+    given = np.stack([sent[:, :, 0], sent[:, :, 1], size], axis=1)[:, :, -arch.span :].astype(np.float32)
+    data = convert(bundle, tmp_path / "m", name).path.read_bytes()
+    found = (as_onnx if "onnx" in name else as_tflite).run_model(data, given)
+    exact = (
+        integer_network(bundle).forward(raw) / 256
+        if "int8" in name
+        else bundle.network().forward(bundle.scaler.apply(raw[:, :, -arch.span :]))
+    )
+    assert found is not None and np.abs(found - exact).max() < 0.02 * np.abs(exact).max()
+    facts = describe(bundle, "")
+    assert json.loads(facts["units"]) == ["raw: (value - 512) * 0.25 is in N", "m/s²", "m/s²"]
+    assert "size is sqrt((x - 0.5)^2 + y^2)" in facts["input"]
+
+
+def test_the_input_of_self_calibrated_and_vector_networks_is_named() -> None:
+    calibrated_layout = replace(load_layout("phone-6").for_vectors(), self_calibration=("x_acc", "y_acc", "z_acc"))
+    units = InputUnits.of(calibrated_layout)
+    assert units.names == ("g",) * 3 + ("rad/s",) * 3 + ("g",) * 3
+    assert units.steps.tolist() == [2048.0] * 3 + [1000.0] * 3 + [16 * 2048.0] * 3
+    mixed = load_layout("phone-6")
+    channels = (replace(mixed.channels[0], step=0.01), *mixed.channels[1:])
+    derived = (Derived("size", "magnitude", ("x_acc", "y_acc")),)
+    units = InputUnits.of(replace(mixed, channels=channels, derived=derived, inputs=("size", "x_gyro")))
+    assert units.names == ("steps", "rad/s") and units.steps.tolist() == [16.0, 1000.0]
 
 
 def test_a_converted_network_reads_calibrated_values() -> None:
     bundle = made(NETS[0])
     layout = replace(bundle.layout, self_calibration=bundle.layout.names)
-    assert "clock rule and self-calibration" in describe(replace(bundle, layout=layout))["input"]
-    assert "self-calibration" not in describe(bundle)["input"]
+    assert "self-calibrated values" in describe(replace(bundle, layout=layout), "")["input"]
+    assert "self-calibration" not in describe(bundle, "")["input"]
 
 
 def test_onnx_says_what_it_is(tmp_path: Path, onnx_here: None) -> None:
@@ -157,6 +297,10 @@ def test_onnx_says_what_it_is(tmp_path: Path, onnx_here: None) -> None:
     assert json.loads(metadata["span"]) == bundle.arch.span and json.loads(metadata["simulated"]) is True
     shape = model.graph.input[0].type.tensor_type.shape.dim
     assert model.graph.input[0].name == "raw"
+    assert metadata["input"] == model.graph.input[0].doc_string
+    assert f"'raw', float32 (N, 11, {bundle.arch.span}), also for whole numbers" in metadata["input"]
+    assert "acc_magnitude is sqrt(acc_x^2 + acc_y^2 + acc_z^2)" in metadata["input"]
+    assert json.loads(metadata["units"]) == ["count"] * 11
     assert [d.dim_param or d.dim_value for d in shape] == ["N", 11, bundle.arch.span]
 
 
@@ -178,6 +322,30 @@ def test_litert_says_what_it_is(name: str, tmp_path: Path, litert_here: None) ->
     facts = json.loads(bytes(model.buffers[entry.buffer].data))
     assert entry.name == b"plushsense" and facts["title"] == bundle.arch.title
     assert json.loads(facts["gestures"]) == list(bundle.gestures.labels)
+    assert f"'raw', float32 (1, {bundle.arch.span}, 11), also for whole numbers" in facts["input"]
+    assert facts["input"] in model.description.decode()
+    # The schema has force_align: 16 for the data of buffers.
+    read = Model.GetRootAs(data)
+    starts = [read.Buffers(n)._tab.Vector(4) for n in range(1, read.BuffersLength())]
+    assert len(starts) > 10 and {start % 16 for start in starts} == {0}
+
+
+@pytest.mark.parametrize("name", ["tflite", "tflite-int8"])
+def test_the_compiled_model_of_litert_gives_the_same_answers(name: str, tmp_path: Path, litert_here: None) -> None:
+    from ai_edge_litert.compiled_model import CompiledModel
+
+    bundle = made(NETS[1])
+    done = convert(bundle, tmp_path / "m.tflite", name)
+    given = values(bundle, others(bundle, 4))
+    model = CompiledModel.from_file(str(done.path))
+    inputs, outputs = model.create_input_buffers(0), model.create_output_buffers(0)
+    found = []
+    for window in given:
+        inputs[0].write(np.ascontiguousarray(window.T[None]))
+        model.run_by_index(0, inputs, outputs)
+        found.append(outputs[0].read(7, np.float32))
+    expected = as_tflite.run_model(done.path.read_bytes(), given)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=0.01 * np.abs(expected).max())
 
 
 def softmax(logits: Any) -> Any:
@@ -197,12 +365,12 @@ def test_probabilities_are_the_softmax(integers: bool, onnx_here: None, litert_h
         getattr(room, "integer_model" if integers else "float_model") for room in (as_onnx, as_tflite)
     )
     session = onnxruntime.InferenceSession(to_onnx(*parts), providers=["CPUExecutionProvider"])
-    logits, found = session.run(["logits", "probabilities"], {"raw": raw.astype(np.float32)})
+    logits, found = session.run(["logits", "probabilities"], {"raw": values(bundle, raw)})
     np.testing.assert_allclose(found, softmax(logits), atol=1e-6)
     if not integers:
         np.testing.assert_allclose(found, bundle.network().probabilities(bundle.scaler.apply(raw)), atol=1e-5)
     run = Interpreter(model_content=to_tflite(*parts), num_threads=1).get_signature_runner("serving_default")
-    answers = [run(raw=np.ascontiguousarray(row.T[None], dtype=np.float32)) for row in raw]
+    answers = [run(raw=np.ascontiguousarray(row.T[None])) for row in values(bundle, raw)]
     logits, found = (np.concatenate([answer[name] for answer in answers]) for name in ("logits", "probabilities"))
     np.testing.assert_allclose(found, softmax(logits), atol=1e-5)
 
@@ -223,7 +391,7 @@ def test_a_file_that_answers_otherwise_is_refused(tmp_path: Path, onnx_here: Non
     job = ConversionJob.of(bundle, None)
     with pytest.raises(BundleError, match="gives other answers"):
         data = as_onnx.float_model(other)
-        compared(job, data, as_onnx.run_model(data, job.windows), "ONNX")
+        compared(job, data, as_onnx.run_model(data, job.values), "ONNX", ())
 
 
 def test_given_windows_are_tried_too(tmp_path: Path, onnx_here: None) -> None:

@@ -51,13 +51,17 @@ class Air:
     fault: ClassVar[Exception | None] = None
     hang: ClassVar[bool] = False
     clients: ClassVar[list[Any]] = []
+    connected: ClassVar[list[Any]] = []
+    broken: ClassVar[bool] = False
+    aborted: ClassVar[bool] = False
 
 
 @pytest.fixture(autouse=True)
 def air() -> Iterator[type[Air]]:
     Air.devices = [("11:22:33:44:55:66", "Lamp", []), (ADDRESS, "Plush Bear", [UART_SERVICE])]
     Air.services = {UART_SERVICE: [("6e400002-b5a3-f393-e0a9-e50e24dcca9e", ["write"]), (UART_TX, ["notify"])]}
-    Air.fault, Air.hang, Air.clients = None, False, []
+    Air.fault, Air.hang, Air.clients, Air.connected = None, False, [], []
+    Air.broken = Air.aborted = False
     yield Air
     for client in Air.clients:
         assert not client.connected, "a connection was left open"
@@ -89,6 +93,9 @@ class Client(bleak.backends.client.BaseBleakClient):
     async def connect(self, pair: bool, **_: Any) -> None:
         if Air.hang:
             await asyncio.sleep(3600)
+        if Air.aborted:
+            self._disconnected_callback()  # bleak tries again by itself
+            await asyncio.sleep(0.01)
         self.loop = asyncio.get_running_loop()
         self.services = bleak.backends.service.BleakGATTServiceCollection()
         handle = itertools.count(1)
@@ -105,13 +112,19 @@ class Client(bleak.backends.client.BaseBleakClient):
         Air.clients.append(self)
 
     async def disconnect(self) -> None:
-        self.connected = False
+        """Call back before returning, as bleak does on all systems; the answer of the radio takes a while."""
+        if self.connected:
+            self.connected = False
+            self._disconnected_callback()
+        await asyncio.sleep(0.01)
 
     @property
     def is_connected(self) -> bool:
         return self.connected
 
     async def start_notify(self, characteristic: Any, callback: Any, **_: Any) -> None:
+        if Air.broken and len(Air.clients) == 1:
+            raise bleak.exc.BleakDBusError("org.freedesktop.DBus.Error.UnknownObject", ["no such object"])
         self.tx, self.callback = characteristic.uuid, callback
 
     async def stop_notify(self, characteristic: Any) -> None:
@@ -142,7 +155,19 @@ class Client(bleak.backends.client.BaseBleakClient):
         self.loop.call_soon_threadsafe(self._disconnected_callback)
 
 
-FAKE = BleBackends(Client, Scanner)
+class Adapter:
+    """Knows the devices that other programs left connected."""
+
+    @classmethod
+    async def get(cls, **_: Any) -> Adapter:
+        return cls()
+
+    async def get_connected_devices(self, service_uuids: frozenset[str]) -> list[Any]:
+        assert UART_SERVICE in service_uuids
+        return Air.connected
+
+
+FAKE = BleBackends(Client, Scanner, Adapter)
 
 
 def opened(**target: Any) -> BleDevice:
@@ -248,6 +273,94 @@ def test_a_toy_that_does_not_let_itself_be_connected(monkeypatch: pytest.MonkeyP
         opened()
 
 
+def test_a_first_try_of_bleak_that_fails_is_not_the_end() -> None:
+    Air.aborted = True
+    with opened() as device:
+        Air.clients[0].play(b"\n1 2 3 4 5 6 7 8 9 10 11 12 13 1000 10\n")
+        assert len(take(device, 1)) == 1
+
+
+def still_connected(name: str = "Plush Bear", address: str = ADDRESS) -> None:
+    """The toy is connected, so that it does not advertise."""
+    Air.connected = [bleak.backends.device.BLEDevice(address, name, None)]
+    Air.devices = [device for device in Air.devices if device[0] != address]
+
+
+needs_adapter = pytest.mark.skipif(not hasattr(bleak, "BleakAdapter"), reason="this bleak is older than 3.1")
+
+
+@needs_adapter
+def test_a_toy_that_was_left_connected_is_found_without_a_search() -> None:
+    still_connected()
+    for target in ({}, {"name": None, "address": ADDRESS.lower()}):
+        with opened(**target):
+            assert Air.clients[-1].tx == UART_TX
+    Air.services = {OTHER: []}
+    with pytest.raises(DeviceError, match=f"has no service {UART_SERVICE}; it has {OTHER}"):
+        opened()
+
+
+@needs_adapter
+def test_the_refusal_names_what_is_still_connected_to_this_computer() -> None:
+    still_connected()
+    with pytest.raises(DeviceError, match=r"Lamp \(.*\); still connected to this computer: Plush Bear \(C0:FF.*\);"):
+        opened(name="Teddy")
+    Air.hang = True
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(DeviceError, match="is still connected to this computer"):
+        patch.setattr(ble, "_CONNECT_S", 0.05)
+        opened()
+
+
+@needs_adapter
+def test_a_toy_that_the_system_wrongly_takes_for_connected_is_searched() -> None:
+    Air.connected = [bleak.backends.device.BLEDevice(ADDRESS, "Plush Bear", None)]
+    Air.broken = True
+    with opened():
+        assert len(Air.clients) == 2 and not Air.clients[0].connected
+
+
+def test_without_the_list_of_connected_devices_the_toy_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """bleak before 3.1, or a system that cannot list them."""
+    monkeypatch.delattr(bleak, "BleakAdapter", raising=False)
+    with opened():
+        assert len(Air.clients) == 1
+    with pytest.raises(DeviceError, match="not still connected to this computer or to another"):
+        opened(name="Teddy")
+
+
+def test_a_toy_that_stops_sending_is_given_up_and_one_that_has_not_begun_is_not() -> None:
+    line = b"\n1 2 3 4 5 6 7 8 9 10 11 12 13 1000 10\n"
+    with opened(silence_s=0.01) as device:
+        device.wait_s = 0.02
+        assert device.read() == []
+        Air.clients[0].play(line)
+        assert len(take(device, 1)) == 1
+        with pytest.raises(DeviceError, match=r"has stopped sending for 0.01 s.*silence_s=0"):
+            while True:
+                device.read()
+    with opened(silence_s=0) as device:
+        device.wait_s = 0.02
+        Air.clients[1].play(line)
+        assert len(take(device, 1)) == 1
+        assert device.read() == []
+
+
+def test_a_connection_that_was_given_up_is_opened_anew() -> None:
+    """As after a crash of the Bluetooth service, of which bleak says nothing."""
+    line = b"\n1 2 3 4 5 6 7 8 9 10 11 12 13 1000 10\n"
+    with ReconnectingDevice("ble://test", PLUSH, lambda: opened(silence_s=0.01)) as device:
+        device.wait_s = 0.02
+        Air.clients[0].play(line)
+        take(device, 1)
+        end = time.monotonic() + 10
+        while len(Air.clients) < 2 or device.state == "waiting":
+            assert time.monotonic() < end
+            device.read()
+        Air.clients[1].play(line)
+        take(device, 1)
+        assert "stopped sending" in device.gaps[0].reason and device.counters.reconnects == 1
+
+
 def not_available(name: str) -> Exception:
     reasons = getattr(bleak.exc, "BleakBluetoothNotAvailableReason", None)
     if reasons is None:
@@ -351,6 +464,7 @@ def test_urls_that_are_refused(url: str, error: type[Exception], words: str) -> 
     [
         ("ble://name:Plush%20Bear", BleTarget("Plush Bear")),
         (f"ble://{ADDRESS}?find_s=3", BleTarget(address=ADDRESS, find_s=3)),
+        (f"ble://{ADDRESS}?silence_s=0", BleTarget(address=ADDRESS, silence_s=0)),
         (
             "ble://12345678-ABCD-abcd-abcd-1234567890ab?service=ABCD",
             BleTarget(address="12345678-ABCD-abcd-abcd-1234567890ab", service=OTHER, tx=None),

@@ -94,6 +94,7 @@ def test_the_stream_says_what_it_carries(name: str) -> None:
             channel = channel.next_sibling()
         assert seen == [*((c.name, c.unit) for c in PHONE.channels), ("device_ms", "ms")]
         assert (info.type(), info.nominal_srate(), info.channel_count()) == ("Touch", 100.0, 7)
+        assert info.desc().child("synchronization").child_value("can_drop_samples") == "true"
 
 
 @needs_lsl
@@ -143,6 +144,7 @@ def test_the_toys_own_clock_by_position_but_not_in_floats(name: str) -> None:
         floats.push_sample([1, 777, 2], 50.0)
         assert [(f.device_ms, f.values) for f in take(device, 1)] == [(777, (1, 2))]
         assert [(f.device_ms, f.values) for f in take(other, 1)] == [(50_000, (1, 2))]
+        assert "its device_ms is float32" in other.notes[1]
 
 
 @needs_lsl
@@ -168,12 +170,37 @@ def test_refusals(name: str) -> None:
     with pytest.raises(DeviceError, match=f"there are .*{name}"):
         open_device(f"lsl://no-{name}?find_s=0.2")
     two = stream(name + "2", 2, type_=f"T{name}")
-    with pytest.raises(DeviceError, match="fits 2 streams.*lsl://source:ID"):
+    with pytest.raises(DeviceError, match=f"fits 2 streams: open one of .*lsl://{name}2 on"):
         open_device(f"lsl://type:T{name}", WIDE)
     text = stream(name + "t", 2, "string")
     with pytest.raises(DeviceError, match="stream of texts"):
         open_device(f"lsl://{name}t", WIDE)
     del one, two, text
+
+
+@needs_lsl
+@pytest.mark.parametrize("sources", [("a", "b"), ("same", "same")])
+def test_one_of_two_equal_toys_is_not_opened_at_random(name: str, sources: tuple[str, str]) -> None:
+    outlets = [stream(name, ["a", "b"], source=source) for source in sources]
+    with pytest.raises(DeviceError, match="fits 2 streams: open one of") as refused:
+        open_device(f"lsl://{name}", WIDE)
+    urls = sorted(part.partition(" on ")[0] for part in str(refused.value).partition("one of ")[2].split(", "))
+    key = "source" if sources[0] != sources[1] else "uid"
+    assert len(urls) == 2 and all(url.startswith(f"lsl://{key}:") for url in urls)
+    with open_device(urls[0], WIDE) as one, open_device(urls[1], WIDE) as other:
+        for value, outlet in enumerate(outlets):
+            outlet.push_sample([value, value], 1.0)
+        assert {take(one, 1)[0].values, take(other, 1)[0].values} == {(0, 0), (1, 1)}
+
+
+@needs_lsl
+def test_a_stream_with_other_labels_is_not_the_toy(name: str) -> None:
+    gyroscope, unnamed = stream(name, ["gx", "gy"]), stream(name + "u", 2)
+    with pytest.raises(DeviceError, match="its 2 channels are gx, gy, and those of layout 'wide' a, b"):
+        open_device(f"lsl://{name}", WIDE)
+    with open_device(f"lsl://{name}u", WIDE, reconnect=True) as device:
+        assert device.notes == ("its channels have no names: its 2 values are taken for a, b, in this order",)
+    del gyroscope, unnamed
 
 
 @pytest.mark.parametrize(

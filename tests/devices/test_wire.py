@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Iterable
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,6 +18,14 @@ PLUSH = load_layout("plush-15")
 OLD = load_layout("plush-14")
 ACCEL = load_layout("accel-3")
 PHONE = load_layout("phone-6")
+PRESS = Layout.from_dict(
+    {
+        "name": "press",
+        "rate_hz": 50.0,
+        "channels": [{"name": name, "unit": "N", "kind": "force", "step": 0.01} for name in ("left", "right")],
+        "wire": ["device_ms", "left", "right"],
+    }
+)
 GOOD = b"1 2 3 4 5 6 7 8 9 10 11 12 13 1000 10\n"
 
 
@@ -99,7 +109,7 @@ def test_lines_of_another_layout_say_which_one_fits() -> None:
     old = b" ".join(b"7" for _ in range(14)) + b"\r\n"
     parser = LineParser(load_layout("plush-15"))
     parser.feed(old * 9)
-    assert parser.mismatch("serial:///dev/x") == ""
+    assert "it has 14 fields, not 15" in parser.mismatch("serial:///dev/x")
     parser.feed(old)
     assert parser.mismatch("serial:///dev/x?baud=9600&layout=plush-15") == (
         "The toy sends 14 numbers a line, but layout 'plush-15' has 15; 'plush-14' has 14: "
@@ -111,7 +121,55 @@ def test_lines_of_another_layout_say_which_one_fits() -> None:
     parser.feed(b" ".join(b"7" for _ in range(15)) + b"\n")
     assert parser.mismatch("x") == "", "a line that fits is a frame, so that the others were damaged"
     parser.feed(b"ready ok\n" * 20 + b"7 7 7 7 7 7 7 7 7 7 7 7 7 7 x\n" * 20)
-    assert parser.mismatch("x") == "", "words are no numbers, and a damaged frame is no other layout"
+    assert "sends 2 numbers" not in parser.mismatch("x"), "words are no numbers, and a damaged frame is no other layout"
+
+
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [
+        (b"ms:0,left:0.5,right:0.25", "it has names before the numbers, so send the numbers alone"),
+        (b"20 left=0.5 right=0.25", "'left=0.5' for left is no number"),
+        (b"20,1.5,nan", "'nan' for right is no number"),
+        (b"20 0x1F 2", "'0x1F' for left is no number"),
+        (b"0.02 1 2", "'0.02' for device_ms is no whole number"),
+        (b"20;1,5;2,25", "a comma separates numbers, so send decimals with a point, as in 1.5"),
+        (b'{"ms": 20, "left": 1.5}', "it is JSON, of which only the numbers are to be sent"),
+        (b"20 1", "it has 2 fields, not 3"),
+        (b"-20 1 2", "a number is too large, or a clock is negative"),
+        (b"\x80\xf8\x00\x9c\xe0", "it is no text, perhaps because the toy has another baud rate (?baud=115200)"),
+        (b"\x80\xf8\xff" * 200, "it is no text, perhaps because the toy has another baud rate (?baud=115200)"),
+        (b"1 2 3 " * 200, "it has more than 256 bytes without a line end"),
+    ],
+)
+def test_the_first_unreadable_line_is_quoted_with_what_is_wrong(line: bytes, fault: str) -> None:
+    parser = LineParser(PRESS)
+    parser.feed(line + b"\r\n")
+    parser.feed(b"another 1 2\n")
+    told = parser.mismatch("serial:///dev/x")
+    quoted = line.decode("ascii", "backslashreplace").replace("\0", "\\u0000")[:100]
+    assert told.startswith(f"The toy sends lines that cannot be read, the first is '{quoted}"), told
+    assert f"': {fault}. Layout 'press' expects 3 numbers a line" in told
+    assert told.endswith("separated by spaces, tabs, commas or semicolons: device_ms, left, right.")
+    parser.feed(b"20 1.5 2.25\n" * 3)
+    assert parser.mismatch("x") == "", "it was a message of the start"
+
+
+def test_no_built_in_layout_is_recommended_to_users_of_their_own() -> None:
+    parser = LineParser(PRESS)
+    parser.feed(b"20 1.5 2.25 7\n" * 30)
+    assert "the first is '20 1.5 2.25 7': it has 4 fields, not 3. Layout 'press' expects" in parser.mismatch("x")
+
+
+def test_a_few_damaged_lines_are_no_other_format_but_a_quarter_is() -> None:
+    parser = LineParser(PRESS)
+    parser.feed(b"20 1.5 2.25\n" * 100 + b"20 1.5 1.5.2\n" * 9)
+    assert parser.mismatch("x") == ""
+    parser.feed(b"20 1.5 1.5.2\n")
+    assert parser.mismatch("x").startswith("The toy sends lines that cannot be read")
+    parser.feed(b"20 1F 3\n20 15 3\n" * 60)
+    assert parser.mismatch("x").startswith(
+        "70 of 230 lines of the toy cannot be read, such as '20 1F 3': '1F' for left"
+    )
 
 
 def test_other_layouts() -> None:
@@ -165,6 +223,49 @@ def test_a_restarted_or_paused_clock_is_no_loss() -> None:
     meter = LossCounter()
     clock = [*range(0, 1000, 10), *range(5, 500, 10), *range(90_000, 91_000, 10)]
     assert sum(meter.push(c) for c in clock) == 0
+
+
+def stamps(seed: int, n: int = 301, period_ms: float = 10.0, jitter: float = 0.0) -> np.ndarray:
+    """Time stamps of an even clock that are each up to ``jitter`` periods early or late, in order."""
+    even = (np.arange(n) + np.random.default_rng(seed).uniform(-jitter, jitter, n)) * period_ms
+    return np.maximum.accumulate(np.rint(even + 1000).astype(int))
+
+
+def lost(clock: Iterable[int]) -> int:
+    meter = LossCounter()
+    return sum(meter.push(int(ms)) for ms in clock)
+
+
+@pytest.mark.parametrize("period_ms", [10.0, 9.7, 1000 / 60, 40.0])
+@pytest.mark.parametrize("seed", range(12))
+def test_jitter_is_no_loss(seed: int, period_ms: float) -> None:
+    uneven = stamps(seed, period_ms=period_ms, jitter=0.4)
+    assert np.diff(uneven).max() > 1.5 * period_ms
+    assert lost(uneven) == 0
+
+
+def test_late_frames_and_frames_in_bursts_are_no_loss() -> None:
+    clock = stamps(1)
+    for size in (2, 4, 16):
+        assert lost(clock[np.minimum(np.arange(301) // size * size + size, 300)]) == 0, size
+    stalled = np.where((clock >= clock[50]) & (clock < clock[80]), clock[80], clock)
+    assert lost(stalled) == 0, "thirty frames came at once"
+    meter = LossCounter()
+    counted = np.cumsum([meter.push(int(ms)) for ms in stalled])
+    assert counted.max() == 30, "until they come, they are missing"
+
+
+@given(st.sets(st.integers(1, 299), max_size=40), st.sampled_from([10.0, 9.7, 1000 / 60, 40.0]))
+@settings(max_examples=100)
+def test_every_lost_frame_of_an_even_clock_is_counted(missing: set[int], period_ms: float) -> None:
+    missing -= {1, 2, 3, 4}  # the period is known after a few frames
+    assert lost(np.delete(stamps(0, period_ms=period_ms), sorted(missing))) == len(missing)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_loss_is_counted_among_jitter(seed: int) -> None:
+    clock = stamps(seed, jitter=0.15)
+    assert lost(np.delete(clock, [60, 61, 62, 120, 200, 201, 250])) == 7
 
 
 def test_loss_follows_the_real_period() -> None:

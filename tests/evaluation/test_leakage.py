@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from plushsense.dataset.quality.outliers import far_inputs
 from plushsense.evaluation.crossval import fold_windows
 from plushsense.evaluation.leakage import KINDS, audit_leakage, warn_of_copies
 from plushsense.scoring.splits import Fold, parse_split
 from plushsense.windows.cut import WindowSet
+from plushsense.workflow.preparation import warn_of_far_readings
 from support.fakes import study
 
 
@@ -92,3 +94,35 @@ def test_recordings_that_rarely_change_are_no_copies() -> None:
     pressed = (np.arange(windows.x.shape[2]) > 60).astype(np.int32)
     for x in (np.zeros_like(windows.x), windows.x * 0 + pressed):
         assert audited(replace(windows, x=x), "by-subject:4")["near_duplicates"] == 0
+
+
+def test_recordings_with_rows_of_one_trained_on_are_counted() -> None:
+    windows = moving()
+    mine, theirs = (np.flatnonzero(windows.subject == who) for who in ("P01", "P03"))
+    one, other = (windows.recording_ids[windows.recording[at[0]]] for at in (mine, theirs))
+    n = int((windows.recording == windows.recording[mine[0]]).sum())
+    none = np.empty(0, dtype=np.int64)
+    pairs = {(one, other), (other, one)}
+    found = audit_leakage(windows, windows, [Fold("f", ("P01",), theirs, none, mine)], pairs)
+    assert (found["shared_rows"], found["near_duplicates"]) == (n, 0)
+    assert found["pairs"] == [{"scored": one, "trained": other, "windows": n}]
+    said: list[str] = []
+    warn_of_copies(found, said.append)
+    assert said[0].startswith(f"{n} of {len(mine)} scored windows are of recordings that have rows of one trained on")
+    apart = Fold("f", ("P01",), np.flatnonzero(windows.subject == "P02"), none, mine)
+    assert not audit_leakage(windows, windows, [apart], pairs)["shared_rows"]
+
+
+def test_windows_that_only_share_a_failed_reading_are_no_copies() -> None:
+    windows = moving()
+    x = windows.x.copy()
+    at = np.flatnonzero(windows.subject != "none")[::3]
+    x[at, 0, 40] = 2**31 - 1
+    failed = replace(windows, x=x)
+    assert far_inputs(windows.x) == {} and far_inputs(x)[0].sum() == len(at)
+    assert audited(failed, "by-subject:4")["near_duplicates"] == 0
+    said: list[str] = []
+    warn_of_far_readings(failed, said.append)
+    assert len(said) == 1 and f"is set by {len(at)} samples" in said[0] and "P01" in said[0]
+    warn_of_far_readings(windows, said.append)
+    assert len(said) == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -115,7 +116,8 @@ def test_across_sessions_the_way_of_holding_does_not_help(tmp_path: Path) -> Non
     assert across.top1["mean"] < 0.6
     assert "In a session that the program never saw it is right in" in verdict(found)
     assert "tried on those who came more than once: 4 of 4 people" in verdict(found)
-    other = found.under({"P1": "PX"})
+    other = replace(found, gestures_of_one_person=("01",)).under({"P1": "PX"}, "gesture {}".format)
+    assert other.gestures_of_one_person == ("gesture 01",)
     assert set(other.trials[0].by_person) == set(other.trials[0].precision) == {"PX", "P2", "P3", "P4"}
     assert "PX" in report(other, "x")
     assert "P1 " not in report(other, "x")

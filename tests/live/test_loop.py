@@ -5,6 +5,8 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import pytest
 
@@ -132,3 +134,53 @@ def test_closing_the_device_ends_the_run(bundle):
     device = Silent("silent://", model.layout)
     threading.Timer(0.05, device.close).start()
     assert not list(run_live(device, StreamClassifier(model)))
+
+
+@contextmanager
+def talking(*pieces: bytes, pause_s: float = 0.0) -> Iterator[str]:
+    """A toy that sends these bytes to whoever connects, with pauses between them, and hangs up."""
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def talk() -> None:
+        connection, _ = server.accept()
+        with connection:
+            for piece in pieces:
+                connection.sendall(piece)
+                time.sleep(pause_s)
+
+    thread = threading.Thread(target=talk, daemon=True)
+    thread.start()
+    yield f"tcp://127.0.0.1:{server.getsockname()[1]}?layout=accel-3"
+    thread.join(10)
+    server.close()
+
+
+NAMED = b"ms:0,X:1,Y:2,Z:3\r\n"
+
+
+@pytest.mark.parametrize("pieces", [(NAMED * 40, b""), (b"", NAMED * 40, b""), (NAMED,)])
+def test_unreadable_lines_are_quoted_also_after_a_silence_and_at_the_end(bundle, pieces):
+    warned: list[str] = []
+    with talking(*pieces, pause_s=0.3 if len(pieces) > 1 else 0.0) as url, open_device(url) as device:
+        live = run_live(device, StreamClassifier(bundle()), silence_s=0.1, warn=warned.append)
+        states = [d.state for d in live]
+    assert states[-1] == "unreadable" and states in (["unreadable"], ["no signal", "unreadable"])
+    assert len(warned) == 1 and "the first is 'ms:0,X:1,Y:2,Z:3': it has names before the numbers" in warned[0]
+    assert live.summary().no_signal == 1
+
+
+def test_frames_after_the_messages_of_a_board_that_starts(bundle):
+    frames = b"".join(b"%d 1 2 3\n" % (10 * k) for k in range(60))
+    with talking(b"rst: power on\nready\n", frames) as url, open_device(url) as device:
+        live = run_live(device, StreamClassifier(bundle()), silence_s=5.0, warn=pytest.fail)
+        assert {d.state for d in live} >= {"warming", "tracking"}
+    assert live.summary().counters["malformed"] == 2
+
+
+def test_many_damaged_lines_among_frames_are_reported(bundle):
+    warned: list[str] = []
+    lines = b"".join(b"%d 1 2 %s\n" % (10 * k, b"1F" if k % 3 == 0 else b"3") for k in range(120))
+    with talking(lines) as url, open_device(url) as device:
+        live = run_live(device, StreamClassifier(bundle()), silence_s=5.0, warn=warned.append)
+        assert "unreadable" not in {d.state for d in live}
+    assert len(warned) == 1 and "lines of the toy cannot be read, such as" in warned[0] and "'1F' for z" in warned[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -76,6 +77,15 @@ def take(r: Recorder, seconds: float = 1.0) -> RecorderStatus:
 
 def whats(folder: Path) -> list[str]:
     return [e.kind for e in read_events(folder)]
+
+
+def test_the_first_unreadable_line_is_shown(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        toy = open_device(f"tcp://127.0.0.1:{server.getsockname()[1]}", LAYOUT)
+        with server.accept()[0] as connection, toy, Recorder.open(tmp_path, toy, head()) as made:
+            connection.sendall(b"head:1,neck:2\r\n" * 20)
+            until(lambda: "the first is 'head:1,neck:2': it has names" in made.status().message)
+            assert made.status().signal == "unreadable" and made.status().message.reason == "toy_lines"
 
 
 def test_one_recording(tmp_path: Path) -> None:

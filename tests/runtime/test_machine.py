@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from plushsense.core.errors import BundleError, ConfigError
-from plushsense.core.layouts import load_layout
+from plushsense.core.errors import ArrayError, BundleError, ConfigError
+from plushsense.core.layouts import Layout, load_layout
 from plushsense.devices.base import Frame
-from plushsense.runtime.classifier import StreamClassifier, check_layout
+from plushsense.runtime.classifier import StreamClassifier, check_layout, whole_frame
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.events import ONE
 from plushsense.runtime.fixed import integer_logits, smooth, smoothing_weight, softmax
@@ -175,3 +175,35 @@ def test_a_device_of_another_layout_is_refused_in_one_sentence():
     table["channels"][1]["step"] = 0.5
     with pytest.raises(ConfigError, match="channel 'y' has another unit, scale, step"):
         check_layout(type(accel).from_dict(table), accel)
+
+
+def test_push_takes_whole_steps_only() -> None:
+    layout = Layout.from_dict(
+        {
+            "name": "press",
+            "rate_hz": 50.0,
+            "channels": [{"name": name, "unit": "N", "kind": "force", "step": 0.01} for name in ("left", "right")],
+            "wire": ["device_ms", "left", "right"],
+        }
+    )
+    assert layout.in_steps((1.37, -0.02)) == (137, -2)
+    frame = whole_frame(Frame(0, 20, (137, -2)), layout)
+    assert whole_frame(Frame(0, np.int64(20), tuple(np.array([137, -2]))), layout) == frame  # type: ignore[arg-type]
+    for wrong, message in (
+        (Frame(0, 20, (1.37, -2)), r"'left' is 1.37 in a frame.*steps, here of 0.01.*layout.in_steps\(sample\)"),
+        (Frame(0, 20, (137, -2.0)), "'right' is -2.0 in a frame"),
+        (Frame(0, 20, (137,)), "The frame has 1 values, but layout 'press' has 2 channels"),
+        (Frame(0, 0.02, (137, -2)), "device_ms is 0.02 in a frame: accepted are whole milliseconds"),
+    ):
+        with pytest.raises(ArrayError, match=message):
+            whole_frame(wrong, layout)  # type: ignore[arg-type]
+    for sample in ((1.0,), (1.0, float("nan"))):
+        with pytest.raises(ArrayError):
+            layout.in_steps(sample)
+
+
+def test_a_reader_refuses_units(bundle) -> None:
+    reader = StreamClassifier(bundle())
+    with pytest.raises(ArrayError, match="whole numbers of steps"):
+        reader.push(Frame(0, 0, (0.5,) * reader.layout.n_channels))  # type: ignore[arg-type]
+    assert reader.time_s == 0.0

@@ -13,8 +13,11 @@ import pytest
 
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.backup import backup
+from plushsense.dataset.index import open_dataset
+from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import DATASETS
 from plushsense.studio.tasks import TaskReporter, run_inspect
+from support.accelerometers import analogue
 from support.browsing import LONG_MS, TABLET, axe, marked
 
 Fixture = Callable[..., Any]
@@ -72,6 +75,17 @@ def test_sources_are_imported_together_and_what_is_refused_is_named(furniture: P
     reasons = {r["file"]: r["reason"].reason for r in found["rejected"]}
     assert reasons == {"broken.zip": "zip_damaged", "notes.txt": "file_no_recording"}
     assert [note.reason for note in found["notes"] if isinstance(note, Sentence)] == ["layout_guessed"]
+
+
+def test_what_all_sources_prove_is_adopted_and_told(tmp_path: Path) -> None:
+    folders = [analogue(tmp_path / f"R{p}", 330, 68, people=range(p, p + 1)) for p in range(2)]
+    found = inspect(tmp_path / "D", *folders)
+    (note,) = (n for n in found["notes"] if isinstance(n, Sentence) and n.reason == "adopted")
+    assert "which stands for zero" in note and found["people"] == {"P0": 6, "P1": 6}
+    assert [round(c.offset, -1) for c in open_dataset(tmp_path / "D").layout.channels] == [330] * 3
+    for language in ("en", "lv"):
+        assert "offset: x 3" in Words(language).sentence(note) != note
+    assert [n.reason for n in inspect(tmp_path / "E", folders[0])["notes"]] == ["layout_guessed", "adopted"]
 
 
 def test_the_person_of_loose_files_and_of_folders_of_gestures_can_be_given(furniture: Path, tmp_path: Path) -> None:

@@ -191,6 +191,7 @@ def test_lines_that_are_no_frames_are_told(workspace: Workspace) -> None:
     until(lambda: reader.now.situation.kind == "unreadable")
     scene = Feed(reader).scene()
     assert (scene["layout"], scene["numbers"]) == ("accel-3", 4)
+    assert "15 numbers a line, but layout 'accel-3' has 4" in scene["first"]["now"]["why"]
     stop.set()
 
 

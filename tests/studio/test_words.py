@@ -84,6 +84,21 @@ def test_a_note_is_worded_in_the_language_of_the_page_also_after_json() -> None:
     assert (Words("en").significant(0.1234, 2), Words("lv").significant(0.1234, 2)) == ("0.12", "0,12")
 
 
+@pytest.mark.parametrize("language", LANGUAGES)
+@pytest.mark.parametrize(
+    "value",
+    [
+        None, [], [""][1:], ["a"], ["a", "b"], 0, 1, 2, 0.5, "a", "a.", Sentence("It is a."),
+        Sentence("x", reason="layout_guessed", layout="phone-6"), [Sentence("It is a."), Sentence("It is b.")],
+    ],
+)  # fmt: skip
+def test_every_sentence_reads_well_with_no_one_and_many_values(language: str, value: Any) -> None:
+    words = Words(language)
+    for key, text in words.table("sentences").items():
+        said = words.sentence(Sentence("", key, **dict.fromkeys(fields(text), value)))
+        assert not re.search(r"None|\bnan\b|\[\]|\{|\.\.(?!\.)|  | [.,:;]|: ?[.;]|\(\)|“”|''", said), f"{key}: {said}"
+
+
 def made() -> Iterator[tuple[str, str, dict[str | None, ast.expr]]]:
     """Yield place, name and arguments of every `Sentence` and every error that the source makes."""
     package = Path(str(resources.files("plushsense")))

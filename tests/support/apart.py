@@ -33,6 +33,7 @@ GROUPS = tuple(
         "cli/test_publish.py dataset/publishing/test_checking.py dataset/publishing/test_contents.py"
         " dataset/publishing/test_package.py",
         "dataset/importing/test_importers_fuzz.py",
+        "dataset/publishing/test_readers.py",
         "evaluation/test_reidentification.py scoring/test_metrics.py",
         "experiments/baselines/test_models.py experiments/baselines/test_report.py experiments/baselines/test_score.py"
         " experiments/streams/test_predictions.py",

@@ -42,7 +42,7 @@ _PRELOADED = (
         "plushsense.deploy.package",
     ),
     *("plushsense.dataset.publishing.package", "pytest", "torch"),
-    *("mlcroissant", "frictionless", "rocrate.rocrate", "datacite"),
+    *("mlcroissant", "frictionless", "datacite"),
 )
 # A command that hangs ends, with the stacks of its threads as its error output.
 _LONGEST_S = 500

@@ -17,6 +17,7 @@ EXHAUSTIVE = {
     "cli/test_profile.py::test_how_it_is_compiled_matters",
     "cli/test_publish.py::test_saving_and_leaving_the_report_out",
     "cli/test_publish.py::test_the_report_says_the_codes_of_the_package",
+    "core/test_none_in_sentences.py::test_no_sentence_shows_none",
     "deploy/proof/test_device.py::test_a_chip_of_qemu_answers_over_its_uart[cortex-m4-tcp]",
     "deploy/proof/test_device.py::test_a_chip_of_qemu_answers_over_its_uart[riscv32-pty]",
     "deploy/proof/test_device.py::test_scenarios_go_over_the_link_too",

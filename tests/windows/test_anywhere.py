@@ -282,7 +282,7 @@ def test_what_gives_no_window_is_named_and_streams_are_counted(tmp_path: Path) -
     seen: list[tuple[int, int]] = []
     w = cut_anywhere(data, SPEC, data.gestures, EVERY, lambda *done: seen.append(done))
     assert seen == [(1, 1)] and w.left_out == ("ben/Shake_5_80: no valid sample",)
-    with pytest.raises(DatasetError, match="gives no window: 1 recordings of 1 gestures"):
+    with pytest.raises(DatasetError, match="gives no window: 1 recording of 1 gesture."):
         cut_anywhere(data, SPEC, data.gestures.subset(["Shake"]), EVERY)
     alone = made_alone(tmp_path / "alone")
     assert add_idle_gesture(alone.gestures, alone) == alone.gestures, "without a stream nothing is known to be idle"

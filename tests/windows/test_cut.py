@@ -15,6 +15,7 @@ from plushsense.dataset.store import Dataset
 from plushsense.windows.clock import resample
 from plushsense.windows.cut import (
     WindowSpec,
+    constant_windows,
     cut_windows,
     from_recording,
     recordings_in_time,
@@ -223,3 +224,15 @@ def test_how_long_a_recording_is_counts_after_trimming(dataset: Dataset, tmp_pat
     assert len(recordings_in_time(list(longer.used))) == len(longer.used)
     w = cut_windows(longer, WindowSpec(context="loop"), longer.gestures.subset(["Wave"]))
     assert w.left_out == () and 7800 in w.x[:, 0, 0]
+
+
+def test_windows_that_are_constant_in_time_are_named(dataset: Dataset, tmp_path: Path) -> None:
+    assert constant_windows(cut_windows(dataset)) is None
+    (tmp_path / "src" / "cat").mkdir()
+    still = Frames(np.tile([5, 6, 7], (120, 1)), np.arange(120) * 10)
+    write_recording(tmp_path / "src" / "cat" / recording_filename("Wave", 7, 120), still, ACCEL)
+    windows = cut_windows(import_recordings(tmp_path / "src", tmp_path / "DS", layout=ACCEL, add_to=True).dataset)
+    note = constant_windows(windows)
+    assert note is not None and note.startswith(
+        f"1 of {len(windows)} windows are constant in time, for instance of cat/"
+    )

@@ -42,7 +42,7 @@ def test_data_of_other_content_is_used_with_a_word_and_of_other_people_refused(d
     other = replace(bundle, provenance=origin | {"dataset_hash": "0", "subjects": [*origin["subjects"], "P99"]})
     assert calibrated_on(other, dataset, said.append).calibration
     assert any("content" in line for line in said) and any("P99" in line for line in said)
-    with pytest.raises(BundleError, match="has no window of the 1 people"):
+    with pytest.raises(BundleError, match="has no window of the 1 person"):
         calibrated_on(replace(bundle, provenance=origin | {"subjects": ["P99"]}), dataset)
     with pytest.raises(BundleError, match="belongs to an export.*plushsense train wrote"):
         calibrated_on(bundle.without_people(), dataset)

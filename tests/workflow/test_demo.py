@@ -43,6 +43,7 @@ def test_demo_twice(cli: Callable[..., Any], tmp_path: Path, monkeypatch: pytest
     assert [g["affect"] for g in found["live"]["gestures"]]
     assert (Path(found["export"]) / "plushsense.c").is_file()
     assert "say nothing about a real toy" in ran.stderr
+    assert "2/6  train 14d1_19d2_19d4 on " in ran.stderr and "None" not in ran.stderr
     assert "simulation" in Path(found["report"]).read_text().lower()
     again = cli("demo", "--quick", "--out", out)
     assert again.status == 0

@@ -411,3 +411,40 @@ def test_class_labels_that_do_not_fit_are_refused(dtype: object) -> None:
     provenance = {"estimator": {"labels": ["a", "b"], "dtype": dtype}}
     with pytest.raises(BundleError):
         labels_from(SimpleNamespace(provenance=provenance, gestures=gestures))  # type: ignore[arg-type]
+
+
+def test_windows_of_different_lengths_get_a_way_out() -> None:
+    import pandas as pd
+
+    x, y, _ = waves(20)
+    uneven = [w[:, : 60 - k % 3] for k, w in enumerate(x)]
+    cells = np.empty((20, 2), dtype=object)
+    held = np.empty(20, dtype=object)
+    for k, w in enumerate(uneven):
+        held[k], cells[k, 0], cells[k, 1] = w, *w
+    nested = pd.DataFrame({name: [pd.Series(row) for row in cells[:, c]] for c, name in enumerate("ab")})
+    for windows in (uneven, held, cells, [w.tolist() for w in uneven], nested):
+        with pytest.raises(ArrayError, match=r"from 58 to 60 samples.*np\.stack\(\[w\[:, :58\] for w in X\]\)"):
+            small().fit(windows, y)
+    with pytest.raises(ArrayError, match=r"np\.stack\(\[w\[:58\] for w in X\]\)"):
+        small().fit([pd.DataFrame(w.T) for w in uneven], y)
+    with pytest.raises(ArrayError, match="channels have different lengths"):
+        small().fit([[w[0], w[1][:50]] for w in x], y)
+    with pytest.raises(ArrayError, match=r"different shapes \(\(1, 60\), \(2, 60\)\)"):
+        small().fit([x[0][:1], *uneven[1:]], y)
+    model = small(epochs=1).fit(x, y)
+    with pytest.raises(ArrayError, match="different lengths"):
+        model.predict(uneven)
+    for windows in (list(x), [w.tolist() for w in x]):
+        np.testing.assert_array_equal(model.predict_proba(windows), model.predict_proba(x))
+
+
+def test_fractions_where_whole_numbers_were_trained_on_are_reported() -> None:
+    x, y, _ = waves(20)
+    model = small(epochs=1).fit(np.rint(100 * x).astype(int), y)
+    with pytest.warns(UserWarning, match="X has fractions, but the windows in fit were whole numbers"):
+        model.predict(x)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.predict(np.rint(100 * x))
+        small(epochs=1).fit(x, y).predict(x + 0.001)

@@ -75,3 +75,19 @@ def test_xdf_files_are_imported_again(dataset: Dataset, tmp_path: Path) -> None:
     assert np.array_equal(np.diff(clock), np.diff(dataset.read_stream(dataset.streams[0].id).device_ms))
     alone = Dataset(dataset.path, dataset.head, again.dataset.recordings[:0], [])
     assert to_xdf(alone, tmp_path / "nothing") == []
+
+
+def test_readers_of_xdf_keep_the_times_across_lost_samples(tmp_path: Path) -> None:
+    if importlib.util.find_spec("pyxdf") is None:
+        missing("lsl", "pyxdf is not installed")
+    import pyxdf
+
+    rows = [f"P1,{'Shake' if 400 <= i < 500 else ''},{10 * i},{i},1,2" for i in range(600) if not 100 < i < 300]
+    (tmp_path / "t.csv").write_text("\n".join(["subject,label,time_ms,x,y,z", *rows]) + "\n")
+    columns = {"time": "time_ms"}
+    done = ps.import_recordings(tmp_path / "t.csv", tmp_path / "DS", layout="accel-3", columns=columns)
+    (file,) = to_xdf(done.dataset, tmp_path / "xdf")
+    toy, markers = pyxdf.load_xdf(file)[0]
+    assert toy["time_stamps"] == pytest.approx(toy["time_series"][:, 3] / 1000.0, abs=1e-9)
+    assert markers["time_stamps"].tolist() == [4.0, 5.0]
+    assert toy["time_series"][np.searchsorted(toy["time_stamps"], 4.0), 0] == 400

@@ -155,6 +155,7 @@ def test_other_formats(tmp_path: Path, bundle: Bundle, onnx_here: None, capsys: 
     assert {"model.onnx", "model.int8.onnx"} <= set(facts["files"])
     said = (tmp_path / "out" / "README.md").read_text(encoding="utf-8")
     assert "`model.onnx`" in said and "`--also onnx-int8`" in said
+    assert said.count("Input 'raw', float32 (N, ") == 2
     assert main(["export", str(tmp_path / "m.plush"), str(tmp_path / "two"), "--also", "onx"]) == 2
     assert "Did you mean 'onnx'" in capsys.readouterr().err
     assert not (tmp_path / "two").exists()

@@ -9,6 +9,7 @@ from typing import Any
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, say, spread, table, warn
 from plushsense.cli.settings import marks, report_jobs, settings
+from plushsense.core.sentences import plural
 
 
 def run(args: argparse.Namespace) -> int:
@@ -33,8 +34,8 @@ def lines(result: dict[str, Any]) -> list[str]:
     """Format the scores of abstention as text."""
     out = marks({**result, "leaky": False})
     out.append(
-        f"{result['recordings']} gestures of {result['people']} people left out, classified at their "
-        f"end in the stream; {100 * result['accuracy']:.1f} % correct\n"
+        f"{plural(result['recordings'], 'gesture')} of {plural(result['people'], 'person')} left out, classified at "
+        f"their end in the stream; {100 * result['accuracy']:.1f} % correct\n"
     )
     rows = [
         (

@@ -10,6 +10,7 @@ from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, say, spread, table, warn
 from plushsense.cli.settings import listed, marks, settings
 from plushsense.core.errors import ConfigError
+from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
     from plushsense.experiments.adaptation import Adapted
@@ -137,7 +138,7 @@ def _lines(done: Adapted, out: Path) -> list[str]:
     if done.tested is not None:
         before, after = done.tested
         text.append(
-            f"on {before.recordings} recordings that were not used to adapt: {after.right} correct, before "
+            f"on {plural(before.recordings, 'recording')} that were not used to adapt: {after.right} correct, before "
             f"{before.right}; log loss {after.log_loss:.3f}, before {before.log_loss:.3f}."
         )
     return text
@@ -167,8 +168,8 @@ def _evaluate(args: argparse.Namespace) -> int:
 def _evaluation_lines(e: dict[str, Any]) -> list[str]:
     out = marks({**e, "leaky": False})
     out.append(
-        f"split {e['split']}, context {e['context']}; {e['use']} recordings of each gesture adapt, the rest test; "
-        f"{e['choices']} choices of recordings, {100 * e['refused']:.1f} % left the bundle as it is\n"
+        f"split {e['split']}, context {e['context']}; {plural(e['use'], 'recording')} of each gesture adapt, the rest "
+        f"test; {e['choices']} choices of recordings, {100 * e['refused']:.1f} % left the bundle as it is\n"
     )
     for engine, scores in e["engines"].items():
         rows = [

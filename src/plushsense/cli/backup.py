@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from plushsense.cli.output import emit, say
 from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.sentences import plural
 from plushsense.jobs.progress import ProgressReporter
 
 
@@ -51,9 +53,16 @@ def run_restore(args: argparse.Namespace) -> int:
         "streams": len(dataset.streams),
         "hash": dataset.hash,
     }
-    emit(args, result, f"{args.dest}: restored {result['recordings']} recordings of {result['subjects']} people")
+    emit(
+        args,
+        result,
+        f"{args.dest}: restored {plural(result['recordings'], 'recording')} of {plural(result['subjects'], 'person')}",
+    )
     return 0
 
 
-def _counts(table: dict[str, object]) -> str:
-    return f"{table['recordings']} recordings of {table['subjects']} people, {table['files']} files"
+def _counts(table: dict[str, Any]) -> str:
+    return (
+        f"{plural(table['recordings'], 'recording')} of {plural(table['subjects'], 'person')}, "
+        f"{plural(table['files'], 'file')}"
+    )

@@ -11,6 +11,7 @@ from plushsense.cli.options import options
 from plushsense.cli.output import emit, say
 from plushsense.cli.settings import listed
 from plushsense.core.errors import ConfigError
+from plushsense.core.sentences import plural
 from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
@@ -67,8 +68,8 @@ def overview(result: CheckReport) -> Iterator[str]:
     people = len(result.dataset.subjects)
     excluded = f", {result.excluded} excluded" if result.excluded else ""
     yield (
-        f"{result.dataset.path}: {result.recordings} recordings of {people} people checked{excluded}; "
-        f"{result.seconds:.1f} s"
+        f"{result.dataset.path}: {plural(result.recordings, 'recording')} of {plural(people, 'person')} checked"
+        f"{excluded}; {result.seconds:.1f} s"
     )
     if result.dataset.head.simulated:
         yield "SIMULATION: these recordings say nothing about a real toy."
@@ -121,4 +122,4 @@ def _by_person(findings: Sequence[Finding], lines: int) -> Iterator[str]:
         else:
             yield f"      {first.subject}: {len(group)}, for example {first.about}: {first.message}"
     if len(groups) > lines:
-        yield f"      and {sum(map(len, groups[lines:]))} more of {len(groups) - lines} people"
+        yield f"      and {sum(map(len, groups[lines:]))} more of {plural(len(groups) - lines, 'person')}"

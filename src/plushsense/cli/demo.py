@@ -8,6 +8,7 @@ from pathlib import Path
 
 from plushsense.cli.output import emit, say, spread, table
 from plushsense.cli.settings import report_stages
+from plushsense.core.sentences import plural
 
 
 def run(args: argparse.Namespace) -> int:
@@ -31,8 +32,8 @@ def run(args: argparse.Namespace) -> int:
             "",
             "Live, a virtual person left out of the training; the decision at the end of each gesture:",
             table(("at s", "performed", "decided", "affect", "decided"), rows),
-            f"  affect correct at the end of {right} of {len(gestures)} gestures; "
-            f"{summary['decisions_per_s']:.1f} decisions a second, {summary['counters']['lost']} lines lost, "
+            f"  affect correct at the end of {right} of {plural(len(gestures), 'gesture')}; "
+            f"{summary['decisions_per_s']:.1f} decisions a second, {plural(summary['counters']['lost'], 'line')} lost, "
             f"{summary['counters']['malformed']} malformed",
             "",
             f"data set  {done['dataset']}",

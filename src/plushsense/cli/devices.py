@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, say, table
 from plushsense.cli.settings import listed, report_stages
+from plushsense.cli.signals import interrupt_on_signals
 from plushsense.core.errors import ConfigError
 from plushsense.core.files import check_output_file
+from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
     from plushsense.devices.virtual.stream import ToySpec
@@ -38,6 +40,7 @@ def _publish(args: argparse.Namespace) -> int:
     from plushsense.devices.opening import open_device
 
     with (
+        interrupt_on_signals(),
         open_device(args.lsl_out, args.layout, reconnect=True) as device,
         LslOutlet(device.layout, args.lsl_name or "PlushSense") as outlet,
     ):
@@ -49,7 +52,10 @@ def _publish(args: argparse.Namespace) -> int:
             say("stopped")
         finally:
             counters = device.counters
-            say(f"published {counters.frames} frames; lost {counters.lost}, reconnected {counters.reconnects} times")
+            say(
+                f"published {plural(counters.frames, 'frame')}; lost {counters.lost}, reconnected "
+                f"{plural(counters.reconnects, 'time')}"
+            )
     return 0
 
 
@@ -66,7 +72,7 @@ def run_toy(args: argparse.Namespace) -> int:
     try:
         truth = Path(args.truth).open("a", encoding="utf-8") if args.truth else None
     except OSError as error:
-        raise ConfigError(f"--truth '{args.truth}' cannot be written: {error.strerror}.") from None
+        raise ConfigError(f"--truth '{args.truth}' cannot be written: {error.strerror or error}.") from None
 
     def ready(url: str) -> None:
         emit(args, {"url": url}, url)
@@ -102,9 +108,9 @@ def run_toy(args: argparse.Namespace) -> int:
         if truth is not None:
             truth.close()
     if args.lsl is not None:
-        say(f"published {counters.sent} frames")  # LSL does not report who received them
+        say(f"published {plural(counters.sent, 'frame')}")  # LSL does not report who received them
     else:
-        say(f"sent {counters.sent} lines; {counters.dropped} had no reader")
+        say(f"sent {plural(counters.sent, 'line')}; {counters.dropped} had no reader")
     return 0
 
 
@@ -138,7 +144,8 @@ def _play_to_folder(args: argparse.Namespace, spec: ToySpec) -> int:
     emit(
         args,
         played.to_dict(),
-        f"{args.out}: {played.seconds:.1f} s, {played.gestures} gestures of {len(played.people)} virtual people; "
+        f"{args.out}: {played.seconds:.1f} s, {plural(played.gestures, 'gesture')} of "
+        f"{plural(len(played.people), 'virtual person')}; "
         f"{counters}. Replay it as replay://{args.out}, or import {Path(args.out) / RECORDED}. A simulation.",
     )
     return 0
@@ -155,7 +162,8 @@ def run_simulate(args: argparse.Namespace) -> int:
     emit(
         args,
         summary,
-        f"{args.dataset or args.out}: {summary['recordings']} recordings of {args.people} virtual people. "
+        f"{args.dataset or args.out}: {plural(summary['recordings'], 'recording')} of "
+        f"{plural(args.people, 'virtual person')}. "
         "A simulation: scores on it say nothing about a real toy.",
     )
     return 0

@@ -9,6 +9,7 @@ from typing import Any
 from plushsense.cli.output import emit, figure, say, spread, table, warn
 from plushsense.cli.settings import SIMULATION, listed, marks, report_jobs, settings
 from plushsense.core.errors import ConfigError
+from plushsense.core.sentences import plural
 from plushsense.workflow.reporting import name_of
 
 
@@ -62,15 +63,18 @@ def lines(e: dict[str, Any]) -> list[str]:
     out += [f"{name:<16}{spread(e[key])}" for key, name in names.items()]
     rest = e["nobody"] if units == "subjects" else None
     if rest:
-        out.append(f"without recordings at rest: {rest['recordings']} recordings, accuracy {figure(rest['accuracy'])}")
+        out.append(
+            f"without recordings at rest: {plural(rest['recordings'], 'recording')}, accuracy "
+            f"{figure(rest['accuracy'])}"
+        )
     if rest and (whole := e.get("with_rest")):
         scores = ", ".join(f"{METRICS[key].name} {spread(of)}" for key, of in whole.items())
-        out.append(f"with them, over all classes and {len(e['folds'])} folds, as the paper: {scores}")
+        out.append(f"with them, over all classes and {plural(len(e['folds']), 'fold')}, as the paper: {scores}")
     for title, of in (("pooled recordings, by vote", e["by_recording"]), ("pooled windows", e["pooled"])):
         scores = ", ".join(f"{name} {figure(of[k])}" for k, name in names.items())
         out.append(f"{title}{', with recordings at rest' if rest and title == 'pooled windows' else ''}: {scores}")
     for kind, part in e["by_context"].items():
-        out.append(f"  on {kind} windows: accuracy {figure(part['accuracy'])} ({part['windows']} windows)")
+        out.append(f"  on {kind} windows: accuracy {figure(part['accuracy'])} ({plural(part['windows'], 'window')})")
     if "leakage" in e:
         out.append(describe_leakage(e["leakage"]))
     return out + (deployed(e["int8"]) if "int8" in e else [])
@@ -124,7 +128,7 @@ def _sweep_report(args: argparse.Namespace) -> int:
             f"'{args.out}' is a sweep: --dataset, --evaluation, --model and --recording are for a page of evaluations."
         )
     done = write_sweep_report(args.out, args.page, title=args.title, mlflow=args.mlflow)
-    emit(args, done, [f"{done['report']}: {done['done']} of {done['trials']} trials", *done["said"]])
+    emit(args, done, [f"{done['report']}: {done['done']} of {plural(done['trials'], 'trial')}", *done["said"]])
     return 0
 
 

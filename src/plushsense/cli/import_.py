@@ -6,8 +6,9 @@ import argparse
 from typing import Any
 
 from plushsense.cli.options import options
-from plushsense.cli.output import emit, plural, say, table
+from plushsense.cli.output import emit, say, table
 from plushsense.core.errors import ConfigError
+from plushsense.core.sentences import plural
 from plushsense.jobs.progress import ProgressReporter
 
 _MOST_WARNINGS = 20
@@ -26,12 +27,12 @@ def _columns(texts: list[str]) -> dict[str, str]:
 def _report(result: dict[str, Any], names: str) -> None:
     """Print warnings, and what was left out or rejected, on standard error; ``names`` says where all warnings are."""
     for line in result["warnings"][:_MOST_WARNINGS]:
-        say(f"warning: {line}")
+        say(line if getattr(line, "reason", "") == "adopted" else f"warning: {line}")
     if len(result["warnings"]) > _MOST_WARNINGS:
         say(f"... and {len(result['warnings']) - _MOST_WARNINGS} more warnings{names}")
     for sensor in result.get("sensors", ()):
         say(f"accelerometer {', '.join(sensor['axes'])}: {sensor['summary']}")
-    for proposal in result.get("proposals", ()):
+    for proposal in (p for p in result.get("proposals", ()) if not p["adopted"]):
         say(f"suggestion: {proposal['reason']}: {proposal['advice']}")
     for status in ("left_out", "rejected"):
         by_reason: dict[str, list[str]] = {}
@@ -75,7 +76,7 @@ def _dry_run(args: argparse.Namespace, given: dict[str, Any]) -> int:
         [
             table(["person", "session", "gesture", "time in ms", *shown], rows),
             *more,
-            f"{plural(found['recordings'], 'recording')} of {len(found['subjects'])} people, "
+            f"{plural(found['recordings'], 'recording')} of {plural(len(found['subjects']), 'person')}, "
             f"{plural(found['streams'], 'stream')}, layout {found['layout']}; nothing was written",
             *([f"gestures: {gestures}"] if gestures else []),
         ],
@@ -114,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
     emit(
         args,
         result,
-        f"{args.dest}: {plural(done.recordings, 'recording')} of {done.subjects} people{new}, "
+        f"{args.dest}: {plural(done.recordings, 'recording')} of {plural(done.subjects, 'person')}{new}, "
         f"{plural(len(done.gestures), 'gesture')}, {plural(done.streams, 'stream')}; "
         f"{plural(len(result['warnings']), 'warning')}, {plural(len(done.rejected), 'file')} rejected; "
         f"{done.seconds:.1f} s",

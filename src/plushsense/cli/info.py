@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, table
 from plushsense.core.errors import ConfigError, printable
+from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
     from plushsense.dataset.statistics import Duration, SummaryStatistics
@@ -26,7 +27,8 @@ def run(args: argparse.Namespace) -> int:
     emit(
         args,
         summary,
-        f"{dataset!r}\nlayout {summary['layout']}, {summary['located_in_stream']} recordings located in a stream, "
+        f"{dataset!r}\nlayout {summary['layout']}, {plural(summary['located_in_stream'], 'recording')} located "
+        "in a stream, "
         f"{summary['with_warnings']} with warnings, {summary['excluded']} excluded\nhash {summary['hash']}\n\n"
         + table(("gesture", "affect", "recordings", "people", "median s"), rows),
     )
@@ -77,7 +79,7 @@ def run_stats(args: argparse.Namespace) -> int:
         "channels": [asdict(c) for c in channels],
     }
     simulated = " (a simulation: it says nothing about people)" if dataset.head.simulated else ""
-    text = [f"{dataset.head.name}{simulated}: {len(dataset.used)} recordings, {trimmed} trimmed", ""]
+    text = [f"{dataset.head.name}{simulated}: {plural(len(dataset.used), 'recording')}, {trimmed} trimmed", ""]
     text += ["Whole recordings", _duration_table(durations, args.by, after=False), ""]
     if trimmed:
         text += ["After trimming", _duration_table(durations, args.by, after=True), ""]

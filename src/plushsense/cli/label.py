@@ -10,6 +10,7 @@ from dataclasses import asdict
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, say, table
 from plushsense.core.errors import ConfigError
+from plushsense.core.sentences import plural
 
 _LINES = 40
 
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     rows = [(s.stream, f"{s.start_s:.2f}", f"{s.stop_s:.2f}", s.label) for s in done.stretches]
     listing = [table(("stream", "start s", "stop s", "label"), rows), ""] if 0 < len(rows) <= _LINES else []
     totals = "".join(f"; {label} {total:.0f} s" for label, total in sorted(seconds.items()))
-    emit(args, result, [*listing, f"{len(rows)} labelled stretches{totals}"])
+    emit(args, result, [*listing, f"{plural(len(rows), 'labelled stretch')}{totals}"])
     return 0
 
 
@@ -64,5 +65,5 @@ def _relabel(args: argparse.Namespace) -> int:
     dataset = open_dataset(args.dataset)
     chosen = [r.id for r in find_recordings(dataset, args.recording)]
     changed = relabel(dataset, chosen, gesture, **options(args, "who", "why"))
-    emit(args, {"relabelled": list(changed)}, [f"relabelled {len(changed)} of {len(chosen)} recordings"])
+    emit(args, {"relabelled": list(changed)}, [f"relabelled {len(changed)} of {plural(len(chosen), 'recording')}"])
     return 0

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from plushsense.cli.output import say, write_line
+from plushsense.cli.output import say, warn, write_line
+from plushsense.cli.signals import interrupt_on_signals
 
 if TYPE_CHECKING:
     from plushsense.live.reactions import Reaction
@@ -18,6 +19,7 @@ STATES = {
     "warming": "collecting the first samples",
     "tracking": "reading",
     "no signal": "no signal",
+    "unreadable": "unreadable",
     "sensor fault": "sensor fault: the readings are not plausible",
 }
 
@@ -37,29 +39,40 @@ def run(args: argparse.Namespace) -> int:
     if args.smoothing is not None:
         decide = replace(decide, smoothing_s=args.smoothing)
     classifier = classifier_of(bundle, decide, args.engine)
-    with open_device(args.device, bundle.layout, reconnect=args.reconnect) as device:
+    with interrupt_on_signals(), open_device(args.device, bundle.layout, reconnect=args.reconnect) as device:
         say(
             f"reading {args.device}; {bundle.arch.symbol}, a decision every "
             f"{classifier.step_s * 1000:.0f} ms; Ctrl-C ends"
         )
-        live = run_live(device, classifier, seconds=args.seconds)
+        for assumed in device.notes:
+            say(f"warning: {args.device}: {assumed}")
+        fresh: list[str] = []
+
+        def note(sentence: str) -> None:
+            if args.text:
+                write_line(f"{classifier.time_s:9.2f} s  warning: {sentence}")
+            else:
+                warn(sentence)
+                fresh.append(sentence)
+
+        live = run_live(device, classifier, seconds=args.seconds, warn=note)
         try:
             state: State | None = None
-            mismatch = ""
             for decision in live:
-                if decision.state == "no signal" and device.mismatch != mismatch:
-                    say(mismatch := device.mismatch)
                 reactions = reactor.push(decision) if reactor else []
                 if args.text or args.events:
                     changed, state = decision.state != state, decision.state
-                    if not (changed or decision.events or reactions):
+                    if not (changed or decision.events or reactions or fresh):
                         continue
                 if args.text:
-                    lines = format_update(decision, changed, reactions, device.mismatch)
+                    lines = format_update(decision, changed, reactions)
                 else:
                     more: dict[str, object] = {"reactions": [r.to_dict() for r in reactions]} if reactor else {}
-                    if decision.state == "no signal" and device.mismatch:
+                    if decision.state == "unreadable":
                         more["mismatch"] = device.mismatch
+                    if fresh:
+                        more["warnings"] = fresh.copy()
+                        fresh.clear()
                     lines = [json.dumps(decision.to_dict() | more, ensure_ascii=False)]
                 if lines:
                     write_line("\n".join(lines))
@@ -71,18 +84,12 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def format_update(
-    decision: Decision, state_changed: bool, reactions: Sequence[Reaction] = (), mismatch: str = ""
-) -> list[str]:
-    """Format event changes, reactions and, if ``state_changed``, the new state as lines of text.
-
-    ``mismatch`` states why no line of the toy can be read, and replaces "no signal".
-    """
+def format_update(decision: Decision, state_changed: bool, reactions: Sequence[Reaction] = ()) -> list[str]:
+    """Format event changes, reactions and, if ``state_changed``, the new state as lines of text."""
     lines = [f"{event.t_s:9.2f} s  {_event(event)}" for event in decision.events]
     lines += [f"{reaction.t_s:9.2f} s    {_reaction(reaction)}" for reaction in reactions]
     if state_changed:
-        unread = mismatch if decision.state == "no signal" else ""
-        lines.append(f"{decision.t_s:9.2f} s  {unread or STATES[decision.state]}")
+        lines.append(f"{decision.t_s:9.2f} s  {STATES[decision.state]}")
     return lines
 
 

@@ -79,11 +79,6 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return Table.of(head, rows).text()
 
 
-def plural(n: int, noun: str) -> str:
-    """Format a count with its noun, as in ``1 fold`` or ``2 folds``."""
-    return f"{n} {noun}{'s' * (n != 1)}"
-
-
 def figure(value: float | None, digits: int = 3) -> str:
     """Format a score with ``digits`` decimal places, or as a dash if it is None."""
     return "-" if value is None else f"{value:z.{digits}f}"

@@ -8,6 +8,7 @@ from typing import Any
 
 from plushsense.cli.output import emit, figure, say, table, warn
 from plushsense.cli.settings import SIMULATION, listed, marks, report_jobs, settings
+from plushsense.core.sentences import plural
 
 
 def run_lens(args: argparse.Namespace) -> int:
@@ -92,7 +93,7 @@ def _merge_lines(result: dict[str, Any]) -> list[str]:
     heads = [head for name in names.values() for head in (name, "cross-fitted")]
     return [
         *marks(result),
-        f"split {result['split']}; means over {result['people']} people; nothing was trained again",
+        f"split {result['split']}; means over {plural(result['people'], 'person')}; nothing was trained again",
         "",
         table(("merges", "classes", "largest class", *heads, "confused", "in people", "merged last"), rows),
         "",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from plushsense.cli.output import emit, say
 from plushsense.core.errors import ConfigError
+from plushsense.core.sentences import plural
 from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
@@ -42,8 +43,8 @@ def run_pseudonymise(args: argparse.Namespace) -> int:
     emit(
         args,
         result,
-        f"{args.out}: {result['recordings']} recordings of {result['subjects']} people under pseudonyms, "
-        f"{result['files']} files; {len(done.findings)} findings to read.\n"
+        f"{args.out}: {plural(result['recordings'], 'recording')} of {plural(result['subjects'], 'person')} "
+        f"under pseudonyms, {plural(result['files'], 'file')}; {plural(len(done.findings), 'finding')} to read.\n"
         f"The key is {args.key}: store it apart from the data, and never publish it.",
     )
     return 0
@@ -77,9 +78,10 @@ def _removal_lines(result: Forgotten) -> list[str]:
             "files that may be derived from the person are listed:"
         )
     lines.append(
-        f"{'removed' if result.done else 'to remove'}: {len(plan.files)} files of '{plan.subject}' ({plan.raw} raw), "
-        f"{plan.marks} marks, {'their line in the people table, ' if plan.listed else ''}{len(plan.caches)} caches, "
-        f"{len(plan.evaluations)} evaluations, {len(plan.leftovers)} unfinished leftovers"
+        f"{'removed' if result.done else 'to remove'}: {plural(len(plan.files), 'file')} of '{plan.subject}' "
+        f"({plan.raw} raw), {plural(plan.marks, 'mark')}, "
+        f"{'their line in the people table, ' if plan.listed else ''}{plural(len(plan.caches), 'cache')}, "
+        f"{plural(len(plan.evaluations), 'evaluation')}, {plural(len(plan.leftovers), 'unfinished leftover')}"
     )
     paths = [*plan.files[:_MOST_FILES], *plan.caches, *plan.evaluations, *plan.leftovers]
     lines += [f"  {path}" for path in paths]

@@ -36,7 +36,7 @@ def _publish(args: argparse.Namespace) -> int:
     done = publish_dataset(
         args.dataset,
         args.out,
-        **options(args, "licence", "contact", "consent", "save", "key", "bids", "seed", "thorough"),
+        **options(args, "licence", "contact", "consent", "save", "key", "seed", "thorough"),
         streams=not args.no_streams,
         excluded=args.allow_excluded,
         columns=tuple(listed(args.allow_columns)),

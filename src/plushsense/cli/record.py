@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, say
+from plushsense.cli.signals import interrupt_on_signals
 from plushsense.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ _WAIT_S = 0.02
 
 
 def run(args: argparse.Namespace) -> int:
-    from plushsense.cli.terminal import Screen, interrupt_on_signals, keys
+    from plushsense.cli.terminal import Screen, keys
     from plushsense.core.version import __version__
     from plushsense.recording.recorder import (
         Recorder,
@@ -39,9 +40,10 @@ def run(args: argparse.Namespace) -> int:
     software = f"plushsense {__version__}"
     request = _request(args)
     folder, known = session_folder(Path(args.out), request, args.session, args.new)
-    with open_toy(with_speed(args.device, request.speed), session_layout(request, folder, known)) as device:
+    layout = session_layout(request, folder, known)
+    with interrupt_on_signals(), open_toy(with_speed(args.device, request.speed), layout) as device:
         head = session_head(request, folder, known is None, device.layout, software)
-        notices = _notices(request, head, known is None)
+        notices = [*_notices(request, head, known is None), *(f"{args.device}: {note}" for note in device.notes)]
         for notice in notices:
             say(f"warning: {notice}")
         session = OpenSession(folder, head)
@@ -53,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
         title = f"{head.subject}, session {folder.name}: {session.protocol.title}"
         screen = Screen(recorder, title, notices)
         try:
-            with interrupt_on_signals(), recorder, keys() as typed:
+            with recorder, keys() as typed:
                 _drive(recorder, typed, screen, auto is not None)
         finally:
             screen.close()

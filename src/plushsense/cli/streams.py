@@ -11,6 +11,7 @@ from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, say, table, warn
 from plushsense.cli.settings import listed, marks, report_jobs, settings
 from plushsense.core.errors import ConfigError
+from plushsense.core.sentences import plural
 from plushsense.jobs.progress import ProgressReporter
 
 
@@ -153,7 +154,7 @@ def _format_labels(result: dict[str, Any]) -> list[str]:
     if not result["labelled_stretches"]:
         return []
     return [
-        f"{result['practised']} events named a gesture that was being practised: right, but no hits",
+        f"{plural(result['practised'], 'event')} named a gesture that was being practised: right, but no hits",
         f"where a recording or a label says what happened ({result['known_hours']:.2f} h): "
         f"{_rate(result['false_events_per_known_hour'])} false events an hour",
     ]
@@ -181,7 +182,7 @@ def _format_systems(result: dict[str, Any]) -> list[str]:
     people = len(result["subjects"])
     return [
         *_marks(result),
-        f"split {result['split']}, {people} people left out in turn, seed {result['seed']}",
+        f"split {result['split']}, {plural(people, 'person')} left out in turn, seed {result['seed']}",
         "",
         table(("system", "setting", *_HEAD), rows),
         "",

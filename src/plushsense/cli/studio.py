@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from plushsense.cli.output import say
+from plushsense.cli.signals import interrupt_on_signals
 from plushsense.core.errors import ConfigError
 
 _HOME = "PlushSense"
@@ -49,5 +50,6 @@ def run(args: argparse.Namespace) -> int:
             say(f"The studio is at  {address}   Ctrl-C ends it. All files are in {workspace.folder}")
 
     names = tuple(args.name)
-    serve(workspace, host=args.host, port=args.port, names=names, show=not args.no_show, on_ready=on_ready)
+    with interrupt_on_signals():
+        serve(workspace, host=args.host, port=args.port, names=names, show=not args.no_show, on_ready=on_ready)
     return 0

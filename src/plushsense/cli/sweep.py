@@ -7,8 +7,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
-from plushsense.cli.output import emit, figure, plural, say, table, warn
+from plushsense.cli.output import emit, figure, say, table, warn
 from plushsense.cli.settings import grid_changes, marks, work_options
+from plushsense.core.sentences import plural
 from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
@@ -55,7 +56,8 @@ def _sweep_lines(s: dict[str, Any]) -> list[str]:
 
     out = marks(s)
     out.append(
-        f"grid {s['name']}, split {s['split']}, context {s['context']}: {s['done']} of {s['trials']} trials done "
+        f"grid {s['name']}, split {s['split']}, context {s['context']}: {s['done']} of "
+        f"{plural(s['trials'], 'trial')} done "
         f"({s['resumed']} from before)\n"
     )
     mark = " (leaky)" if s["leaky"] else ""
@@ -90,7 +92,7 @@ def run_search(args: argparse.Namespace) -> int:
 
 def _search_plan_lines(plan: dict[str, Any]) -> list[str]:
     """Format the plan of a search as text: networks to compare, networks left out, and the cost."""
-    rungs = ", ".join(f"{e} epochs on {f} folds" for e, f in zip(plan["rungs"], plan["folds"], strict=True))
+    rungs = ", ".join(f"{e} epochs on {plural(f, 'fold')}" for e, f in zip(plan["rungs"], plan["folds"], strict=True))
     return [
         *(f"left out: {row['arch']} {row['filters']}: {row['why']}" for row in plan["left_out"]),
         *marks(plan),
@@ -142,7 +144,7 @@ def _search_lines(s: dict[str, Any]) -> list[str]:
     )
     out.append(
         f"\nBest: {best['arch']} with {best['filters']}, macro-F1 {figure(best['macro_f1'])}{mark} over "
-        f"{best['folds']} folds. It is the best of {s['chosen_among']} on these people: slightly too high."
+        f"{plural(best['folds'], 'fold')}. It is the best of {s['chosen_among']} on these people: slightly too high."
     )
     small = s["smallest_equal"]
     if small["trial"] != best["trial"]:

@@ -7,7 +7,6 @@ import contextlib
 import math
 import os
 import queue
-import signal
 import sys
 import textwrap
 import threading
@@ -150,29 +149,6 @@ class KeyRepeatFilter:
         repeated = key == self._key and at_s - self._at_s < REPEAT_S.get(key.lower(), 0.0)
         self._key, self._at_s = key, at_s
         return repeated
-
-
-@contextmanager
-def interrupt_on_signals() -> Iterator[None]:
-    """Raise KeyboardInterrupt once, as Ctrl-C does, if the process is terminated or its terminal is closed."""
-    handled = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)]
-    # Keep ignoring signals that are already ignored, as with nohup.
-    handled = [number for number in handled if signal.getsignal(number) is signal.SIG_DFL]
-    if threading.current_thread() is not threading.main_thread():
-        handled = []
-
-    def end(number: int, frame: object) -> None:
-        for other in handled:
-            signal.signal(other, signal.SIG_IGN)
-        raise KeyboardInterrupt
-
-    for number in handled:
-        signal.signal(number, end)
-    try:
-        yield
-    finally:
-        for number in handled:
-            signal.signal(number, signal.SIG_DFL)
 
 
 _BOLD, _DIM, _RED, _GREEN, _BLUE, _OFF = "\x1b[1m", "\x1b[2m", "\x1b[31;1m", "\x1b[32;1m", "\x1b[34;1m", "\x1b[0m"

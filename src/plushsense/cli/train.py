@@ -10,6 +10,7 @@ from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, warn
 from plushsense.cli.settings import report_epochs, settings
 from plushsense.core.errors import ConfigError
+from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
     from plushsense.models.bundle import Bundle
@@ -79,11 +80,12 @@ def decided(decision: Mapping[str, Any]) -> list[str]:
     fitted = decision.get("fitted")
     if not fitted:
         return []
-    people = "1 person" if fitted["people"] == 1 else f"{fitted['people']} people"
+    people = plural(fitted["people"], "person")
     events, answers = fitted["events"], fitted.get("answers")
     text = f"Decisions fitted on {people} who {'was' if fitted['people'] == 1 else 'were'} held back"
     if "cost" in events:
-        text += f" ({fitted['gestures']} gestures in {60 * fitted['hours']:.0f} min of streams): mean cost of errors "
+        text += f" ({plural(fitted['gestures'], 'gesture')} in {60 * fitted['hours']:.0f} min of streams): mean "
+        text += "cost of errors "
         text += f"per gesture {figure(events['cost_before'])} with the defaults, "
         text += f"{figure(events['cost'])} now" if events["moved"] else "and no settings are reliably better"
     else:
@@ -110,6 +112,6 @@ def _gate(gate: Mapping[str, Any]) -> str:
     false = gate["false_alarms_per_hour"]
     alarms = "" if false is None else f", with {false:.1f} false alarms an hour"
     return (
-        f"Gate fitted on {gate['people']} people: it detects {100 * gate['recall']:.0f} % of their "
-        f"{gate['recordings']} energetic recordings{alarms}."
+        f"Gate fitted on {plural(gate['people'], 'person')}: it detects {100 * gate['recall']:.0f} % of their "
+        f"{plural(gate['recordings'], 'energetic recording')}{alarms}."
     )

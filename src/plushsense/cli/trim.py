@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, say, table
+from plushsense.core.sentences import plural
 from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
@@ -99,4 +100,8 @@ def _print(args: argparse.Namespace, done: TrimResult, drawn: list[Path]) -> Non
     counts = ", ".join(f"{n} {state}" for state, n in sorted(states.items()))
     head = ("recording", "rows", "start s", "stop s", "confidence", "state", "note")
     listing = [] if decided and not 0 < len(rows) <= _LINES else [table(head, rows), ""]
-    emit(args, result, [*listing, f"{len(done.trims)} recordings{': ' if counts else ''}{counts}", *map(str, drawn)])
+    emit(
+        args,
+        result,
+        [*listing, f"{plural(len(done.trims), 'recording')}{': ' if counts else ''}{counts}", *map(str, drawn)],
+    )

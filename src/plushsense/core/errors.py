@@ -35,6 +35,8 @@ from types import ModuleType
 # of what follows.
 _CONTROLS = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 _LONGEST_COMPARED = 200
+# Not that of a path, as in '../a', or of an ellipsis.
+_DOUBLED_STOP = re.compile(r"(?<=[\w)\]}'\"”’»])\.\.(?=\s|$)")
 
 
 def printable(text: str, *, lines: bool = False) -> str:
@@ -44,6 +46,11 @@ def printable(text: str, *, lines: bool = False) -> str:
     """
     plain = _CONTROLS.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
     return plain if lines else plain.replace("\n", "\\u000a").replace("\t", "\\u0009")
+
+
+def single_stops(text: str) -> str:
+    """Return a text with one full stop where a part that ends with one, such as a further sentence, left two."""
+    return _DOUBLED_STOP.sub(".", text)
 
 
 class PlushSenseError(Exception):
@@ -59,7 +66,7 @@ class PlushSenseError(Exception):
     """
 
     def __init__(self, message: str = "", *, reason: str = "", **values: object) -> None:
-        super().__init__(printable(message))
+        super().__init__(printable(single_stops(message)))
         self.reason, self.values = reason, values
 
 

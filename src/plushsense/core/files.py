@@ -169,7 +169,7 @@ def check_output_file(path: Path, mark: str, noun: str, error: type[BadInput], *
             return
         place = next((p for p in path.absolute().parents if p.exists()), None)
     except OSError as cause:
-        raise error(f"'{path}' cannot be used ({cause.strerror}): give another file.") from None
+        raise error(f"'{path}' cannot be used ({cause.strerror or cause}): give another file.") from None
     if place is None or not place.is_dir() or not os.access(place, os.W_OK | os.X_OK):
         raise error(f"'{path}' cannot be written: '{place or path}' is no folder in which you may write; give another.")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import LayoutError, nearest
+from plushsense.core.errors import ArrayError, LayoutError, nearest
+from plushsense.core.sentences import Sentence
 from plushsense.core.toml import builtin_names, load_table, read_named
 
 DEVICE_MS = "device_ms"
@@ -32,6 +34,8 @@ MOST_GAP_MS, MOST_GAP_SAMPLES, MOST_GAP_VALUES = 60_000, 60_000, 2_000_000
 MOST_CHANNELS = 4096  # as many as a network may read; also of the entries of every other list
 _SIZES = (1e-30, 1e30)  # of a step, and of a scale, which may be negative
 _INT32 = (-2147483648.0, 2147483647.0)
+# Labels of a stream that say no more than the place of a channel: "3", "ch3", "Channel 3", or nothing.
+_NUMBERED = re.compile(r"(?:ch(?:an(?:nel)?)?)?[\W\d_]*", re.IGNORECASE)
 
 
 def magnitude_limit(n: int) -> int:
@@ -113,6 +117,10 @@ class Channel:
         return float(f"{steps * self.step:.6g}"), f" {self.unit}" if plain else ""
 
 
+# What an import measures of the channels of a data set, and puts into its layout.
+MEASURED = ("offset", "unit", "valid_min", "valid_max")
+
+
 @dataclass(frozen=True)
 class Derived:
     """A channel computed from others, an integer with 4 fraction bits (`plushsense.windows.features.RunningMean`).
@@ -146,10 +154,20 @@ class CsvFormat:
 
 
 class StreamColumns(NamedTuple):
-    """Indices of a layout's channels in a sample of a stream, and of the device clock (None if the stream has none)."""
+    """Indices of a layout's channels in a sample of a stream, and of the device clock (None if the stream has none).
+
+    ``notes`` are sentences for the user on what was assumed: that the number of channels is enough where they have no
+    labels, and that another clock is better than one of float32.
+    """
 
     channels: tuple[int, ...]
     clock: int | None = None
+    notes: tuple[Sentence, ...] = ()
+
+    @property
+    def by_number(self) -> bool:
+        """Whether only the number of channels fits, since they have no labels."""
+        return any(note.reason == "stream_unnamed" for note in self.notes)
 
 
 @dataclass(frozen=True)
@@ -390,6 +408,19 @@ class Layout:
         derived = tuple(d for d in self.derived if d.kind != "gravity") + gravity
         return replace(self, derived=derived, inputs=(*others, *axes, *(d.name for d in gravity)))
 
+    def reads_as(self, other: Layout) -> bool:
+        """Return whether the channels are those of ``other``, but for what an import measures (`MEASURED`)."""
+        return self.names == other.names and not self.unlike(other)
+
+    def unlike(self, other: Layout) -> list[str]:
+        """Return which channels of the same names differ from those of ``other`` in more than an import measures.
+
+        Units must be the same unless the layouts have the same name.
+        """
+        measured = dict.fromkeys(key for key in MEASURED if key != "unit" or self.name == other.name)
+        pairs = zip(self.channels, other.channels, strict=True)
+        return [a.name for a, b in pairs if asdict(a) | measured != asdict(b) | measured]
+
     def index(self, name: str) -> int:
         """Return the index of a channel; for an unknown name raise LayoutError with the nearest known one."""
         if name not in self.names:
@@ -399,31 +430,63 @@ class Layout:
             )
         return self.names.index(name)
 
-    def match_columns(self, labels: Sequence[str], width: int) -> StreamColumns | str:
+    def in_steps(self, values: Sequence[float]) -> tuple[int, ...]:
+        """Return one sample of all channels (C,), as files and lines have it, in the integer steps of a frame.
+
+        Raises:
+            ArrayError: for another number of values, or one that is not finite.
+        """
+        if len(values) != self.n_channels:
+            raise ArrayError(
+                f"A sample has {len(values)} values, but layout '{self.name}' has {self.n_channels} channels: give one "
+                f"for each of {', '.join(self.names)}."
+            )
+        for channel, value in zip(self.channels, values, strict=True):
+            if not math.isfinite(value):
+                raise ArrayError(f"'{channel.name}' is {value} in a sample: accepted are finite numbers.")
+        return tuple(round(float(v) / c.step) for c, v in zip(self.channels, values, strict=True))
+
+    def match_columns(self, labels: Sequence[str], width: int, exact: bool = True) -> StreamColumns | str:
         """Match the ``width`` columns of a stream by label, or by position; return why if the stream does not fit.
 
         Labels are names of channels or header texts of the CSV format, in any order and without regard to case and
-        surrounding spaces; the stream may have further columns. If no label is a channel, the stream must have exactly
-        the channels of the layout, or the fields of its wire format.
+        surrounding spaces; the stream may have further columns. Labels that are other names mean another sensor, and
+        do not fit. If there are none, or plain numbers, the stream must have exactly the channels of the layout, or the
+        fields of its wire format.
+
+        Args:
+            exact: whether the values are more exact than float32, which is exact for 4.7 hours of milliseconds only:
+                the device clock of such a stream is not used.
         """
         texts = dict(zip((h.casefold() for h in self.csv.header), self.csv.columns, strict=True))
         texts |= {n.casefold(): n for n in (*self.names, DEVICE_MS)}
-        keys = [texts.get(label.strip().casefold(), "") for label in labels] if len(labels) == width else []
-        if set(keys) & set(self.names):
+        keys = [texts.get(label.strip().casefold(), "") for label in labels]
+        notes = []
+        if any(key or not _NUMBERED.fullmatch(label.strip()) for key, label in zip(keys, labels, strict=True)):
+            listed = f"{', '.join(labels[:6])}{', …' if len(labels) > 6 else ''}"
+            if not set(keys) & set(self.names):
+                mine = f"{', '.join(self.names[:6])}{', …' if self.n_channels > 6 else ''}"
+                return f"its {width} channels are {listed}, and those of layout '{self.name}' {mine}"
+            if len(labels) != width:
+                return f"its header names {len(labels)} channels ({listed}), and its samples have {width} values"
             if wrong := [n for n in self.names if keys.count(n) != 1]:
                 return f"its labels do not name {', '.join(wrong)} exactly once"
-        elif width == self.n_channels:
-            return StreamColumns(tuple(range(width)))
-        elif width == len(self.wire):
-            keys = list(self.wire)
+        elif width in (self.n_channels, len(self.wire)):
+            keys = list(self.names if width == self.n_channels else self.wire)
+            listed = ", ".join(keys)
+            message = f"its channels have no names: its {width} values are taken for {listed}, in this order"
+            notes.append(Sentence(message, reason="stream_unnamed", n=width, channels=listed))
         else:
-            named = f" ({', '.join(labels[:6])}{', …' if len(labels) > 6 else ''})" if any(labels) else ""
             return (
-                f"it has {width} channels{named}, and layout '{self.name}' needs {self.n_channels}, or the "
-                f"{len(self.wire)} of its wire format"
+                f"it has {width} channels, and layout '{self.name}' needs {self.n_channels}, or the {len(self.wire)} "
+                "of its wire format"
             )
         clock = keys.index(DEVICE_MS) if DEVICE_MS in keys else None
-        return StreamColumns(tuple(keys.index(n) for n in self.names), clock)
+        if clock is not None and not exact:
+            clock = None
+            message = f"its {DEVICE_MS} is float32, which is exact for 4.7 hours only: the time stamps are the clock"
+            notes.append(Sentence(message, reason="stream_clock", column=DEVICE_MS))
+        return StreamColumns(tuple(keys.index(n) for n in self.names), clock, tuple(notes))
 
     def samples(self, seconds: float) -> int:
         """Return the number of samples in ``seconds``, at least one."""

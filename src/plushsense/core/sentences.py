@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Self
 
-from plushsense.core.errors import PlushSenseError
+from plushsense.core.errors import PlushSenseError, single_stops
 
 
 class Sentence(str):
@@ -23,7 +23,7 @@ class Sentence(str):
     values: dict[str, Any]
 
     def __new__(cls, message: str = "", /, reason: str = "", **values: Any) -> Self:
-        sentence = super().__new__(cls, message)
+        sentence = super().__new__(cls, single_stops(message))
         sentence.reason, sentence.values = reason, values
         return sentence
 
@@ -43,3 +43,17 @@ class Sentence(str):
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
         """Return the sentence of which ``table`` is the `to_dict`."""
         return cls(table["message"], table["reason"], **table["values"])
+
+
+def join_names(names: Iterable[object], none: str = "none") -> str:
+    """Join names for a sentence, as in ``a, b``; ``none`` stands for no names, and '' for one that is blank."""
+    return ", ".join(text if (text := str(name)).strip() else "''" for name in names) or none
+
+
+def plural(n: int, noun: str) -> str:
+    """Format a count with its noun, as in ``1 fold``, ``2 folds``, ``0 people`` (of "person") or ``2 stretches``."""
+    if n == 1:
+        return f"1 {noun}"
+    if noun.endswith("person"):
+        return f"{n} {noun.removesuffix('person')}people"
+    return f"{n} {noun}{'es' if noun.endswith('ch') else 's'}"

@@ -33,6 +33,7 @@ from plushsense.core.files import refuse_special_files, write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames, ReadResult, read_bytes, read_recording, read_stream
+from plushsense.core.sentences import plural
 from plushsense.core.toml import load_table, read_toml
 from plushsense.dataset.about import About, HeadFile
 from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, append_marks, locked, read_marks
@@ -341,13 +342,15 @@ class Dataset:
         self._with_stretches = True
 
     def with_inputs(self, layout: Layout) -> Dataset:
-        """Return this data set with the network inputs of ``layout``; itself if the measured channels differ.
+        """Return this data set as a network with ``layout`` reads it; itself if it is of other channels.
 
-        With the inputs comes the self-calibration that they are computed from.
+        Besides the inputs, offsets, valid ranges, rate, gap and self-calibration become those of ``layout``: in a data
+        set, they may have been measured when it was imported (`Layout.reads_as`).
         """
         own = self.layout
-        given = {key: getattr(layout, key) for key in ("inputs", "derived", "self_calibration")}
-        if own.channels != layout.channels or given == {key: getattr(own, key) for key in given}:
+        keys = ("channels", "rate_hz", "gap_ms", "inputs", "derived", "self_calibration")
+        given = {key: getattr(layout, key) for key in keys}
+        if not own.reads_as(layout) or given == {key: getattr(own, key) for key in given}:
             return self
         head = replace(self.head, layout=replace(own, **given))
         return self._copy(head, self.recordings)
@@ -508,8 +511,9 @@ class Dataset:
 
     def __repr__(self) -> str:
         return (
-            f"Dataset({self.head.name!r}: {len(self.recordings)} recordings, {len(self.subjects)} people, "
-            f"{len(self.gestures)} gestures, {len(self.streams)} streams)"
+            f"Dataset({self.head.name!r}: {plural(len(self.recordings), 'recording')}, "
+            f"{plural(len(self.subjects), 'person')}, {plural(len(self.gestures), 'gesture')}, "
+            f"{plural(len(self.streams), 'stream')})"
         )
 
     def _repr_html_(self) -> str:

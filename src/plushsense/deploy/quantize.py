@@ -315,7 +315,9 @@ def classifier_of(bundle: Bundle, decide: DecideSpec | None, engine: str) -> Str
     if engine == "float":
         return StreamClassifier(bundle, decide)
     model = integer_model(bundle, decide)
-    return IntegerClassifier(model) if engine == "int8" else BothEngines(model, StreamClassifier(bundle, decide))
+    one = IntegerClassifier(model) if engine == "int8" else BothEngines(model, StreamClassifier(bundle, decide))
+    one.bundle = bundle
+    return one
 
 
 def integer_probabilities(network: IntegerNetwork, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:

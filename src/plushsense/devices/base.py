@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import time
+import warnings
 from abc import ABC, abstractmethod
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import NamedTuple, Self
 
+from plushsense.core.errors import PlushSenseWarning
 from plushsense.core.layouts import Layout
+from plushsense.core.sentences import Sentence
 
 
 class Frame(NamedTuple):
@@ -48,43 +52,110 @@ class Counters:
         return asdict(self)
 
 
+_AROUND = 8  # frames before and after a long step that are compared
+_FEW = 20
+# Difference in frames up to which a count stays; above a half, as clocks drift.
+_SAME = 0.65
+# Mean distance of the usual steps from their mean, relative to it, up to which a clock counts as even.
+_EVEN, _EVEN_FEW = 0.16, 0.08
+
+
+@dataclass
+class _LongStep:
+    """A step that may hide lost frames: its position and length, the clock in the frames before, what was counted."""
+
+    at: int
+    step: int
+    before: list[int]
+    counted: int = 0
+
+
 class LossCounter:
-    """Count lost frames by the device clock: a step of at least 1.5 times the running median means lost frames.
+    """Count lost frames by the device clock.
+
+    A step of at least 1.5 periods means lost frames only if the frames after it stay as late as it was: time stamps
+    that vary, a late frame that the next ones make up for, and frames stamped several at once are no loss. The period
+    is measured, because the rate of a toy is not exactly that of its layout. Where steps vary by about a third, it is
+    their mean, so that frames lost evenly look like a lower rate.
 
     If the clock goes back or advances by more than ``pause_ms``, it was reset or paused, and no frames are counted.
     """
 
     def __init__(self, span: int = 101, pause_ms: int = 10_000) -> None:
         self._steps: deque[int] = deque(maxlen=span)
-        self._last: int | None = None
+        self._recent: deque[int] = deque(maxlen=_AROUND + 1)
+        self._long: list[_LongStep] = []
         self._pause_ms = pause_ms
-        self._median = 0.0
-        self._stale = 0
+        self._frames = self._stale = 0
+        self._period = 0.0
 
     def push(self, device_ms: int) -> int:
-        """Return how many frames are missing between the previous frame and this one."""
-        last, self._last = self._last, device_ms
-        if last is None:
-            return 0
-        step = device_ms - last
+        """Return by how much this frame changes the number of lost ones; negative if some of them were only late."""
+        recent = self._recent
+        step = device_ms - recent[-1] if recent else -1
         if not 0 <= step <= self._pause_ms:
+            recent.clear()
+            self._long = []
+        recent.append(device_ms)
+        self._frames += 1
+        if len(recent) < 2:
             return 0
         self._steps.append(step)
-        # The median of many steps changes slowly, so it is computed only every 10 frames.
+        # The mean of many steps changes slowly, so it is computed only every 20 frames.
         self._stale += 1
-        if self._median <= 0.0 or self._stale >= 10 or len(self._steps) < 20:
-            self._median = float(sorted(self._steps)[len(self._steps) // 2])
-            self._stale = 0
-        if self._median <= 0.0 or step < 1.5 * self._median:
+        if self._stale >= _FEW or len(self._steps) < _FEW:
+            self._period, self._stale = self._measure_period(), 0
+        if 0.0 < 1.5 * self._period <= step:
+            self._long.append(_LongStep(self._frames, step, list(recent)[:-1]))
+        elif not self._long:
             return 0
-        return max(1, round(step / self._median) - 1)
+        change = 0
+        for one in self._long:
+            counted = self._lost_in(one)
+            change += counted - one.counted
+            one.counted = counted
+        wait = [_AROUND + round(one.step / max(self._period, 1.0)) for one in self._long]
+        self._long = [one for one, n in zip(self._long, wait, strict=True) if self._frames - one.at < n]
+        return change
+
+    def _measure_period(self) -> float:
+        """Return the time between two frames; 0 if it is not known, or if frames are stamped several at once."""
+        steps, n = sorted(self._steps), len(self._steps)
+        median, mean = steps[n // 2], sum(steps) / n
+        if steps[(n - 1) // 4] < mean / 4:
+            return 0.0
+        usual = steps[bisect_left(steps, 0.5 * median) : bisect_right(steps, 1.5 * median)]
+        period = sum(usual) / len(usual)
+        few = n < _FEW
+        spread = sum(abs(step - period) for step in usual) / len(usual)
+        if 2 * len(usual) >= n and spread <= (_EVEN_FEW if few else _EVEN) * period:
+            return 0.0 if few and steps[0] < 0.5 * median else period
+        return 0.0 if few else mean
+
+    def _lost_in(self, one: _LongStep) -> int:
+        """Return how many frames are lost in a long step, by how much later the frames after it are than those before.
+
+        Both the earliest and the latest of them must be later, measured from an even clock through the last one before.
+        """
+        period, last = self._period, one.before[-1]
+        if period <= 0.0:
+            return 0
+        since = self._frames - one.at + 1
+        after = list(self._recent)[-min(since, _AROUND) :]
+        late = [ms - last - (since - n) * period for n, ms in enumerate(reversed(after))]
+        usual = [ms - last + n * period for n, ms in enumerate(reversed(one.before))]
+        shift = min(max(late) - max(usual), min(late) - min(usual)) / period
+        if since > 1 and abs(shift - one.counted) < _SAME:
+            return one.counted
+        return min(max(0, round(shift)), max(1, round(one.step / period) - 1))
 
 
 class Device(ABC):
     """An open toy. Use it as a context manager and iterate over its frames, or call `read` repeatedly.
 
     Iteration ends when the source ends (a file, or a connection that the other side closed properly) or when `close` is
-    called, even from another thread. A lost connection raises DeviceError.
+    called, even from another thread. A lost connection raises DeviceError. Lines that cannot be read give a
+    PlushSenseWarning.
 
     Attributes:
         url: the URL with which it was opened.
@@ -93,6 +164,7 @@ class Device(ABC):
         wait_s: longest wait of `read`; 0 does not wait, for reading many toys in turn.
         arrived_s: time at which the bytes of the last frames arrived, before they were parsed, by `time.perf_counter`;
             for a replay or a virtual toy, the time at which the first of them was due. None if unknown.
+        notes: sentences for the user on what was assumed about the frames.
     """
 
     def __init__(self, url: str, layout: Layout) -> None:
@@ -102,6 +174,7 @@ class Device(ABC):
         self.closed = False
         self.wait_s = 0.1
         self.arrived_s: float | None = None
+        self.notes: tuple[str, ...] = ()
 
     @abstractmethod
     def read(self) -> list[Frame] | None:
@@ -112,9 +185,9 @@ class Device(ABC):
         """
 
     @property
-    def mismatch(self) -> str:
-        """What to do if the toy sends lines that do not fit the layout; "" if they do, or nothing has been received."""
-        return ""
+    def mismatch(self) -> Sentence:
+        """Why lines of the toy cannot be read, with the first of them, and what to do; "" if they can, or none came."""
+        return Sentence()
 
     def reopen(self) -> Device | None:
         """Return a device that continues, or ends, after a lost connection; None: it must be opened anew by its URL.
@@ -134,8 +207,12 @@ class Device(ABC):
             self._shut()
 
     def __iter__(self) -> Iterator[Frame]:
+        reported = ""
         while not self.closed:
             frames = self.read()
+            if not frames and self.mismatch != reported:
+                reported = self.mismatch
+                warnings.warn(str(reported), PlushSenseWarning, stacklevel=2)
             if frames is None:
                 return
             yield from frames

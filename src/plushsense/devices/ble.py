@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import atexit
 import contextlib
 import queue
 import re
@@ -17,7 +18,7 @@ from urllib.parse import unquote
 
 from plushsense.core.errors import ConfigError, DeviceError, need
 from plushsense.core.layouts import Layout
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, join_names
 from plushsense.devices.base import Device, Frame, now_ms
 from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
 from plushsense.devices.wire import LineParser
@@ -25,8 +26,10 @@ from plushsense.devices.wire import LineParser
 UART_SERVICE = "6e400001-b5a3-f393-e0a9-e50e24dcca9e"
 UART_TX = "6e400003-b5a3-f393-e0a9-e50e24dcca9e"
 """Nordic UART service and its notifying characteristic (Nordic Semiconductor, nRF Connect SDK, "NUS")."""
+_GATT_SERVICE = "1801"  # of nearly all devices
 
 FIND_S = 10.0
+SILENCE_S = 10.0
 _TOY_WORDS = ("plush", "toy", "teddy", "bear")
 _CONNECT_S = 20.0
 _MAC = re.compile(r"[0-9A-F]{2}(?:[:-][0-9A-F]{2}){5}\Z", re.IGNORECASE)
@@ -43,6 +46,8 @@ class BleTarget:
         service: UUID of the service.
         tx: UUID of the notifying characteristic; None: the only one of the service.
         find_s: longest duration of the search, in seconds.
+        silence_s: time without notifications after which a toy that has sent some counts as disconnected, in seconds;
+            0: no limit.
     """
 
     name: str | None = None
@@ -50,14 +55,16 @@ class BleTarget:
     service: str = UART_SERVICE
     tx: str | None = UART_TX
     find_s: float = FIND_S
+    silence_s: float = SILENCE_S
 
 
 @dataclass(frozen=True)
 class BleBackends:
-    """Client and scanner backend classes of bleak; None: those of the platform."""
+    """Client, scanner and adapter backend classes of bleak; None: those of the platform."""
 
     client: type[Any] | None = None
     scanner: type[Any] | None = None
+    adapter: type[Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -89,6 +96,10 @@ class BleDevice(Device):
 
     bleak runs in the event loop of another thread (`bluetooth_loop`), which queues the notifications for `read`.
     Notifications may end within a line; the first line may be incomplete, as on a serial port.
+
+    bleak does not report that the system's Bluetooth service has crashed, so that notifications that stop for
+    ``silence_s`` end the connection, too. A toy that has not sent anything yet may be silent for any time. The system
+    keeps a connection whose program has ended: the device closes at the latest when Python ends.
     """
 
     def __init__(self, url: str, layout: Layout, target: BleTarget, backends: BleBackends | None = None) -> None:
@@ -99,7 +110,9 @@ class BleDevice(Device):
         self._parser = LineParser(layout, self.counters, joining=True)
         self._received: queue.SimpleQueue[tuple[float, int, bytes] | None] = queue.SimpleQueue()
         self._over: asyncio.Event | None = None
+        self._received_s: float | None = None
         self._loop = bluetooth_loop()
+        atexit.register(self.close)
         opened: Future[None] = Future()
         self._task = asyncio.run_coroutine_threadsafe(self._work(opened), self._loop)
         try:
@@ -116,6 +129,8 @@ class BleDevice(Device):
             try:
                 received = self._received.get(timeout=self.wait_s) if wait else self._received.get_nowait()
             except queue.Empty:
+                if not frames:
+                    self._check_silence()
                 return frames
             if received is None:
                 if self.closed:
@@ -133,15 +148,28 @@ class BleDevice(Device):
             wait = False
         return None
 
+    def _check_silence(self) -> None:
+        limit_s = self._target.silence_s
+        if self._received_s is not None and 0.0 < limit_s <= time.perf_counter() - self._received_s:
+            self._parser.finish()
+            raise DeviceError(
+                f"'{self.url}' has stopped sending for {limit_s:g} s, so its connection is given up: is it still near, "
+                "and Bluetooth running? For a toy that pauses, write ?silence_s=0.",
+                reason="toy_gone",
+                url=self.url,
+            )
+
     def _on_notification(self, _: Any, data: bytearray) -> None:
-        self._received.put((time.perf_counter(), now_ms(), bytes(data)))
+        self._received_s = time.perf_counter()
+        self._received.put((self._received_s, now_ms(), bytes(data)))
 
     @property
-    def mismatch(self) -> str:
+    def mismatch(self) -> Sentence:
         """As in `Device`."""
         return self._parser.mismatch(self.url)
 
     def _shut(self) -> None:
+        atexit.unregister(self.close)
         self._loop.call_soon_threadsafe(self._end)
         self._received.put(None)
         with contextlib.suppress(TimeoutError):
@@ -179,30 +207,52 @@ class BleDevice(Device):
             self._received.put(None)
 
     async def _listen(self, over: asyncio.Event, opened: Future[None]) -> None:
-        device = await self._find()
+        # A toy does not advertise while it is connected, be it by a program that ended without disconnecting.
+        connected = await _connected(self._bleak, self._backends, self._target.service)
+        for device in connected:
+            if self._matches(device.address, device.name):
+                # The system may be wrong: after a crash of its service, only a scan brings the toy back.
+                with contextlib.suppress(self._bleak.exc.BleakError):
+                    await self._receive(device, f"'{self.url}' is still connected to this computer", over, opened)
+                    return
+        device = await self._find(connected)
+        await self._receive(device, f"'{self.url}' was found", over, opened)
+
+    async def _receive(self, device: Any, found: str, over: asyncio.Event, opened: Future[None]) -> None:
+        connected = False
+
+        def disconnected(_: Any) -> None:
+            # bleak calls this also while it tries to connect, and before its `disconnect` returns.
+            if connected:
+                self._loop.call_soon_threadsafe(over.set)
+
         chosen = {} if self._backends.client is None else {"backend": self._backends.client}
-        client = self._bleak.BleakClient(
-            device, lambda _: self._loop.call_soon_threadsafe(over.set), timeout=_CONNECT_S, **chosen
-        )
+        client = self._bleak.BleakClient(device, disconnected, timeout=_CONNECT_S, **chosen)
         try:
             await asyncio.wait_for(client.connect(), _CONNECT_S)
         except TimeoutError:
             raise DeviceError(
-                f"'{self.url}' was found but could not be connected within {_CONNECT_S:g} s: "
-                "is another computer or phone connected to it?",
+                f"{found} but could not be connected within {_CONNECT_S:g} s: "
+                "is another computer or phone connected to it? Switching it off and on disconnects all.",
                 reason="toy_unreachable",
                 url=self.url,
             ) from None
+        connected = True
         try:
             characteristic = self._characteristic(list(client.services))
             await client.start_notify(characteristic, self._on_notification)
             opened.set_result(None)
             await over.wait()
         finally:
+            connected = False
             with contextlib.suppress(Exception):
                 await asyncio.wait_for(client.disconnect(), 3.0)
 
-    async def _find(self) -> Any:
+    def _matches(self, address: str, name: str | None) -> bool:
+        target = self._target
+        return _same(address, target.address) if target.address is not None else name == target.name
+
+    async def _find(self, connected: list[Any]) -> Any:
         """Scan for the device, since connecting to an address without a scan is unreliable (see bleak's manual)."""
         target = self._target
         device_found: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
@@ -211,8 +261,7 @@ class BleDevice(Device):
         def advertised(device: Any, data: Any) -> None:
             name = data.local_name or device.name or ""
             names[device.address] = name
-            matches = _same(device.address, target.address) if target.address else name == target.name
-            if matches and not device_found.done():
+            if self._matches(device.address, name) and not device_found.done():
                 device_found.set_result(device)
 
         with contextlib.suppress(TimeoutError):
@@ -223,10 +272,13 @@ class BleDevice(Device):
             here = f"there are {', '.join(there[:8])}" + (f" and {len(there) - 8} more" if len(there) > 8 else "")
         else:
             here = f"there are {len(names)} without a name" if names else "nothing advertises here"
+        if connected:
+            still = join_names(f"{device.name or 'a device without a name'} ({device.address})" for device in connected)
+            here += f"; still connected to this computer: {still}"
         described = f"named '{target.name}'" if target.address is None else f"with the address {target.address}"
         raise DeviceError(
             f"'{self.url}': no Bluetooth device {described} advertised within {target.find_s:g} s; {here}; "
-            "is it switched on, near, and not connected elsewhere?",
+            "is it switched on, near, and not still connected to this computer or to another?",
             reason="toy_no_bluetooth",
             name=target.name or target.address,
         )
@@ -236,7 +288,7 @@ class BleDevice(Device):
         service = next((s for s in services if s.uuid.lower() == target.service), None)
         if service is None:
             raise DeviceError(
-                f"'{self.url}' has no service {target.service}; it has {_listed(s.uuid for s in services)}: "
+                f"'{self.url}' has no service {target.service}; it has {join_names(sorted(s.uuid for s in services))}: "
                 "write ?service=UUID&tx=UUID."
             )
         notifying = [c for c in service.characteristics if {"notify", "indicate"} & set(c.properties)]
@@ -247,7 +299,7 @@ class BleDevice(Device):
             wrong = "names none of those" if target.tx is None else f"{target.tx} is none of those"
             raise DeviceError(
                 f"'{self.url}': of service {target.service} the characteristics that notify are "
-                f"{_listed(c.uuid for c in notifying)}, and the URL's tx {wrong}: write &tx=UUID."
+                f"{join_names(sorted(c.uuid for c in notifying))}, and the URL's tx {wrong}: write &tx=UUID."
             )
         return match
 
@@ -297,6 +349,15 @@ def search_bluetooth(scan_s: float, backends: BleBackends | None = None) -> Devi
     return DeviceListing(toys, [Sentence(message, reason="ble_others", n=others)])
 
 
+async def _connected(bleak: ModuleType, backends: BleBackends, service: str) -> list[Any]:
+    """Return the devices that are connected to this computer; none if bleak, before 3.1, or the system cannot tell."""
+    chosen = {} if backends.adapter is None else {"backend": backends.adapter}
+    with contextlib.suppress(Exception):
+        adapter = await bleak.BleakAdapter.get(**chosen)
+        return list(await adapter.get_connected_devices([service, _GATT_SERVICE]))
+    return []
+
+
 def _scanner(bleak: ModuleType, backends: BleBackends, advertised: Callable[[Any, Any], None]) -> Any:
     chosen = {} if backends.scanner is None else {"backend": backends.scanner}
     return bleak.BleakScanner(detection_callback=advertised, **chosen)
@@ -323,11 +384,6 @@ def _same(address: str, other: str) -> bool:
     return address.replace("-", ":").lower() == other.replace("-", ":").lower()
 
 
-def _listed(uuids: Any) -> str:
-    texts = sorted(uuids)
-    return ", ".join(texts) if texts else "none"
-
-
 def _uuid(address: DeviceAddress, key: str) -> str | None:
     text = address.query.get(key)
     if text is None:
@@ -343,8 +399,8 @@ def _uuid(address: DeviceAddress, key: str) -> str | None:
 
 
 def open_ble(address: DeviceAddress, layout: Layout) -> BleDevice:
-    """Open ``ble://AA:BB:CC:DD:EE:FF?service=UUID&tx=UUID`` or ``ble://name:PlushName?find_s=10``."""
-    address.check_keys(("service", "tx", "find_s"))
+    """Open ``ble://AA:BB:CC:DD:EE:FF?service=UUID&tx=UUID`` or ``ble://name:PlushName?find_s=10&silence_s=10``."""
+    address.check_keys(("service", "tx", "find_s", "silence_s"))
     place = unquote(address.place).strip("/")
     named, colon, name = place.partition(":")
     by_name = named.lower() == "name" and colon != ""
@@ -361,5 +417,6 @@ def open_ble(address: DeviceAddress, layout: Layout) -> BleDevice:
         service or UART_SERVICE,
         tx or (UART_TX if service in (None, UART_SERVICE) else None),
         address.number("find_s", FIND_S, 0.1, 600.0),
+        address.number("silence_s", SILENCE_S, 0.0, 3600.0),
     )
     return BleDevice(address.url, layout, target)

@@ -94,7 +94,7 @@ class LineDevice(Device):
         return self._parser.frames(data, now_ms())
 
     @property
-    def mismatch(self) -> str:
+    def mismatch(self) -> Sentence:
         """As in `Device`."""
         return self._parser.mismatch(self.url)
 

@@ -8,14 +8,14 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 from urllib.parse import quote, unquote
 
 from plushsense.core.errors import ConfigError, DeviceError, need
-from plushsense.core.layouts import DEVICE_MS, Layout, StreamColumns
+from plushsense.core.layouts import DEVICE_MS, Layout
 from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Device, Frame, LossCounter, now_ms
 from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
@@ -24,8 +24,10 @@ from plushsense.devices.virtual.server import ToyCounters, ToyServer
 from plushsense.devices.virtual.stream import PerformedGesture, VirtualDevice
 
 FIND_S = 5.0
-KEYS = {"name": "name", "type": "type", "source": "source_id"}
+KEYS = {"name": "name", "type": "type", "source": "source_id", "uid": "uid"}
 """Search keys of a URL, and the LSL stream property for each."""
+_SECOND_S = 1.0
+"""Time to search for a second stream: liblsl asks known computers, one by one, only 0.5 s after the multicast."""
 
 _LIMIT = 2**53
 _BACK_MS = 1000
@@ -61,6 +63,7 @@ class LslDevice(Device):
     the LSL time stamp, from the sender's clock, in whole milliseconds. A time stamp up to 1 s earlier than the previous
     one is replaced by that, so that the clock does not go back; a larger step back is a restart. Values are converted
     to integer steps. A sample with a value that is not finite, or is a fraction for a step of 1, counts as malformed.
+    A `device_ms` of float32 is not used, since it is exact for less than five hours.
     """
 
     def __init__(self, url: str, layout: Layout, key: str, value: str, find_s: float = FIND_S) -> None:
@@ -79,31 +82,30 @@ class LslDevice(Device):
         self._inlet: Any = self._pylsl.StreamInlet(found, recover=False)
         try:
             labels = stream_labels(self._inlet.info(timeout=FIND_S))
-            columns = layout.match_columns(labels, found.channel_count())
+            exact = found.channel_format() != self._pylsl.cf_float32
+            columns = layout.match_columns(labels, found.channel_count(), exact)
             if isinstance(columns, str):
                 raise DeviceError(f"The stream '{url}' does not fit: {columns}; choose another layout with ?layout=.")
             self._columns = columns
+            self.notes = columns.notes
             self._inlet.open_stream(timeout=FIND_S)
         except RuntimeError:  # pylsl's TimeoutError and LostError, which it keeps elsewhere in each version
             raise DeviceError(
                 f"'{url}' is announced but does not answer: is its program still running, and no firewall between?"
             ) from None
-        if found.channel_format() == self._pylsl.cf_float32 and self._columns.clock is not None:
-            # A float32 is exact for less than five hours of milliseconds.
-            self._columns = StreamColumns(self._columns.channels)
 
     def _find(self, key: str, value: str, find_s: float) -> Any:
         mark = '"' if "'" in value else "'"
         predicate = f"{KEYS[key]}={mark}{value}{mark}"
         found = self._pylsl.resolve_bypred(predicate, 1, find_s)
-        if found:  # search for a second one, since it must be unique
-            found = {s.uid(): s for s in (*found, *self._pylsl.resolve_bypred(predicate, 2, 0.3))}
+        if found and key != "uid":  # search for a second one, since it must be unique
+            found = {s.uid(): s for s in (*found, *self._pylsl.resolve_bypred(predicate, 2, _SECOND_S))}.values()
         if len(found) == 1:
-            return next(iter(found.values()))
+            return next(iter(found))
         if found:
-            sources = ", ".join(f"'{s.source_id()}' on {s.hostname()}" for s in found.values())
-            message = f"'{self.url}' fits {len(found)} streams, of {sources}: name one by lsl://source:ID."
-            raise DeviceError(message, reason="toy_several_streams", url=self.url)
+            choices = ", ".join(f"{u} on {s.hostname()}" for u, s in zip(stream_urls(found), found, strict=True))
+            message = f"'{self.url}' fits {len(found)} streams: open one of {choices}."
+            raise DeviceError(message, reason="toy_several_streams", url=self.url, urls=choices)
         there = ", ".join(f"{s.name()} ({s.type() or 'no type'})" for s in self._pylsl.resolve_streams(0.5))
         raise DeviceError(
             f"'{self.url}': no LSL stream has the {key} '{value}' within {find_s:g} s; "
@@ -192,19 +194,29 @@ def name_url(name: str) -> str:
     return f"lsl://{prefix}{quote(name)}"
 
 
-def stream_url(info: Any, *, unique_name: bool = True) -> str:
-    """Return the URL that opens a stream: by its name if that is unique, else by its source."""
-    source = info.source_id()
-    return name_url(info.name()) if unique_name or not source else f"lsl://source:{quote(source)}"
+def stream_urls(streams: Iterable[Any]) -> list[str]:
+    """Return for each stream the URL that opens only this one: its name, else its source, else its uid.
+
+    A uid changes with every start of the program that sends the stream.
+    """
+    streams = list(streams)
+    names, sources = Counter(s.name() for s in streams), Counter(s.source_id() for s in streams)
+    return [
+        name_url(s.name())
+        if names[s.name()] == 1
+        else f"lsl://source:{quote(s.source_id())}"
+        if s.source_id() and sources[s.source_id()] == 1
+        else f"lsl://uid:{s.uid()}"
+        for s in streams
+    ]
 
 
 def search_streams(scan_s: float) -> DeviceListing:
     """List all LSL streams."""
     streams = {s.uid(): s for s in load_pylsl().resolve_streams(scan_s)}.values()
-    names = Counter(s.name() for s in streams)
     devices = [
         DeviceInfo(
-            stream_url(s, unique_name=names[s.name()] == 1),
+            url,
             "lsl",
             s.name(),
             Sentence(
@@ -215,13 +227,13 @@ def search_streams(scan_s: float) -> DeviceListing:
                 host=s.hostname(),
             ),
         )
-        for s in streams
+        for url, s in zip(stream_urls(streams), streams, strict=True)
     ]
     return DeviceListing(sorted(devices, key=lambda d: (d.name, d.url)))
 
 
 def open_lsl(address: DeviceAddress, layout: Layout) -> LslDevice:
-    """Open ``lsl://NAME``, ``lsl://type:EEG`` or ``lsl://source:ID``; ``?find_s=5`` bounds the search."""
+    """Open ``lsl://NAME``, or by another of the `KEYS`, as ``lsl://source:ID``; ``?find_s=5`` bounds the search."""
     address.check_keys(("find_s",))
     place = unquote(address.place).removesuffix("/")
     key, colon, value = place.partition(":")
@@ -236,6 +248,8 @@ def open_lsl(address: DeviceAddress, layout: Layout) -> LslDevice:
 
 
 STREAM_TYPE = "Touch"
+MARKERS, MARK = "PlushSense markers", "mark"
+"""Name of the LSL stream of the studio's markers, and the marker of `Recorder.mark`, which is no gesture."""
 _DRIFT = 200e-6
 _FAR_S = 10.0
 _LINGER_S = 0.25
@@ -265,6 +279,8 @@ class LslOutlet:
         about = info.desc()
         about.append_child_value("manufacturer", "PlushSense")
         about.append_child_value("layout", layout.name)
+        # Readers must not space the time stamps evenly across frames that were lost between the toy and here.
+        about.append_child("synchronization").append_child_value("can_drop_samples", "true")
         channels = about.append_child("channels")
         units = (*(c.unit or "none" for c in layout.channels), "ms")
         kinds = (*(c.kind for c in layout.channels), "clock")

@@ -10,6 +10,7 @@ from typing import Literal
 
 from plushsense.core.errors import DeviceError
 from plushsense.core.layouts import Layout
+from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Counters, Device, Frame, now_ms
 
 ConnectionState = Literal["connected", "waiting"]
@@ -82,6 +83,7 @@ class ReconnectingDevice(Device):
         self._waiting_since = 0.0
         self._found: Device | Exception | None = None
         self.inner: Device | None = open_inner()
+        self.notes = self.inner.notes
         self._count()
 
     def read(self) -> list[Frame] | None:
@@ -116,10 +118,10 @@ class ReconnectingDevice(Device):
         return frames
 
     @property
-    def mismatch(self) -> str:
+    def mismatch(self) -> Sentence:
         """As in `Device`, of the connected toy."""
         inner = self.inner
-        return inner.mismatch if inner is not None else ""
+        return inner.mismatch if inner is not None else Sentence()
 
     def _count(self) -> None:
         inner = self.inner

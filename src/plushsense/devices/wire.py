@@ -9,7 +9,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from plushsense.core.errors import printable
 from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Layout, layout_names, load_layout
+from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Counters, Frame, LossCounter
 
 _INTEGER = re.compile(rb"[+-]?[0-9]{1,18}\Z")
@@ -18,8 +20,12 @@ _DECIMAL = re.compile(rb"[+-]?(?:[0-9]{1,18}(?:\.[0-9]{0,18})?|\.[0-9]{1,18})(?:
 _SEPARATORS = bytes.maketrans(b",;\t\v\f", b"   \0\0")
 _LIMIT = 2**53
 _LONGEST_DELAY_MS = 2**31
-# So many lines of another width in a row are not lines that were cut or joined.
+# So many lines of another width in a row are not lines that were cut or joined, and so many unreadable ones no chance.
 _SURE = 10
+_QUOTED = 100  # characters of an unreadable line
+_NAMED = 8  # fields whose names are listed
+_NAME = re.compile(rb"\s*[\"']?[A-Za-z_][^\s,;:=]*[\"']?\s*[:=]")
+_DECIMAL_COMMA, _OTHER_GAP = re.compile(rb"[0-9],[0-9]"), re.compile(rb"[0-9][ ;\t]+[0-9]")
 
 
 @dataclass(frozen=True)
@@ -74,24 +80,92 @@ class LineParser:
         )
         self._delay_at = layout.wire.index(DELAY_MS) if DELAY_MS in layout.wire else -1
         self._other_fields = self._others = 0
+        # The first unreadable line since the last frame, and how many there were.
+        self._unread, self._unreadable = b"", 0
+        self._early = 0  # malformed lines before the first frame, as of a board that starts
 
-    def mismatch(self, url: str) -> str:
-        """Return what to do if the last lines all have another number of numbers than the layout; "" otherwise."""
-        if self._others < _SURE:
-            return ""
+    def mismatch(self, url: str) -> Sentence:
+        """Return why lines cannot be read, and what to do; "" if they can.
+
+        Ten lines with another number of numbers are of another built-in layout. Before the first frame, one unreadable
+        line is enough; afterwards ten without a frame between them, or a quarter of all lines since.
+        """
+        bad = self.counters.malformed - self._early
+        lines = bad + self.counters.frames
+        comma = _DECIMAL_COMMA.search(self._unread) and _OTHER_GAP.search(self._unread)
+        # To the user of a layout of their own, the built-in ones are of no use.
+        if self._others >= _SURE and not comma and self.layout.name in layout_names():
+            return self._other_layout(url)
+        if self._unreadable >= (_SURE if self._begun else 1):
+            problem, many = "The toy sends lines that cannot be read, the first is", {}
+        elif self._begun and bad >= 2 * _SURE and 4 * bad >= lines and self._unread:
+            problem, many = f"{bad} of {lines} lines of the toy cannot be read, such as", {"bad": bad, "of": lines}
+        else:
+            return Sentence()
+        layout, names = self.layout, self.layout.wire
+        listed = ", ".join(names if len(names) <= _NAMED else (*names[: _NAMED - 1], "…"))
+        line, why = _quoted(self._unread), self._fault(self._unread, url)
+        return Sentence(
+            f"{problem} '{line}': {why}. Layout '{layout.name}' expects {len(names)} numbers a line, separated by "
+            f"spaces, tabs, commas or semicolons: {listed}.",
+            "toy_lines_many" if many else "toy_lines",
+            line=line,
+            why=why,
+            layout=layout.name,
+            n=len(names),
+            names=listed,
+            **many,
+        )
+
+    def _fault(self, line: bytes, url: str) -> Sentence:
+        """Return what is wrong with an unreadable line, without a full stop."""
+        fields, needed = line.translate(_SEPARATORS).split(), self._fields
+        if sum(not 32 <= byte < 127 and byte != 9 for byte in line) > len(line) // 4:
+            baud = ", perhaps because the toy has another baud rate (?baud=115200)" if url.startswith("serial") else ""
+            return Sentence(f"it is no text{baud}", "line_no_text")
+        if len(line) > self.max_line:
+            return Sentence(f"it has more than {self.max_line} bytes without a line end", "line_long", n=self.max_line)
+        if line.lstrip().startswith((b"{", b"[")):
+            return Sentence("it is JSON, of which only the numbers are to be sent", "line_json")
+        if _NAME.match(line):
+            return Sentence("it has names before the numbers, so send the numbers alone", "line_names")
+        if len(fields) != needed:
+            if _DECIMAL_COMMA.search(line) and _OTHER_GAP.search(line):
+                message = "a comma separates numbers, so send decimals with a point, as in 1.5"
+                return Sentence(message, "line_decimal_comma")
+            has = "1 field" if len(fields) == 1 else f"{len(fields)} fields"
+            return Sentence(f"it has {has}, not {needed}", "line_fields", n=len(fields), needed=needed)
+        for name, field in zip(self.layout.wire, fields, strict=True):
+            text = _quoted(field)
+            whole = name not in self.layout.names or self._steps[self.layout.index(name)] == 1.0
+            if not (_INTEGER if whole else _DECIMAL).match(field):
+                what = "whole number" if whole and _DECIMAL.match(field) else "number"
+                message = f"'{text}' for {name} is no {what}"
+                return Sentence(message, f"line_no_{what.replace(' ', '_')}", field=text, channel=name)
+        return Sentence("a number is too large, or a clock is negative", "line_range")
+
+    def _other_layout(self, url: str) -> Sentence:
+        """Return which layout has the number of numbers of the last lines."""
         number, layout = self._other_fields, self.layout
         known = [load_layout(name) for name in layout_names()]
         fitting = [other for other in known if len(other.wire) == number]
         # A model reads any layout with its channels.
         fitting = [other for other in fitting if other.channels == layout.channels] or fitting
         problem = f"The toy sends {number} numbers a line, but layout '{layout.name}' has {self._fields}"
+        values = {"n": number, "layout": layout.name, "needed": self._fields}
         if not fitting:
             sizes = ", ".join(f"{other.name} {len(other.wire)}" for other in known)
-            return f"{problem}: give a layout file that names them (?layout=FILE.toml); built-in are {sizes}."
+            return Sentence(
+                f"{problem}: give a layout file that names them (?layout=FILE.toml); built-in are {sizes}.",
+                "toy_numbers",
+                **values,
+            )
         place, _, query = url.partition("?")
         kept = [part for part in query.split("&") if part and not part.startswith("layout=")]
         fits = f"'{fitting[0].name}' has {number}"
-        return f"{problem}; {fits}: open it as {place}?{'&'.join([*kept, f'layout={fitting[0].name}'])}"
+        address = f"{place}?{'&'.join([*kept, f'layout={fitting[0].name}'])}"
+        message = f"{problem}; {fits}: open it as {address}"
+        return Sentence(message, "toy_numbers_fit", **values, fits=fitting[0].name, url=address)
 
     def feed(self, data: bytes) -> list[ParsedLine]:
         """Return the frames that end within these bytes; keep the rest of the last line for the next call."""
@@ -126,6 +200,7 @@ class LineParser:
             return
         if len(self._pending) + len(piece) > self.max_line:
             self.counters.malformed += 1
+            self._note_unread(bytes(self._pending) + piece)
             self._pending.clear()
             self._skipping = True
         else:
@@ -138,7 +213,7 @@ class LineParser:
         if self._skipping:
             self._skipping = False
             return None
-        line = line.translate(_SEPARATORS)
+        came, line = line, line.translate(_SEPARATORS)
         fields = line.split()
         if not fields:
             return None
@@ -146,8 +221,10 @@ class LineParser:
         if numbers is None:
             self.counters.malformed += 1
             self._note_other(fields)
+            if not joined:
+                self._note_unread(came)
             return None
-        self._others = 0
+        self._others = self._unreadable = 0
         if joined:
             return None
         if self._clock_at >= 0:
@@ -158,7 +235,8 @@ class LineParser:
             if self._clock_ms > _LIMIT:
                 self._clock_ms = 0
             device_ms = self._clock_ms
-        self._begun = True
+        if not self._begun:
+            self._begun, self._early = True, self.counters.malformed
         values = tuple([numbers[at] for _, at in self._channels])
         garbage = False
         for value, (low, high) in zip(values, self._valid, strict=True):
@@ -175,6 +253,12 @@ class LineParser:
         if len(fields) != self._other_fields or not all(_DECIMAL.match(field) for field in fields):
             self._other_fields, self._others = len(fields), 0
         self._others += len(fields) != self._fields
+
+    def _note_unread(self, line: bytes) -> None:
+        """Count a line that cannot be read, and keep it if it is the first since the last frame."""
+        if not self._unreadable:
+            self._unread = line[: self.max_line + 1]
+        self._unreadable += 1
 
     def _numbers(self, fields: list[bytes], line: bytes) -> list[int] | None:
         """Return all fields as integers (channels in steps, clocks in ms); None if the line is not a frame."""
@@ -202,6 +286,11 @@ class LineParser:
                 return None
             numbers[at] = number
         return numbers
+
+
+def _quoted(line: bytes) -> str:
+    text = line.decode("ascii", "backslashreplace")
+    return printable(text if len(text) <= _QUOTED else f"{text[:_QUOTED]}…")
 
 
 def _integer(field: bytes) -> int | None:

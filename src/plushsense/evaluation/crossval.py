@@ -7,7 +7,7 @@ split is made over recordings, so that the windows to train on and those to scor
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -212,6 +212,7 @@ def evaluate(
     cluster: str | None = None,
     seed: int = 0,
     validation: bool = True,
+    shared_rows: Collection[tuple[str, str]] = (),
     progress: Callable[[JobProgress], None] | None = None,
 ) -> Evaluation:
     """Train and score a model on each fold of ``split``.
@@ -227,6 +228,7 @@ def evaluate(
         cluster: address of a Ray cluster that runs the folds instead.
         seed: seed of the split.
         validation: whether to hold back windows for validation; without it they are trained on.
+        shared_rows: as for `audit_leakage`.
         progress: called when a fold reports an epoch, with (epoch, epochs, row of the history) as its message, or is
             done.
 
@@ -267,7 +269,7 @@ def evaluate(
     tested = [(fold.name, fold.test) for fold in folds]
     predictions = gather_predictions(score_windows, tested, [outcome["probabilities"] for outcome in outcomes])
     table = compute_scores(predictions, records, score_windows.affects, parsed.separates_people)
-    table["leakage"] = audit_leakage(train_windows, score_windows, folds)
+    table["leakage"] = audit_leakage(train_windows, score_windows, folds, shared_rows)
     if score_windows.self_calibration:
         table["self_calibration"] = score_windows.self_calibration
     if all("deployed" in outcome for outcome in outcomes):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.gestures import NOBODY
 from plushsense.core.sentences import Sentence
+from plushsense.dataset.quality.outliers import far_inputs
 from plushsense.scoring.splits import Fold, Index
 from plushsense.windows.cut import WindowSet
 
@@ -34,56 +36,85 @@ KINDS = {
     "same_person": "person also trained on",
     "copies": "equal to a training window of another recording",
     "near_duplicates": "nearly equal to a training window of another recording",
+    "shared_rows": "of a recording that has rows of one trained on",
 }
 
 Mask = NDArray[np.bool_]
 
 
-def audit_leakage(train: WindowSet, score: WindowSet, folds: Sequence[Fold]) -> dict[str, Any]:
+def audit_leakage(
+    train: WindowSet, score: WindowSet, folds: Sequence[Fold], shared_rows: Collection[tuple[str, str]] = ()
+) -> dict[str, Any]:
     """Count the scored windows of all folds that have something in common with the windows trained on in their fold.
 
     Validation windows count as trained on. Nobody (recordings at rest) is no person. Windows that rarely change are
     neither copies nor near-duplicates: a toy at rest is equal to itself, and so are presses of a switch. Windows that
-    share rows of a stream are not, either: they are counted as overlapping.
+    share rows of a stream are not, either: they are counted as overlapping. Failed readings, which would make windows
+    alike that share nothing else, are left out of the comparison.
 
     Args:
         train, score: the windows that the indices of ``folds`` refer to.
+        shared_rows: pairs of recordings, in both orders, of which one has rows of the other
+            (`plushsense.dataset.quality.copies`).
 
     Returns:
         ``windows``, the number of scored windows; a count for each of `KINDS`; ``pairs``, the recordings with most
-        copies or near-duplicates, as {scored, trained, windows}.
+        copies, near-duplicates or shared rows, as {scored, trained, windows}.
     """
-    signatures = _Signatures.of(train, score)
+    partners: dict[str, list[str]] = {}
+    for one, twin in sorted(shared_rows):
+        partners.setdefault(one, []).append(twin)
+    compared = _without_far(train)
+    signatures = _Signatures.of(compared, compared if score is train else _without_far(score))
     totals, pairs = dict.fromkeys(("windows", *KINDS), 0), Counter[tuple[str, str]]()
     for fold in folds:
         known = np.union1d(fold.train, fold.validation)
         test = fold.test
         people = np.setdiff1d(train.subject[known], [NOBODY])
         copies, near, twins = signatures.duplicates(known, test)
+        mine, trained = _ids(score, test), set(_ids(train, known).tolist())
+        copied = {r: twin for r in set(mine.tolist()) for twin in partners.get(r, ()) if twin in trained and r != twin}
         found = {
-            "same_recording": np.isin(_ids(score, test), _ids(train, known)),
+            "same_recording": np.isin(mine, list(trained)),
             "overlapping": _overlapping(train, known, score, test),
             "same_person": np.isin(score.subject[test], people),
             "copies": copies,
             "near_duplicates": near,
+            "shared_rows": np.isin(mine, list(copied)),
         }
         totals["windows"] += len(test)
         for kind, mask in found.items():
             totals[kind] += int(mask.sum())
-        for mine, twin in zip(_ids(score, test[near]), _ids(train, twins[near]), strict=True):
-            pairs[str(mine), str(twin)] += 1
+        for one, twin in zip(mine[near], _ids(train, twins[near]), strict=True):
+            pairs[str(one), str(twin)] += 1
+        for one in mine[found["shared_rows"] & ~near].tolist():
+            pairs[one, copied[one]] += 1
     listed = [{"scored": a, "trained": b, "windows": n} for (a, b), n in pairs.most_common(_LISTED)]
     return {**totals, "pairs": listed}
 
 
+def _without_far(windows: WindowSet) -> WindowSet:
+    """Return windows in which the samples that alone set the scale of their input are the input's median."""
+    found = far_inputs(windows.x)
+    if not found:
+        return windows
+    x = windows.x.copy()
+    for at, far in found.items():
+        x[:, at][far] = np.median(x[:, at])
+    return replace(windows, x=x)
+
+
 def warn_of_copies(audit: Mapping[str, Any], warn: Callable[[str], None]) -> None:
-    """Warn of scored windows that are copies of training windows, naming two recordings."""
-    if audit["near_duplicates"]:
+    """Warn of scored windows with copies of what another recording trained on, naming two recordings."""
+    if audit["pairs"]:
         first = audit["pairs"][0]
+        n = audit["near_duplicates"]
+        what = "are copies, or nearly, of training windows of another recording"
+        if audit["shared_rows"] > n:
+            n, what = audit["shared_rows"], "are of recordings that have rows of one trained on"
         sentence = (
-            f"{audit['near_duplicates']} of {audit['windows']} scored windows are copies, or nearly, of training "
-            f"windows of another recording (as {first['scored']} of {first['trained']}), so the scores are too high: "
-            "exclude one of the two recordings"
+            f"{n} of {audit['windows']} scored windows {what} (as {first['scored']} of {first['trained']}), so the "
+            "scores are too high: exclude one of the two recordings"
         )
         warn(Sentence(sentence, "near_copies", first=first["scored"], second=first["trained"]))
 

@@ -109,14 +109,16 @@ class Reidentified:
         """Return the trial of a design and a program; None if it was skipped."""
         return next((t for t in self.trials if (t.design, t.sees) == (design, sees)), None)
 
-    def under(self, codes: Mapping[str, str]) -> Reidentified:
-        """Return the results with people's codes replaced by ``codes``; a code that is not in it is kept."""
+    def under(self, codes: Mapping[str, str], label: Callable[[str], str]) -> Reidentified:
+        """Return the results with the public code of each person (a code not in ``codes`` is kept) and gesture."""
 
         def renamed(shares: dict[str, float]) -> dict[str, float]:
             return {codes.get(p, p): share for p, share in shares.items()}
 
         trials = [replace(t, by_person=renamed(t.by_person), precision=renamed(t.precision)) for t in self.trials]
-        return replace(self, trials=tuple(trials))
+        return replace(
+            self, trials=tuple(trials), gestures_of_one_person=tuple(map(label, self.gestures_of_one_person))
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""

@@ -363,7 +363,9 @@ def _dataset(recordings: Dataset | str | os.PathLike[str], bundle: Bundle, place
         return as_dataset(recordings)
     if not Path(recordings).exists():
         raise DatasetError(f"There is no folder '{recordings}': give a data set, or a person's folder of recordings.")
-    return import_recordings(Path(recordings), place / "DS", layout=bundle.layout, gestures=bundle.gestures).dataset
+    return import_recordings(
+        Path(recordings), place / "DS", layout=bundle.layout, gestures=bundle.gestures, adopt_proposals=False
+    ).dataset
 
 
 def _person(dataset: Dataset, subject: str | None) -> str:

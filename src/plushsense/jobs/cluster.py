@@ -18,6 +18,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from plushsense.core.errors import ConfigError, PlushSenseError, need
+from plushsense.core.sentences import join_names
 from plushsense.jobs.journal import Engine, Job, JobEvent, Take, portable, thread_settings
 
 # Number of times that a task is started again after its process or node was lost.
@@ -102,8 +103,8 @@ def _knock(address: str) -> None:
 def _no_connection(address: str, cause: BaseException) -> PlushSenseError:
     reason = str(cause)
     if "ersion mismatch" in reason:
-        versions = re.findall(r"(Ray|Python): *(\S+)", reason)
-        both = "; here ".join(", ".join(f"{name} {number}" for name, number in versions[i : i + 2]) for i in (0, 2))
+        versions = [" ".join(found) for found in re.findall(r"(Ray|Python): *(\S+)", reason)]
+        both = f"{join_names(versions[:2])}; here {join_names(versions[2:])}" if versions else _first_line(reason)
         return ConfigError(
             f"The cluster at '{address}' has other versions ({both}): install the same Python and Ray on both."
         )

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections import deque
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import ConfigError, PlushSenseWarning
+from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Device, Frame
+from plushsense.live.plausibility import PlausibilityMonitor
 from plushsense.runtime.classifier import Decision, StreamReader, check_layout
 
 _KEPT = 72_000  # number of latencies kept: the last hour at 20 decisions per second
@@ -37,6 +40,7 @@ class LiveSummary:
         events: number of events that began.
         no_signal: number of times that no frame came, or the clock had a gap or was reset.
         faults: number of sensor faults.
+        warnings: what differs from the training, or cannot be read; each once.
     """
 
     decisions: int
@@ -52,6 +56,7 @@ class LiveSummary:
     events: int = 0
     no_signal: int = 0
     faults: int = 0
+    warnings: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON."""
@@ -59,14 +64,20 @@ class LiveSummary:
         return asdict(self) | rounded
 
 
+def _python_warning(sentence: str) -> None:
+    warnings.warn(str(sentence), PlushSenseWarning, stacklevel=2)
+
+
 class LiveRun(Iterator[Decision]):
     """A live run: iterate over it for decisions; call `summary` for its figures at any time.
 
-    If the device sends no frame for ``silence_s``, there is one decision with the state ``no signal``, which ends an
-    open event; the same happens if an event is open when the device ends.
+    If the device sends no frame for ``silence_s``, there is one decision with the state ``no signal``, or
+    ``unreadable`` if it sends lines that are none, which ends an open event; the same happens if an event is open when
+    the device ends.
 
     Attributes:
         over: whether the run has ended.
+        warnings: what differs from the training (see `PlausibilityMonitor`), or cannot be read; each once.
         latency_s: time from the arrival of the bytes to the decision, for the newest one; None before the first.
         latencies_s: the same for all decisions of the last hour.
     """
@@ -77,9 +88,15 @@ class LiveRun(Iterator[Decision]):
         classifier: StreamReader,
         seconds: float | None,
         silence_s: float = SILENCE_S,
+        warn: Callable[[str], None] = _python_warning,
     ) -> None:
         self.device = device
         self.classifier = classifier
+        self.warnings: list[Sentence] = []
+        self._warn = warn
+        self._monitor = PlausibilityMonitor(classifier.layout, classifier.bundle)
+        self._mismatch = Sentence()
+        self._malformed = device.counters.malformed  # at the last frame
         self._seconds, self._silence_s = seconds, silence_s
         self._begun = self._last_frames_s = time.perf_counter()
         self._silent = False
@@ -102,12 +119,18 @@ class LiveRun(Iterator[Decision]):
         now = time.perf_counter()
         if frames is None:
             self.over = True
-            return [self._noted(self.classifier.silence())] if self.classifier.in_event else []
+            unread = self._unread() != self._mismatch
+            return [self._quiet()] if self.classifier.in_event or unread else []
         if not frames:
             return self._no_frames(now)
         arrived = self.device.arrived_s
         arrived = now if arrived is None else arrived
         decided = self._read(frames, arrived)
+        for sentence in self._monitor.push(frames):
+            self._note(sentence)
+        if self.device.counters.malformed > self._malformed:
+            self._note(self.device.mismatch)
+        self._malformed, self._mismatch = self.device.counters.malformed, Sentence()
         # Set after the computation, whose duration must not count as silence of the toy.
         self._last_frames_s, self._silent = time.perf_counter(), False
         return decided
@@ -116,10 +139,29 @@ class LiveRun(Iterator[Decision]):
         quiet = now - self._last_frames_s
         if self._seconds is not None and quiet >= self._seconds:
             self.over = True
-        if self._silent or quiet < self._silence_s:
+        # Lines may come only after the silence began, as from a board that starts when its port is opened.
+        if quiet < self._silence_s or (self._silent and self._unread() == self._mismatch):
             return []
-        self._silent = True
-        return [self._noted(self.classifier.silence())]
+        return [self._quiet()]
+
+    def _unread(self) -> Sentence:
+        """Return why the lines that came since the last frame cannot be read; "" if none came."""
+        return self.device.mismatch if self.device.counters.malformed > self._malformed else Sentence()
+
+    def _quiet(self) -> Decision:
+        """Return the decision that ends an open event because no frame comes."""
+        again, self._silent, self._mismatch = self._silent, True, self._unread()
+        decision = self.classifier.silence()
+        if not self._mismatch:
+            return self._noted(decision)
+        self._note(self._mismatch)
+        decision = replace(decision, state="unreadable")
+        return decision if again else self._noted(decision)
+
+    def _note(self, sentence: Sentence) -> None:
+        if sentence and sentence not in self.warnings:
+            self.warnings.append(sentence)
+            self._warn(sentence)
 
     def _read(self, frames: list[Frame], arrived: float) -> list[Decision]:
         decided: list[Decision] = []
@@ -138,7 +180,7 @@ class LiveRun(Iterator[Decision]):
     def _noted(self, decision: Decision) -> Decision:
         self._decisions += 1
         self._warming += decision.state == "warming"
-        self._no_signal += decision.state == "no signal"
+        self._no_signal += decision.state in ("no signal", "unreadable")
         self._events += sum(event.kind == "begun" for event in decision.events)
         return decision
 
@@ -159,6 +201,7 @@ class LiveRun(Iterator[Decision]):
             self._events,
             self._no_signal,
             self.classifier.faults,
+            tuple(self.warnings),
         )
 
 
@@ -176,6 +219,7 @@ def run_live(
     *,
     seconds: float | None = None,
     silence_s: float = SILENCE_S,
+    warn: Callable[[str], None] = _python_warning,
 ) -> LiveRun:
     """Run a model on an open device.
 
@@ -185,6 +229,7 @@ def run_live(
         seconds: device time after which the run stops (so a replay ends at the same place at any speed). The run also
             stops if the device sends nothing for this time. None: run until the device ends.
         silence_s: host time without frames after which there is no signal.
+        warn: called with each sentence on what differs from the training or cannot be read.
 
     Raises:
         ConfigError: if the channels of the device are not those of the model, or ``seconds`` is not positive.
@@ -194,7 +239,7 @@ def run_live(
         raise ConfigError(f"seconds is {seconds!r}; give a positive duration, or leave it out to run until the end.")
     check_layout(device.layout, classifier.layout)
     classifier.reset()
-    return LiveRun(device, classifier, seconds, silence_s)
+    return LiveRun(device, classifier, seconds, silence_s, warn)
 
 
 _PAUSE_S = 0.001  # pause after a round without frames; at 100 Hz a frame comes every 10 ms

@@ -187,7 +187,7 @@ class Reactor:
         """
         if not isinstance(reported, Decision):
             return [r for event in reported if (r := self._react(event)) is not None]
-        lost = reported.state in ("no signal", "sensor fault")
+        lost = reported.state in ("no signal", "unreadable", "sensor fault")
         return [
             reaction
             for event in reported.events

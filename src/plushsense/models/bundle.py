@@ -265,7 +265,7 @@ class Bundle:
             why = "a text in it has half a character" if isinstance(cause, UnicodeEncodeError) else cause
             raise BundleError(f"The bundle '{path}' cannot be used: {why}") from None
         if changed:
-            was, now = content.get(changed[0]), implied[changed[0]]
+            was, now = content.get(changed[0], "not stored"), implied[changed[0]]
             raise BundleError(
                 f"The bundle '{path}' was written under other rules ({changed[0]} was {was}, is {now}): train again."
             )

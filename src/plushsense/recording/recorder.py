@@ -127,7 +127,8 @@ class Recorder(RecordingMachine):
                         f"The toy sends lines, but none is a frame of {layout} ({fields} numbers): "
                         "is the layout right, and the cable sound?"
                     )
-                    self._show_message(Sentence(sentence, "unreadable", layout=layout, n=fields))
+                    unread = self.device.mismatch or Sentence(sentence, "unreadable", layout=layout, n=fields)
+                    self._show_message(unread)
                 elif self._receiver.silent:
                     sentence = "Nothing comes from the toy: is it switched on and near?"
                     self._show_message(Sentence(sentence, "silent"))

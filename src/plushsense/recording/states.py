@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from plushsense.core.errors import DatasetError, PlushSenseError
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, plural
 from plushsense.devices.base import Counters, Device, Frame, now_ms
 from plushsense.recording.plan import Step
 from plushsense.recording.session import Key, OpenSession, SessionProgress
@@ -140,8 +140,8 @@ def write_error(session: OpenSession, recordings: int, cause: Exception) -> Data
     why = getattr(cause, "strerror", None) or cause
     remedy = "close other programs" if lacks_descriptor(cause) else "free disk space"
     return DatasetError(
-        f"'{session.folder}' cannot be written any more ({why}): the session has stopped, with {recordings} recordings "
-        f"saved; {remedy}, and continue the same session.",
+        f"'{session.folder}' cannot be written any more ({why}): the session has stopped, with "
+        f"{plural(recordings, 'recording')} saved; {remedy}, and continue the same session.",
         reason="files_open" if lacks_descriptor(cause) else "disk_full",
         folder=session.folder,
         why=why,
@@ -271,7 +271,7 @@ class RecordingMachine:
         self._since_s = time.monotonic()
         self._state: RecorderState = "idle"
         self._paused = False
-        self._message = Sentence()
+        self._message = self._mismatch = Sentence()
         self.over = Sentence()
         self._failed = Sentence()
         self._closing = False
@@ -429,6 +429,8 @@ class RecordingMachine:
                     for frame in frames:
                         self._receive(frame)
                     self._receiver.check_malformed()
+                    if not frames:
+                        self._show_unreadable()
                     if frames:
                         self._flush()
                         self._receiver.end_reading()
@@ -465,7 +467,8 @@ class RecordingMachine:
             self._log_step("start", row=row, host_ms=frame.host_ms, device_ms=frame.device_ms)
             self._enter("recording")
         elif self._take is not None:
-            self._take.lost += missing
+            # Negative where frames that were counted before the recording came late.
+            self._take.lost = max(0, self._take.lost + missing)
         self._received.append(frame)
         if self._take is not None:
             self._take.frames.append(frame)
@@ -476,6 +479,14 @@ class RecordingMachine:
                 self._stop("longest")
         elif self._state == "idle" and self._auto is not None and self._passed_s() >= self._auto.rest_s:
             self._begin()
+
+    def _show_unreadable(self) -> None:
+        """Show why no line of the toy can be read, once for each reason."""
+        unreadable = self._receiver.silent and self._receiver.quality().signal == "unreadable"
+        mismatch = self.device.mismatch if unreadable else Sentence()
+        if mismatch and mismatch != self._mismatch:
+            self._show_message(mismatch)
+        self._mismatch = mismatch
 
     def _flush(self) -> None:
         """Pass the received frames to the background writer; call this before anything to be written after them."""

@@ -184,7 +184,7 @@ SLOWEST = 2.0
 
 
 class ReceivedFrame(NamedTuple):
-    """Frame with the times to write, the number of frames missing before it, and the gap before it, if any."""
+    """Frame with the times to write, the change of the number of missing frames, and the gap before it, if any."""
 
     frame: Frame
     missing: int
@@ -282,7 +282,7 @@ class FrameReceiver:
         frame = Frame(host, came.device_ms, came.values)
         counted = self._loss.push(came.device_ms)
         missing = 0 if odd else counted
-        self.lost += missing
+        self.lost = max(0, self.lost + missing)
         returned = self._device.counters.reconnects > self._reconnects
         self._reconnects = self._device.counters.reconnects
         gap = None

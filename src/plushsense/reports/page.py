@@ -56,7 +56,8 @@ def write_page(target: Path, page: str) -> Path:
         write_file(target, page)
     except OSError as cause:
         raise ConfigError(
-            f"The report '{target}' cannot be written ({cause.strerror}): give a file in a folder where you may write."
+            f"The report '{target}' cannot be written ({cause.strerror or cause}): give a file in a folder "
+            f"where you may write."
         ) from cause
     return target
 
@@ -100,5 +101,5 @@ def write_files(folder: Path, files: Mapping[str, bytes], earlier: Sequence[str]
         write_file(folder / _LIST, "\n".join([_LIST_HEAD, *files, ""]).encode())
     except OSError as cause:
         raise ConfigError(
-            f"The report's files cannot be written to '{folder}' ({cause.strerror}): give another page."
+            f"The report's files cannot be written to '{folder}' ({cause.strerror or cause}): give another page."
         ) from cause

@@ -97,7 +97,9 @@ def describe_protocol(evaluation: Mapping[str, Any]) -> list[tuple[str, str]]:
 def describe_leakage(audit: Mapping[str, Any]) -> str:
     """Describe a leakage audit (`plushsense.evaluation.leakage`) in one sentence."""
     shares = ", ".join(
-        f"{noun} {percent(audit[key] / max(audit['windows'], 1))}" for key, noun in _TEXTS["leakage"].items()
+        f"{noun} {percent(audit[key] / max(audit['windows'], 1))}"
+        for key, noun in _TEXTS["leakage"].items()
+        if key in audit
     )
     return f"Of the {count(audit['windows'])} scored windows, the share that was in some way trained on: {shares}."
 

@@ -5,11 +5,12 @@ A `StreamReader` runs a `plushsense.runtime.machine.ToyMachine` and converts its
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import ArrayError, ConfigError
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import Layout
 from plushsense.devices.base import Frame
@@ -53,7 +54,7 @@ class GestureEvent:
         return {"what": values.pop("kind"), **values}
 
 
-State = Literal["warming", "tracking", "no signal", "sensor fault"]
+State = Literal["warming", "tracking", "no signal", "unreadable", "sensor fault"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +69,8 @@ class Decision:
         confidence: smoothed probability of the gesture, 0 to 1, or None.
         source: what decided: ``cnn``, the network, or, between two steps, ``gate``, the threshold rules.
         state: ``warming`` from the start or a restart until enough samples for the network were read; then
-            ``tracking``; ``no signal`` when frames are missing; ``sensor fault`` when sensors are at fault.
+            ``tracking``; ``no signal`` when frames are missing; ``unreadable`` when lines come that are none;
+            ``sensor fault`` when sensors are at fault.
         probabilities: smoothed probabilities in class order, or None.
         answer: ``sure`` (of one gesture), ``affect`` (of an affect only), ``unsure``, ``unknown`` (not a known
             gesture) or ``idle``; None while there is no answer.
@@ -108,7 +110,12 @@ class StreamReader:
     time of the last frame before. During a sensor fault there are no decisions.
 
     The arguments are those of `ToyMachine`.
+
+    Attributes:
+        bundle: the model that it was made from, None if that is not known; `LiveRun` compares the frames with it.
     """
+
+    bundle: Bundle | None = None
 
     def __init__(
         self, network: LogitStream, layout: Layout, gestures: GestureSet, rules: Rules, smoothing: int
@@ -157,7 +164,13 @@ class StreamReader:
         return self._decision(self._machine.silence())
 
     def push(self, frame: Frame) -> list[Decision]:
-        """Process one frame and return the decisions that it completes, usually none or one."""
+        """Process one frame and return the decisions that it completes, usually none or one.
+
+        Raises:
+            ArrayError: for a frame that does not have the layout's channels in whole steps, as `Layout.in_steps` gives
+                them, and whole milliseconds.
+        """
+        frame = whole_frame(frame, self.layout)
         silent, self._silent = self._silent, False
         decisions = [
             self._decision(moment)
@@ -264,7 +277,7 @@ class BothEngines(IntegerClassifier):
         self._largest = 0.0
 
     def push(self, frame: Frame) -> list[Decision]:
-        """Process one frame; return the deployed model's decisions that it completes."""
+        """Process one frame like `StreamReader.push`; return the deployed model's decisions."""
         decisions = super().push(frame)
         both = (decisions, self.original.push(frame))
         answered = [[(d, d.probabilities) for d in part if d.probabilities is not None] for part in both]
@@ -290,16 +303,44 @@ class BothEngines(IntegerClassifier):
         }
 
 
+def whole_frame(frame: Frame, layout: Layout) -> Frame:
+    """Return a frame as Python integers; raise ArrayError if it is not one of the layout, in whole steps."""
+    host_ms, device_ms, values = frame
+    if type(device_ms) is int and len(values) == layout.n_channels and {int}.issuperset(map(type, values)):
+        return frame
+    if len(values) != layout.n_channels:
+        raise ArrayError(
+            f"The frame has {len(values)} values, but layout '{layout.name}' has {layout.n_channels} channels: give "
+            f"one for each of {', '.join(layout.names)}."
+        )
+    try:
+        device_ms = operator.index(device_ms)
+    except TypeError:
+        raise ArrayError(
+            f"device_ms is {device_ms!r} in a frame: accepted are whole milliseconds of the toy's clock."
+        ) from None
+    whole = []
+    for channel, value in zip(layout.channels, values, strict=True):
+        try:
+            whole.append(operator.index(value))
+        except TypeError:
+            raise ArrayError(
+                f"'{channel.name}' is {value!r} in a frame, whose values are whole numbers of steps, here of "
+                f"{channel.step:g}: convert the sample by values=layout.in_steps(sample)."
+            ) from None
+    return Frame(host_ms, device_ms, tuple(whole))
+
+
 def check_layout(sent: Layout, read: Layout) -> None:
     """Raise ConfigError if a model cannot read the frames that a device sends.
 
-    The channels are compared, with their units, integer steps and valid ranges, but not the line format, so that older
-    firmware of the same toy is accepted. Rate, gap and inputs are those of the model.
+    The channels are compared, with their units and integer steps, but not the line format, so that older firmware of
+    the same toy is accepted. Rate, gap, inputs, offsets and valid ranges are those of the model.
 
     Raises:
         ConfigError: naming both layouts and the first channel that differs.
     """
-    if sent.channels == read.channels:
+    if sent.reads_as(read):
         return
     ask = f"open the device with ?layout={read.name}, or take a model made for '{sent.name}'"
     if sent.names != read.names:
@@ -310,10 +351,9 @@ def check_layout(sent: Layout, read: Layout) -> None:
             sent=sent.name,
             read=read.name,
         )
-    other = next(a.name for a, b in zip(sent.channels, read.channels, strict=True) if a != b)
     raise ConfigError(
-        f"The device sends layout '{sent.name}', in which channel '{other}' has another unit, scale, step or "
-        f"valid range than in the model's '{read.name}': {ask}.",
+        f"The device sends layout '{sent.name}', in which channel '{sent.unlike(read)[0]}' has another unit, scale, "
+        f"step or kind than in the model's '{read.name}': {ask}.",
         reason="toy_layout_differs",
         sent=sent.name,
         read=read.name,

@@ -29,7 +29,7 @@ from plushsense.core.files import free_path, write_file
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.backup import backup, is_backup, restore
 from plushsense.dataset.importing.archives import UnpackLimits
-from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.importing.importers import import_recordings, propose
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.privacy.forget import forget
 from plushsense.dataset.privacy.pseudonymise import pseudonymise
@@ -200,6 +200,8 @@ def run_inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
                 add_to=adding,
                 person=spec["person"],
                 guess_layout=not adding,
+                # What a single source proves may not fit the others.
+                adopt_proposals=len(sources) == 1 and not adding,
                 limits=UNPACKED,
                 progress=reporter.count,
                 **settings,
@@ -213,6 +215,10 @@ def run_inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         flagged += len(done.warnings)
     if not dest.exists():
         raise refusals[0]
+    if len(sources) > 1:
+        before = len(done.notes)
+        propose(done, adopting=True)
+        notes += done.notes[before:]
     dataset = open_dataset(dest)
     return {
         "name": dataset.head.name if restored else "",

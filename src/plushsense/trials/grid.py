@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, g
 
 from plushsense.core.errors import ArchError, BadInput, ConfigError, nearest
 from plushsense.core.layouts import Layout
+from plushsense.core.sentences import join_names
 from plushsense.core.toml import check_table, read_toml, unknown_key
 from plushsense.models.arch import (
     DEFAULT_FILTERS,
@@ -227,7 +228,9 @@ def problems(
         if epochs < 1:
             wrong.append(f"Epochs {epochs} cannot be trained: accepted are whole numbers from 1.")
     if list(grid.epochs) != sorted(grid.epochs):
-        wrong.append(f"The epochs {_listed(grid.epochs)} do not ascend: give {_listed(sorted(set(grid.epochs)))}.")
+        wrong.append(
+            f"The epochs {join_names(grid.epochs)} do not ascend: give {join_names(sorted(set(grid.epochs)))}."
+        )
     for batch in grid.batches:
         if isinstance(batch, int) and batch < 2:
             wrong.append(f"A batch of {batch} cannot be used: accepted are whole numbers from 2 and '{FULL}'.")
@@ -344,11 +347,7 @@ def _too_long(grid: GridSpec, symbol: str, layout: Layout, past: int | None) -> 
 
 def first_line(cause: Exception) -> str:
     """Return the first line of an error message, without the drawing that may follow."""
-    return str(cause).splitlines()[0]
-
-
-def _listed(values: Iterable[object]) -> str:
-    return ", ".join(map(str, values))
+    return (str(cause) or type(cause).__name__).splitlines()[0]
 
 
 # The tables of a grid's file; `experiments.search.halving` reads the table "search".

@@ -520,7 +520,7 @@ def summary_head(dataset: Dataset, planned: Plan) -> dict[str, Any]:
         "affects": list(planned.gestures.affects),
         "windows": max(len(windows) for windows in planned.sets.values()),
         "machine": machine(
-            f"{os.cpu_count()} processors",
+            f"{os.cpu_count() or '?'} processors",
             f"{grid.threads} thread{'s' * (grid.threads > 1)} a training",
             f"PyTorch {need('torch', 'train').__version__}",
         ),

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import Gesture, GestureSet
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import plural
 from plushsense.dataset.marks import LabelledStretch
 from plushsense.dataset.store import Dataset, Progress, RecordingInfo, StreamInfo
 from plushsense.windows.clock import Segment
@@ -44,6 +44,8 @@ from plushsense.windows.cut import (
     assemble,
     drop_long_recordings,
     from_recording,
+    refuse_still_clocks,
+    without_window,
 )
 from plushsense.windows.features import network_inputs
 from plushsense.windows.sessions import SessionReader
@@ -177,7 +179,7 @@ def cut_anywhere(
     for recording in (r for r in used if r.id not in reached):
         instead = from_recording(sessions.recording(recording), dataset, reach, layout.samples(spec.step_s))
         if not instead:
-            left_out.append(Sentence(f"{recording.id}: no valid sample", "no_valid_sample", recording=recording.id))
+            left_out.append(without_window(recording, sessions))
         cuts += [(recording, c) for c in instead]
     gesturing = len(moving) + sum(not gestures.get(r.gesture).idle for r, _ in cuts)
     n_idle = round(gesturing * anywhere.idle_share / (1.0 - anywhere.idle_share))
@@ -185,8 +187,10 @@ def cut_anywhere(
     quiet += _evenly(free, n_idle - len(quiet))
     cuts += [(recording, place.cut(reach)) for recording, place in (*moving, *quiet)]
     if not cuts:
+        refuse_still_clocks(dataset, sessions)
         raise DatasetError(
-            f"Data set '{dataset.head.name}' gives no window: {len(used)} recordings of {len(gestures)} gestures."
+            f"Data set '{dataset.head.name}' gives no window: {plural(len(used), 'recording')} of "
+            f"{plural(len(gestures), 'gesture')}."
         )
     return replace(assemble(cuts, gestures, dataset), left_out=tuple(left_out))
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
 from plushsense.core.gestures import NOBODY, GestureSet
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, plural
 from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, usual_rows
 from plushsense.dataset.store import RECORDINGS, UNKNOWN_SUBJECT, Dataset, Progress, RecordingInfo
 from plushsense.windows.clock import Segment, whole_recording
@@ -139,8 +139,8 @@ class WindowSet:
         n, f, t = self.x.shape
         kinds = ", ".join(f"{int((self.context == c).sum())} {c}" for c in np.unique(self.context))
         return (
-            f"WindowSet({n} windows of {f} channels × {t} samples at {self.rate_hz:g} Hz, "
-            f"{len(np.unique(self.recording))} recordings, {len(self.labels)} classes; {kinds})"
+            f"WindowSet({plural(n, 'window')} of {plural(f, 'channel')} × {t} samples at {self.rate_hz:g} Hz, "
+            f"{plural(len(np.unique(self.recording)), 'recording')}, {len(self.labels)} classes; {kinds or 'empty'})"
         )
 
 
@@ -257,17 +257,53 @@ def cut_windows(
         elif not own:
             own = from_recording(sessions.recording(recording), dataset, reach, step)
         if not own:
-            left_out.append(Sentence(f"{recording.id}: no valid sample", "no_valid_sample", recording=recording.id))
+            left_out.append(without_window(recording, sessions))
         cuts += [(recording, c) for c in own]
         if progress is not None:
             progress(done + 1, len(recordings))
     if not cuts:
+        refuse_still_clocks(dataset, sessions)
         raise DatasetError(
-            f"Data set '{dataset.head.name}' gives no window: {len(recordings)} recordings of "
-            f"{len(gestures)} gestures ({', '.join(gestures.labels[:6])}…).",
+            f"Data set '{dataset.head.name}' gives no window: {plural(len(recordings), 'recording')} of "
+            f"{plural(len(gestures), 'gesture')} ({', '.join(gestures.labels[:6])}…).",
             reason="no_windows",
         )
     return replace(assemble(cuts, gestures, dataset), left_out=tuple(left_out))
+
+
+def constant_windows(windows: WindowSet) -> Sentence | None:
+    """Return a warning if windows are constant in time, None if none is."""
+    constant = np.flatnonzero((windows.x == windows.x[:, :, :1]).all(axis=(1, 2)))
+    if not len(constant):
+        return None
+    first = windows.recording_ids[windows.recording[constant[0]]]
+    return Sentence(
+        f"{len(constant)} of {len(windows)} windows are constant in time, for instance of {first}: look at the sensors "
+        "and the clock with  plushsense check",
+        "windows_constant",
+        n=len(constant),
+        of=len(windows),
+        recording=first,
+    )
+
+
+def without_window(recording: RecordingInfo, sessions: SessionReader) -> Sentence:
+    """Return the reason why a recording gives no window."""
+    if recording.id in sessions.standing:
+        return Sentence(f"{recording.id}: its clock stands still", "clock_of_recording_still", recording=recording.id)
+    return Sentence(f"{recording.id}: no valid sample", "no_valid_sample", recording=recording.id)
+
+
+def refuse_still_clocks(dataset: Dataset, sessions: SessionReader) -> None:
+    """Raise DatasetError if clocks that stand still are why a data set gives no window."""
+    if sessions.standing:
+        raise DatasetError(
+            f"Data set '{dataset.head.name}' gives no window: the clock stands still in {len(sessions.standing)} "
+            f"recordings, for instance in {min(sessions.standing)}: import the files again with all digits of their "
+            "times, or with row_rate_hz in a pattern.",
+            reason="no_windows_clocks_still",
+            n=len(sessions.standing),
+        )
 
 
 def drop_long_recordings(

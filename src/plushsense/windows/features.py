@@ -8,19 +8,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput
 from plushsense.core.layouts import (
+    ACCELERATION,
     GRAVITY_FRACTION_BITS,
     GRAVITY_STATE_BITS,
     MAGNITUDE_FRACTION_BITS,
     Layout,
     magnitude_limit,
 )
+from plushsense.windows.calibration import UNIT
 
 
 def magnitude(parts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -87,6 +89,60 @@ def network_inputs(values: NDArray[np.int64], layout: Layout) -> NDArray[np.int6
         else:
             columns.append(magnitude(parts))
     return np.stack(columns, axis=1)
+
+
+_FRACTIONS = {"magnitude": 1 << MAGNITUDE_FRACTION_BITS, "gravity": 1 << GRAVITY_FRACTION_BITS}
+
+
+class InputUnits(NamedTuple):
+    """The inputs of a network as values: the whole numbers of `network_inputs` are ``value * steps - zero``.
+
+    The value of a measured channel is that which the toy sends, that of a derived channel the one computed from such
+    values less their offsets. Self-calibrated channels are in units of 1 g, or of their spread. The value of a channel
+    derived from channels of different steps is in steps.
+
+    Attributes:
+        steps: integer steps in a unit, (F,).
+        zero: offset in integer steps, (F,).
+        names: name of the unit of each input.
+    """
+
+    steps: NDArray[np.float64]
+    zero: NDArray[np.float64]
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, layout: Layout) -> InputUnits:
+        """Return the units of a layout's inputs."""
+        derived = {d.name: d for d in layout.derived}
+        steps, zeros, names = [], [], []
+        for name in layout.inputs:
+            parts = [layout.index(part) for part in (derived[name].of if name in derived else (name,))]
+            units = {_unit_of(layout, part, name in derived) for part in parts}
+            step, unit = units.pop() if len(units) == 1 else (1.0, "steps")
+            steps.append(step * _FRACTIONS[derived[name].kind] if name in derived else step)
+            zeros.append(0 if name in (*derived, *layout.self_calibration) else int(layout.zero_int[parts[0]]))
+            names.append(unit)
+        return cls(np.array(steps), np.array(zeros, dtype=np.float64), tuple(names))
+
+    def values(self, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
+        """Return the values of integer windows (N, F, T)."""
+        return np.asarray((x + self.zero[:, None]) / self.steps[:, None], dtype=np.float32)
+
+    def scaler(self, integers: Scaler) -> Scaler:
+        """Return the scaling of values that equals the given one of integers."""
+        return Scaler((integers.offset + self.zero) / self.steps, integers.scale * self.steps)
+
+
+def _unit_of(layout: Layout, at: int, is_centred: bool) -> tuple[float, str]:
+    """Return the steps in a unit of a measured channel, and the name of the unit."""
+    channel = layout.channels[at]
+    if channel.name in layout.self_calibration:
+        return float(UNIT), "g" if channel.kind == ACCELERATION else "spread"
+    if channel.scale == 1.0:
+        return 1.0 / channel.step, channel.unit
+    value = "value" if is_centred or not channel.offset else f"(value - {channel.offset:g})"
+    return 1.0 / channel.step, f"raw: {value} * {channel.scale:g} is in {channel.unit}"
 
 
 class SampleInputs:

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from plushsense.core.gestures import NOBODY
+from plushsense.dataset.quality.measurements import rows_at_one_time
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
 from plushsense.windows.calibration import SelfCalibration
 from plushsense.windows.clock import Segment, resample
@@ -24,6 +25,8 @@ class SessionReader:
 
     def __init__(self, dataset: Dataset) -> None:
         self._dataset = dataset
+        self.standing = set[str]()
+        """Ids of the recordings whose clock stands still, of those that were read."""
         self._states: dict[str, SelfCalibration] = {}  # at the beginning of each recording
 
     def stream(self, stream: str) -> list[Segment]:
@@ -48,9 +51,13 @@ class SessionReader:
         return calibrated
 
     def recording(self, recording: RecordingInfo) -> list[Segment]:
-        """Return the segments of a recording."""
+        """Return the segments of a recording; none if its clock stands still, since nothing is known of its times."""
         dataset = self._dataset
-        segments = resample(dataset.read(recording), dataset.layout)
+        frames = dataset.read(recording)
+        if rows_at_one_time(frames.device_ms):
+            self.standing.add(recording.id)
+            return []
+        segments = resample(frames, dataset.layout)
         if not dataset.layout.self_calibration:
             return segments
         if recording.id not in self._states:

@@ -22,6 +22,7 @@ from plushsense.core.version import __version__
 from plushsense.dataset.files import CACHE
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import as_dataset
+from plushsense.dataset.quality.copies import copied_recordings
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, Generation
 from plushsense.deploy.quantize import (
     QUANTIZE_VERSION,
@@ -392,6 +393,7 @@ def evaluate(
         cluster=cluster,
         seed=config.evaluation.seed,
         validation=config.holds_back,
+        shared_rows=copied_recordings(dataset, score.recording_ids),
         progress=progress,
     )
     warn_of_copies(result.table["leakage"], warn)

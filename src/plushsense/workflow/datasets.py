@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 from plushsense.core.errors import BundleError, ConfigError, DatasetError
 from plushsense.core.files import write_file
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, plural
 from plushsense.dataset.index import as_dataset, change_head, open_dataset
 from plushsense.dataset.privacy.forget import RemovalPlan, find_mentions, plan_removal
 from plushsense.dataset.privacy.forget import forget as remove_person
 from plushsense.dataset.publishing.checking import StageProgress
-from plushsense.dataset.publishing.contents import PublishOptions, public_codes
+from plushsense.dataset.publishing.contents import PublishOptions, public_codes, public_labels
 from plushsense.dataset.publishing.package import (
     PublishResult,
     Reidentification,
@@ -63,8 +63,8 @@ class CheckResult(CheckReport):
     def __repr__(self) -> str:
         n = self.counts()["by_severity"]
         return (
-            f"CheckResult({self.dataset.head.name!r}: {self.recordings} recordings, "
-            f"{n['error']} errors, {n['warning']} warnings, {n['info']} notes)"
+            f"CheckResult({self.dataset.head.name!r}: {plural(self.recordings, 'recording')}, "
+            f"{plural(n['error'], 'error')}, {plural(n['warning'], 'warning')}, {plural(n['info'], 'note')})"
         )
 
     def _repr_html_(self) -> str:
@@ -157,7 +157,6 @@ def publish_dataset(
     excluded: bool = False,
     columns: tuple[str, ...] = (),
     key: str | os.PathLike[str] | None = None,
-    bids: bool = False,
     reidentification: bool = True,
     seed: int = 1,
     published: str | None = None,
@@ -175,7 +174,6 @@ def publish_dataset(
         columns: columns of ``subjects.csv`` to publish besides age group and gender.
         key: a file outside the data set, created if absent. Packages made with the same key have the same time shifts;
             without a key they are random.
-        bids: add a folder tree in the style of Motion-BIDS.
         reidentification: test whether people can be recognised, and report it in the package.
         published: ISO date of the publication (default: today).
         thorough: let the slow validators read every row of the streams.
@@ -195,7 +193,7 @@ def publish_dataset(
     tested = None
     if reidentification:
         steps = (lambda done, total: progress("recognising people", done, total)) if progress else None
-        result = reidentify(dataset, seed=seed, progress=steps).under(public_codes(dataset))
+        result = reidentify(dataset, seed=seed, progress=steps).under(public_codes(dataset), public_labels(dataset))
         command = f"plushsense publish DATASET OUT --seed {seed}"
         tested = Reidentification(report(result, command), verdict(result), result.to_dict())
     done = publish(
@@ -203,7 +201,6 @@ def publish_dataset(
         folder,
         head,
         options=options,
-        bids=bids,
         reidentification=tested,
         published=published,
         thorough=thorough,
@@ -370,7 +367,7 @@ def _training_of(bundle: Bundle, subject: str, name: str, dataset: Dataset | Non
     if same_name:
         return "trained on this code in an earlier state of this data set: train it again, and remove it", False
     return (
-        f"trained on this code in the data set '{provenance.get('dataset')}': check whether it is the same person",
+        f"trained on this code in the data set '{provenance.get('dataset', '?')}': check whether it is the same person",
         False,
     )
 

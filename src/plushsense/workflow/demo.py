@@ -64,7 +64,8 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
     stage(f"1/6  {size.people} virtual people record {size.repetitions} × 17 gestures, and the recordings are imported")
     dataset = _dataset(out / f"dataset-{name}", out / f"recordings-{name}", size, progress)
     config = resolve(None, training={"epochs": size.epochs, "halve_every": max(1, size.epochs // 4)})
-    stage(f"2/6  train {config.model.arch} on {len(dataset.subjects)} people, some of them for validation")
+    arch = config.for_layout(dataset.layout).model.arch
+    stage(f"2/6  train {arch} on {len(dataset.subjects)} people, some of them for validation")
     trained = train(dataset, config, progress=lambda epoch, epochs, _: progress("training", epoch, epochs), warn=silent)
     bundle = trained.save(out / "model.plush")
     stage(f"3/6  evaluate it on people left out, in {size.folds} folds")

@@ -51,12 +51,54 @@ _TRAINING = ("preset", "epochs", "batch", "learning_rate", "random_state")
 
 def rows_of(X: Any) -> tuple[Any, tuple[int, int] | None]:
     """Return windows (N, C, T) as rows (N, C·T), which scikit-learn can check, and (C, T); other input and None."""
+    X = stacked(X)
     shape = X.shape if hasattr(X, "shape") else np.asarray(X).shape
     if len(shape) < 3:
         return X, None
     if len(shape) > 3:
         raise ArrayError(f"X has the shape {shape}: expected (N, C, T), or (N, C·T) with channels=C.")
     return np.reshape(np.asarray(X), (shape[0], shape[1] * shape[2])), (shape[1], shape[2])
+
+
+def stacked(X: Any) -> Any:
+    """Return windows that are a list or an array of arrays as one array; other input unchanged.
+
+    Raises:
+        ArrayError: for windows of different shapes.
+    """
+    nested = X
+    if hasattr(X, "dtypes"):  # a table of pandas, perhaps with a series in each cell
+        nested = np.asarray(X)
+    if not isinstance(nested, list | tuple) and getattr(getattr(nested, "dtype", None), "kind", "") != "O":
+        return X
+    if isinstance(nested, np.ndarray) and nested.ndim == 2 and nested.size and _is_sequence(nested[0, 0]):
+        nested = [list(row) for row in nested]
+    if not len(nested) or not _is_sequence(nested[0]):
+        return X
+    try:
+        windows = [np.array([np.asarray(part) for part in w]) if isinstance(w, list) else np.asarray(w) for w in nested]
+    except ValueError:
+        raise ArrayError(
+            "X has a window whose channels have different lengths: give each the same number of samples."
+        ) from None
+    shapes = sorted({window.shape for window in windows})
+    if len(shapes) == 1:
+        return np.stack(windows)
+    other = [axis for axis, sizes in enumerate(zip(*shapes, strict=False)) if len(set(sizes)) > 1]
+    if len(other) != 1 or len({len(shape) for shape in shapes}) > 1:
+        raise ArrayError(f"X has windows of different shapes ({shapes[0]}, {shapes[-1]}): expected is (C, T) for all.")
+    axis = other[0]
+    least, most = shapes[0][axis], shapes[-1][axis]
+    cut = f"[{', '.join([':'] * axis + [f':{least}'])}]"
+    raise ArrayError(
+        f"X has windows of different lengths, from {least} to {most} samples: the network reads one length. "
+        f"Cut recordings into windows (ps.cut_windows does it for a data set), or all to the shortest, as in "
+        f"np.stack([w{cut} for w in X])."
+    )
+
+
+def _is_sequence(value: Any) -> bool:
+    return hasattr(value, "__len__") and not isinstance(value, str | bytes | Mapping) and getattr(value, "ndim", 1) > 0
 
 
 def shape_of(features: int, shape: tuple[int, int] | None, given: int | None) -> tuple[int, int]:
@@ -580,8 +622,18 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
                 f"X has the shape {np.asarray(X).shape}: expected (N, {expected[0]}, {expected[1]}), as in fit{swap}."
             )
         rows = validate_data(self, rows, reset=False, ensure_all_finite=False)
-        x = to_integers(rows.reshape(len(rows), *expected), self.bundle_.layout)
         network, scaler = self.bundle_.network(), self.bundle_.scaler
+        x = rows.reshape(len(rows), *expected)
+        if self.bundle_.layout.name == ANONYMOUS and x.dtype.kind == "f":
+            steps = np.array([c.step for c in self.bundle_.layout.channels])
+            coarse = (steps == 1.0) & (scaler.scale > 2.0 / _STEPS_IN_SPREAD)
+            if (np.rint(x[:, coarse]) != x[:, coarse]).any():
+                warnings.warn(
+                    "X has fractions, but the windows in fit were whole numbers, to which they are rounded: give the "
+                    "same units as in fit.",
+                    stacklevel=3,
+                )
+        x = to_integers(x, self.bundle_.layout)
         return np.concatenate([network.forward(scaler.apply(x[at : at + _BATCH])) for at in range(0, len(x), _BATCH)])
 
 

@@ -176,7 +176,8 @@ def to_xdf(dataset: Dataset, folder: str | os.PathLike[str]) -> list[Path]:
 
     A file ``<person>/….xdf`` has the stream ``toy`` (the channels as the toy sends them, and device_ms) and the stream
     ``markers``: at the first sample of a recording its gesture, after the last one "end". Times are those of the
-    device's clock, from 0; where it goes back, the time continues with the next sample.
+    device's clock, from 0; where it goes back, the time continues with the next sample. The header of the toy says that
+    samples may be lost (``can_drop_samples``), so that readers do not space the times evenly across a gap.
 
     Raises:
         DatasetError: if ``folder`` exists and is not empty; ForgottenError: like `Generation.check`.
@@ -230,10 +231,11 @@ def _xdf_stream(
 ) -> bytes:
     """Return header, samples and footer of a stream; ``packed`` has number and bytes of the samples of each chunk."""
     listed = "".join(f"<channel><label>{escape(label)}</label></channel>" for label in channels)
+    lossy = "<synchronization><can_drop_samples>true</can_drop_samples></synchronization>" if rate_hz else ""
     header = (
         f"<?xml version='1.0'?><info><name>{name}</name><type>{'Touch' if rate_hz else 'Markers'}</type>"
         f"<channel_count>{len(channels)}</channel_count><nominal_srate>{rate_hz:g}</nominal_srate>"
-        f"<channel_format>{kind}</channel_format><desc><channels>{listed}</channels></desc></info>"
+        f"<channel_format>{kind}</channel_format><desc><channels>{listed}</channels>{lossy}</desc></info>"
     )
     which = struct.pack("<I", number)
     samples = [_xdf_chunk(3, which + struct.pack("<BI", 4, count) + content) for count, content in packed]

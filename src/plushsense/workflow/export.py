@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import ArchError, BadInput, BundleError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, plural
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.convert import CONVERTERS, check_format, convert
@@ -89,8 +89,8 @@ def training_windows(
     at = np.flatnonzero(np.isin(windows.subject, sorted(people)))
     if not len(at):
         raise BundleError(
-            f"The data set '{dataset.head.name}' has no window of the {len(people)} people the bundle was trained "
-            "on: give the data set that it was trained on.",
+            f"The data set '{dataset.head.name}' has no window of the {plural(len(people), 'person')} the bundle was "
+            "trained on: give the data set that it was trained on.",
             reason="calibration_other",
             name=dataset.head.name,
         )

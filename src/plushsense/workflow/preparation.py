@@ -15,6 +15,7 @@ from plushsense.core.errors import ConfigError, DatasetError, PlushSenseWarning,
 from plushsense.core.gestures import NOBODY, GestureSet, merge_names
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.proposals import median_gesture_s
+from plushsense.dataset.quality.outliers import far_inputs
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
 from plushsense.deploy.quantize import refuse_undeployable
 from plushsense.evaluation.crossval import fold_windows
@@ -22,7 +23,15 @@ from plushsense.models.arch import Arch, parse_symbol, symbol_within
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere, idle_candidates
-from plushsense.windows.cut import ANYWHERE, ROWS, WindowSet, WindowSpec, cut_windows, shared_gestures
+from plushsense.windows.cut import (
+    ANYWHERE,
+    ROWS,
+    WindowSet,
+    WindowSpec,
+    constant_windows,
+    cut_windows,
+    shared_gestures,
+)
 from plushsense.workflow.config import ALL, SHARED, RunConfig
 
 Warn = Callable[[str], None]
@@ -126,7 +135,24 @@ def windows_for(
         cut = cut_windows(dataset, spec, gestures)
     for line in cut.left_out:
         warn(Sentence(f"left out: {line}", line.reason, **line.values))
+    warn_of_far_readings(cut, warn)
+    # Cells that nothing touches are constant without a fault.
+    if not any(c.is_discrete for c in dataset.layout.channels) and (note := constant_windows(cut)) is not None:
+        warn(note)
     return cut
+
+
+def warn_of_far_readings(windows: WindowSet, warn: Warn) -> None:
+    """Warn of each input whose scale is set by a few readings far from all others."""
+    for at, far in far_inputs(windows.x).items() if warn is not silent else ():
+        name, n, percent = windows.inputs[at], int(far.sum()), 100 * float(far.mean())
+        people = ", ".join(sorted(set(windows.subject[far.any(axis=1)].tolist())))
+        sentence = (
+            f"the scale of {name} is set by {n} samples ({percent:.2g} %, of {people}) far from all others, so that "
+            "everything else looks alike in it: if these readings failed, exclude their recordings, or give the "
+            "layout a valid_min and valid_max without them"
+        )
+        warn(Sentence(sentence, "far_readings", channel=name, n=n, people=people))
 
 
 def add_hard_negatives(

@@ -58,7 +58,7 @@ def check_results(out: Path, name: str, summary: str, identity: str | None = Non
     except (OSError, ValueError, KeyError, TypeError):
         held = known = None
     if identity is None or known != identity:
-        details = ", ".join(str(held[key]) for key in ("name", "split") if key in held) if held else "unknown"
+        details = ", ".join(str(held[key]) for key in ("name", "split") if key in (held or {})) or "unknown"
         other = "already" if identity is None else f"of other settings or other data ({details})"
         raise ConfigError(
             f"'{out}' holds {name[0].lower()}{name[1:]} {other}: choose another --out, or --force to replace it; "
@@ -124,7 +124,8 @@ def check_place(out: Path, config: RunConfig, dataset: Dataset, *, replace: bool
     other = isinstance(data, Mapping) and data.get("hash") != dataset.hash
     raise ConfigError(
         f"'{out}' contains an evaluation of {'other data' if other else 'other settings'} "
-        f"({earlier.get('split')}, {earlier.get('title')}): choose another --out, or --force to replace it.",
+        f"({earlier.get('split', 'no split')}, {earlier.get('title', 'no title')}): choose another --out, or --force "
+        "to replace it.",
         reason="other_results",
     )
 

@@ -161,7 +161,7 @@ def test_encrypted_damaged_and_cut_off(tmp_path: Path) -> None:
 
 def test_what_is_no_archive_of_recordings(tmp_path: Path, session_writer: Writer) -> None:
     (tmp_path / "x.rar").write_bytes(b"Rar!")
-    with pytest.raises(DatasetError, match=r"ends in \.zip, \.xdf, \.parquet, \.csv"):
+    with pytest.raises(DatasetError, match=r"ends in \.zip, \.xdf, \.xdfz, \.xdf\.gz, \.parquet"):
         import_recordings(tmp_path / "x.rar", tmp_path / "DS", layout="accel-3")
     session_writer(tmp_path / "out")
     import_recordings(tmp_path / "out", tmp_path / "DS")

@@ -102,9 +102,10 @@ def test_what_a_guess_leaves_out_and_refuses(tmp_path: Path) -> None:
     assert found["layout"]["rate_hz"] == 100.0
     assert guessed.doubts[0] == "files that do not end in '.csv' are left out: 1"
     assert [doubt.partition(":")[0] for doubt in guessed.doubts[1:]] == [
-        "files without such rows are left out",
         "the column 'index' is taken for a number of the row, not for a channel",
         "the column 'time_host' is taken for a second clock, not for a channel",
+        "files without such rows are left out",
+        "the person is taken from the path",
     ]
     assert preview_import(src, pattern=ImportPattern(**found)).gestures == {"Hold": 12, "Tap": 12}
     shutil.copy(src / "P01" / "all day.csv", src / "P02" / "evening.csv")
@@ -228,8 +229,10 @@ def test_a_pattern_reads_a_zip_and_gets_people_from_a_mapping(tmp_path: Path) ->
     shutil.make_archive(str(tmp_path / "taps"), "zip", tmp_path / "src")
     (tmp_path / "map.csv").write_text("file,subject\ntaps.jsonl,eve\n")
     (tmp_path / "p.toml").write_text((PATTERNS / "taps.toml").read_text().replace('subject = "user.id"\n', ""))
+    unknown = preview_import(tmp_path / "taps.zip", pattern=tmp_path / "p.toml")
+    assert unknown.subjects == ["unknown"] and "--subjects map.csv" in unknown.warnings[-1]
     with pytest.raises(DatasetError, match="no column 'subject'.*--subjects map.csv"):
-        import_recordings(tmp_path / "taps.zip", tmp_path / "DS", pattern=tmp_path / "p.toml")
+        import_recordings(tmp_path / "src", tmp_path / "DS", pattern=tmp_path / "p.toml", person="")
     done = import_recordings(
         tmp_path / "taps.zip", tmp_path / "DS", pattern=tmp_path / "p.toml", subjects=tmp_path / "map.csv"
     )

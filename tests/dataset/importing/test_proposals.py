@@ -11,44 +11,32 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import ConfigError
-from plushsense.core.layouts import load_layout
-from plushsense.core.recorder_csv import Frames, write_recording
+from plushsense.core.layouts import Layout, load_layout
+from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.importing.proposals import Sensor, find_sensors, readable_layouts
 from plushsense.dataset.index import open_dataset
-
-ACCEL = load_layout("accel-3")
-
-
-def analogue(
-    folder: Path, zero: float, one_g: float, period_ms: int = 10, turned: bool = True, people: range = range(3)
-) -> Path:
-    """Recordings of an accelerometer of 10 bits, held in many directions for a while and moved in between."""
-    rng = np.random.default_rng(people.start)
-    for p in people:
-        (folder / f"P{p}").mkdir(parents=True)
-        for take in range(6):
-            up = rng.normal(size=3) if turned else np.array([0.0, 0.0, 1.0])
-            up /= np.linalg.norm(up)
-            rows = 3000 // period_ms
-            moves = np.where(np.arange(rows) > rows // 2, 0.8, 0.0) * np.sin(np.arange(rows) * period_ms / 70)
-            values = zero + one_g * (up + moves[:, None] * [0.3, 0.5, 0.2]) + rng.normal(0, 0.6, (rows, 3))
-            clock = np.arange(rows, dtype=np.int64) * period_ms
-            frames = Frames(np.round(values).astype(np.int64), clock, clock + 1_700_000_000_000)
-            write_recording(folder / f"P{p}" / f"Wave_{1_700_000_000_000 + take}_{rows}.csv", frames, ACCEL)
-    return folder
+from plushsense.dataset.quality.checking import check
+from plushsense.dataset.quality.outliers import far_inputs, find_failed_readings
+from plushsense.runtime.classifier import check_layout
+from plushsense.windows.clock import SampleClock, resample
+from plushsense.windows.cut import WindowSpec, cut_windows
+from plushsense.windows.features import Scaler
+from support.accelerometers import ACCEL, analogue
 
 
 @pytest.mark.parametrize(("zero", "one_g"), [(330.0, 68.0), (511.0, 102.0)])
 def test_the_zero_of_an_analogue_accelerometer_is_found_and_adopted(tmp_path: Path, zero: float, one_g: float) -> None:
     source = analogue(tmp_path / "R", zero, one_g)
-    done = import_recordings(source, tmp_path / "DS", layout="accel-3")
+    done = import_recordings(source, tmp_path / "DS", layout="accel-3", adopt_proposals=False)
     offset = next(p for p in done.proposals if p["key"] == "offset")
     assert all(abs(value - zero) < 0.05 * one_g for value in offset["value"].values())
-    assert "--adopt" in offset["advice"]
+    assert "give a layout with offset" in offset["advice"] and not offset["adopted"] and not done.notes
     assert [c.offset for c in done.dataset.layout.channels] == [0, 0, 0]
-    adopted = import_recordings(source, tmp_path / "ADOPTED", layout="accel-3", adopt_proposals=True)
-    assert "adopted" in adopted.proposals[0]["advice"]
+    adopted = import_recordings(source, tmp_path / "ADOPTED", layout="accel-3")
+    assert "adopted" in adopted.proposals[0]["advice"] and adopted.proposals[0]["adopted"]
+    (note,) = (n for n in adopted.notes if isinstance(n, Sentence) and n.reason == "adopted")
+    assert adopted.proposals[0]["reason"] in note and note.values["settings"][0].startswith("offset: x ")
     for dataset in (adopted.dataset, open_dataset(tmp_path / "ADOPTED")):
         assert [c.offset for c in dataset.layout.channels] == list(offset["value"].values())
     assert not [p for p in import_recordings(source, tmp_path / "AGAIN", layout=adopted.dataset.layout).proposals
@@ -64,18 +52,19 @@ def test_a_zero_that_cannot_be_known_is_not_proposed(tmp_path: Path) -> None:
 
 def test_two_references_of_an_analogue_converter_are_named(tmp_path: Path, cli: Callable[..., Any]) -> None:
     source = analogue(tmp_path / "R", 330, 68)
-    assert "offset: x 3" in cli("import", source, tmp_path / "DS", "--layout", "accel-3").err
+    ran = cli("import", source, tmp_path / "DS", "--layout", "accel-3", "--no-adopt")
+    assert "suggestion: held still" in ran.err and "offset: x 3" in ran.err and "adopted" not in ran.err
     ran = cli("import", analogue(source, 511, 102, people=range(3, 5)), tmp_path / "DS", "--add")
     assert "suggestion: the accelerometers of the sessions differ in zero or scale: 1 g is about 68" in ran.err
     assert "for P0, P1, P2; 1 g is about 10" in ran.err
     assert 'give a layout with self_calibration = ["x", "y", "z"]' in ran.err
-    adopted = import_recordings(source, tmp_path / "DS2", layout="accel-3", adopt_proposals=True)
+    adopted = import_recordings(source, tmp_path / "DS2", layout="accel-3")
     assert [c.offset for c in adopted.dataset.layout.channels] == [0, 0, 0], "no zero fits both"
     assert open_dataset(tmp_path / "DS2").layout.self_calibration == ("x", "y", "z")
     assert adopted.proposals[0]["advice"] == 'adopted self_calibration = ["x", "y", "z"]'
     wide = load_layout("accel-3")
     wide = replace(wide, channels=tuple(replace(c, valid_max=1e6) for c in wide.channels))
-    kept = import_recordings(source, tmp_path / "WIDE", layout=wide, adopt_proposals=True)
+    kept = import_recordings(source, tmp_path / "WIDE", layout=wide)
     assert kept.dataset.layout == wide and "give a layout" in kept.proposals[0]["advice"]
     (found,) = (p for p in adopted.to_dict()["proposals"] if p["key"] in ("offset", "self_calibration"))
     assert found["value"] == ["x", "y", "z"] and list(found["groups"]) == adopted.sensors
@@ -118,12 +107,111 @@ def test_the_unit_is_recognised_where_it_is_plain(one_g: float, unit: str) -> No
     assert ("but the layout says g" in sensor.summary) == (unit not in ("", "g"))
 
 
+def test_the_unit_that_1_g_tells_is_adopted_and_the_model_still_reads_the_device(tmp_path: Path) -> None:
+    given = replace(
+        ACCEL, channels=tuple(replace(c, unit="g", valid_min=-8000, valid_max=8000) for c in ACCEL.channels)
+    )
+    milli = import_recordings(analogue(tmp_path / "R", 0, 1000), tmp_path / "DS", layout=given)
+    (unit,) = (p for p in milli.proposals if p["key"] == "unit")
+    assert unit["value"] == dict.fromkeys("xyz", "mg") and unit["adopted"]
+    adopted = milli.dataset.layout
+    assert [c.unit for c in adopted.channels] == ["mg"] * 3
+    check_layout(given, adopted)  # the device as its owner describes it, and the model made of the data set
+    assert import_recordings(tmp_path / "R", tmp_path / "DS", layout=given, add_to=True).already_there == 18
+    other = replace(given, name="other")
+    with pytest.raises(ConfigError, match="channel 'x' has another unit, scale, step"):
+        check_layout(other, adopted)
+
+
+def test_two_data_sets_of_one_sensor_are_read_alike(tmp_path: Path) -> None:
+    first = import_recordings(analogue(tmp_path / "R", 330, 68), tmp_path / "DS", layout="accel-3").dataset
+    second = import_recordings(analogue(tmp_path / "Q", 340, 68), tmp_path / "DS2", layout="accel-3").dataset
+    assert first.layout.channels != second.layout.channels
+    read = second.with_inputs(first.layout.for_vectors())
+    assert read.layout.channels == first.layout.channels and read.layout.inputs[-1] == "z_gravity"
+    assert read.hash == second.hash
+
+
+def failing(folder: Path, value: float, rows: int = 1, every: int = 3, times: int = 1) -> Path:
+    """Write recordings of two force sensors at 50 Hz, some with readings ``value`` of the first for ``rows`` rows."""
+    rng = np.random.default_rng(0)
+    folder.mkdir(parents=True)
+    lines = ["subject,time_ms,left,right,label"]
+    for take in range(24):
+        left = 10 * np.sin(np.arange(100) / 9) ** 2 + rng.normal(0, 0.1, 100)
+        if take % every == 0:
+            for at in range(20, 20 + 20 * times, 20):
+                left[at : at + rows] = value
+        lines += [
+            f"P{take % 3},{10**12 + 10000 * take + 20 * i},{x:.2f},{y:.2f},{'push' if take % 2 else 'pull'}"
+            for i, (x, y) in enumerate(zip(left, rng.normal(5, 1, 100), strict=True))
+        ]
+    (folder / "t.csv").write_text("\n".join(lines) + "\n")
+    return folder / "t.csv"
+
+
+FORCE = Layout.from_dict(
+    {
+        "name": "force",
+        "rate_hz": 50.0,
+        "channels": [{"name": n, "unit": "N", "kind": "force", "step": 0.01} for n in ("left", "right")],
+        "wire": ["device_ms", "left", "right"],
+    },
+    "the test",
+)
+
+
+@pytest.mark.parametrize("value", [838860.7, -838860.8, 32767, -32768, 65535])
+def test_failed_readings_are_outside_the_valid_range_that_is_adopted(tmp_path: Path, value: float) -> None:
+    done = import_recordings(failing(tmp_path / "R", value), tmp_path / "DS", layout=FORCE)
+    left, right = done.dataset.layout.channels
+    assert right == FORCE.channels[1]
+    assert -15 < left.valid_min < -8 and 18 < left.valid_max < 25
+    (note,) = (n for n in done.notes if isinstance(n, Sentence) and n.reason == "adopted")
+    assert "8 of 2400 readings of left (P0) are far beyond all others" in note
+    found = [f for f in check(done.dataset).findings if f.check == "garbage" and f.recording]
+    assert len(found) == 8 and all(f.severity == "error" for f in found)
+    kept = import_recordings(tmp_path / "R" / "t.csv", tmp_path / "KEPT", layout=FORCE, adopt_proposals=False)
+    assert kept.dataset.layout == FORCE and "give a layout with valid_m" in kept.proposals[0]["advice"]
+    added = import_recordings(failing(tmp_path / "MORE", value), tmp_path / "KEPT", add_to=True)
+    assert {p["key"] for p in added.proposals} >= {"valid_min", "valid_max"} and added.dataset.layout == FORCE
+    assert len(find_failed_readings(done.dataset)) == 0
+
+
+def test_a_model_reads_failed_readings_as_the_last_good_one(tmp_path: Path) -> None:
+    done = import_recordings(failing(tmp_path / "R", 838860.7), tmp_path / "DS", layout=FORCE)
+    good = import_recordings(failing(tmp_path / "Q", 5.0), tmp_path / "GOOD", layout=FORCE)
+    spec = WindowSpec(window_s=1.0)
+    windows, expected = cut_windows(done.dataset, spec), cut_windows(good.dataset, spec)
+    scaler, usual = Scaler.fit(windows.x), Scaler.fit(expected.x)
+    assert np.allclose(scaler.scale, usual.scale, rtol=0.05) and not far_inputs(windows.x)
+    clock, frames = SampleClock(done.dataset.layout), done.dataset.read(done.dataset.used[0])
+    streamed = np.concatenate([clock.push(int(t), row) for t, row in zip(frames.device_ms, frames.values, strict=True)])
+    assert clock.invalid == 1 and np.array_equal(streamed, resample(frames, done.dataset.layout)[0].data)
+    assert streamed[20, 0] == frames.values[19, 0]
+
+
+@pytest.mark.parametrize(
+    ("value", "rows", "every", "times"),
+    [(838860.7, 20, 24, 1), (90, 1, 3, 1), (65535.01 / 300, 1, 3, 1), (838860.7, 1, 1, 4)],
+    ids=["in succession", "not far", "no limit of integers", "many"],
+)
+def test_what_may_be_real_is_not_taken_for_failed(
+    tmp_path: Path, value: float, rows: int, every: int, times: int
+) -> None:
+    done = import_recordings(failing(tmp_path / "R", value, rows, every, times), tmp_path / "DS", layout=FORCE)
+    assert done.dataset.layout == FORCE
+    # What lasts is a touch or a disconnected sensor: the user decides.
+    assert {p["key"] for p in done.proposals} & {"valid_max"} == ({"valid_max"} if rows == 20 else set())
+
+
 def test_rate_gap_and_window_are_measured(tmp_path: Path) -> None:
-    done = import_recordings(analogue(tmp_path / "R", 0, 8000, period_ms=80), tmp_path / "DS", layout="accel-3")
+    source = analogue(tmp_path / "R", 0, 8000, period_ms=80)
+    done = import_recordings(source, tmp_path / "DS", layout="accel-3", adopt_proposals=False)
     found = {p["key"]: p["value"] for p in done.proposals}
     assert found["rate_hz"] == 12.0 and found["gap_ms"] == pytest.approx(320, abs=8)
     assert "window_s" not in found  # the recordings last 3 s
-    adopted = import_recordings(tmp_path / "R", tmp_path / "DS2", layout="accel-3", adopt_proposals=True).dataset.layout
+    adopted = import_recordings(source, tmp_path / "DS2", layout="accel-3").dataset.layout
     assert (adopted.rate_hz, adopted.gap_ms) == (12.0, found["gap_ms"])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import unicodedata
+from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from plushsense.core.errors import ConfigError, DatasetError, FileFormatError, M
 from plushsense.core.layouts import load_layout
 from plushsense.dataset.importing import table_files
 from plushsense.dataset.importing.importers import ImportSummary, import_recordings
+from plushsense.dataset.importing.pattern import ImportPattern
+from plushsense.windows.anywhere import add_idle_gesture
 
 ACCEL = load_layout("accel-3")
 
@@ -24,7 +27,7 @@ def table(path: Path, rows: list[str], header: str = "subject,session,label,time
 
 
 def rows(subject: str, label: str, start: int, count: int, session: str = "1") -> list[str]:
-    return [f"{subject},{session},{label},{(start + i) * 10},{i},{i + 1},{-i}" for i in range(count)]
+    return [f"{subject},{session},{label},{(start + i) * 10},{i % 7},{i % 7 + 1},{-(i % 7)}" for i in range(count)]
 
 
 def got(done: ImportSummary) -> list[tuple[str, str, str, int]]:
@@ -36,7 +39,7 @@ def test_runs_of_a_label_are_recordings(tmp_path: Path) -> None:
     path = table(tmp_path / "all.csv", lines)
     done = import_recordings(path, tmp_path / "DS", layout="accel-3")
     assert got(done) == [("ana", "1", "Shake", 50), ("ana", "1", "Wave", 40), ("ben", "2", "Shake", 30)]
-    assert done.streams == 0, "every row has a label: there is nothing between the recordings"
+    assert [s.subject for s in done.dataset.streams] == ["ana"], "one gesture goes on where the other ends"
     assert done.to_dict()["warnings"] == []
     wave = done.dataset.read(done.dataset.recordings[1])
     assert wave.values[:2].tolist() == [[0, 1, 0], [1, 2, -1]]
@@ -74,6 +77,33 @@ def test_rows_without_a_label_make_a_stream(tmp_path: Path) -> None:
     (recording,) = done.dataset.recordings
     (stream,) = done.dataset.streams
     assert (recording.stream_row, recording.rows, stream.rows) == (30, 50, 100)
+
+
+def test_recordings_that_follow_one_another_make_a_stream(tmp_path: Path) -> None:
+    together = rows("ana", "Shake", 0, 30) + rows("ana", "Wave", 30, 40) + rows("ana", "Shake", 80, 50)
+    apart = rows("ana", "Shake", 0, 30) + rows("ana", "Wave", 80, 40) + rows("ana", "Shake", 120, 50)
+    for name, lines, streams in (("t", [*together, *rows("ana", "Wave", 130, 40)], 1), ("a", apart[:120], 0)):
+        path = table(tmp_path / f"{name}.csv", lines)
+        one = import_recordings(path, tmp_path / f"{name}-DS", layout="accel-3")
+        pattern = ImportPattern(layout="accel-3", paths=("*.csv",))
+        other = import_recordings(path, tmp_path / f"{name}-by-pattern", pattern=pattern)
+        assert (one.streams, other.streams) == (streams, streams), "one rule with and without a pattern"
+        assert [r.stream_row for r in other.dataset.recordings] == [r.stream_row for r in one.dataset.recordings]
+    counted = ImportPattern(layout="accel-3", paths=("*.csv",), row_rate_hz=100.0)
+    assert import_recordings(path, tmp_path / "no-clock", pattern=counted).streams == 1
+    by_rows = replace(counted, recording_rows=10)
+    assert import_recordings(path, tmp_path / "no-clock-apart", pattern=by_rows).streams == 0
+
+
+def test_rows_with_an_idle_label_belong_to_the_stream_only(tmp_path: Path) -> None:
+    lines = rows("ana", "Null class", 0, 30) + rows("ana", "Shake", 30, 50) + rows("ana", "null_class", 80, 20)
+    path = table(tmp_path / "all.csv", lines)
+    pattern = ImportPattern(layout="accel-3", paths=("*.csv",), idle=("null class",))
+    done = import_recordings(path, tmp_path / "DS", pattern=pattern)
+    (recording,) = done.dataset.recordings
+    assert (done.gestures, done.streams, recording.stream_row, recording.rows) == (["Shake"], 1, 30, 50)
+    idle = add_idle_gesture(done.dataset.gestures, done.dataset)
+    assert [g.label for g in idle.gestures if g.idle] == ["Idle"]
 
 
 def test_a_pause_a_clock_that_runs_back_and_a_recording_column(tmp_path: Path) -> None:

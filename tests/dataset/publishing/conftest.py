@@ -37,4 +37,4 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 @pytest.fixture(scope="session")
 def package(source: Dataset, tmp_path_factory: pytest.TempPathFactory) -> PublishResult:
     """The package; never to be changed by a test."""
-    return made_of(source, tmp_path_factory.mktemp("out") / "package", bids=True)
+    return made_of(source, tmp_path_factory.mktemp("out") / "package")

@@ -17,19 +17,26 @@ def package(folder: Path) -> Path:
 
 def test_the_zip_depends_on_nothing_but_the_files(tmp_path: Path) -> None:
     root = package(tmp_path / "P")
-    write_zip(root, tmp_path / "1.zip", "n")
+    write_zip(root, tmp_path / "1.zip")
     os.utime(root / "z.txt", (1, 1))
     (root / "z.txt").chmod(0o600)
-    write_zip(root, tmp_path / "2.zip", "n")
+    write_zip(root, tmp_path / "2.zip")
     assert (tmp_path / "1.zip").read_bytes() == (tmp_path / "2.zip").read_bytes()
-    write_zip(root, tmp_path / "1.zip", "n")
-    with pytest.raises(DatasetError, match="already there"):
-        write_zip(root, tmp_path / "1.zip", "another")
+    write_zip(root, tmp_path / "1.zip")
     with open_package(tmp_path / "1.zip") as folder:
         assert (folder / "a" / "b" / "ü.csv").read_text() == "1\n"
-        assert folder.name == "n"
     assert not folder.exists()
+    (root / "z.txt").write_text("3\n")
+    with pytest.raises(DatasetError, match="already there"):
+        write_zip(root, tmp_path / "1.zip")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["1.zip", "2.zip", "P"]
+
+
+def test_a_package_that_was_zipped_again_with_its_folder(tmp_path: Path) -> None:
+    package(tmp_path / "out" / "P")
+    write_zip(tmp_path / "out", tmp_path / "p.zip")
+    with open_package(tmp_path / "p.zip") as folder:
+        assert (folder.name, (folder / "z.txt").read_text()) == ("P", "2\n")
 
 
 def test_checksums_as_sha256sum_reads_them(tmp_path: Path) -> None:
@@ -58,7 +65,7 @@ def test_a_link_and_a_damaged_zip_are_refused(tmp_path: Path) -> None:
         archive.writestr(link, "/etc/passwd")
     with pytest.raises(DatasetError, match="is refused"), open_package(tmp_path / "link.zip"):
         pass
-    write_zip(package(tmp_path / "P"), tmp_path / "p.zip", "n")
+    write_zip(package(tmp_path / "P"), tmp_path / "p.zip")
     data = bytearray((tmp_path / "p.zip").read_bytes())
     at = data.find(b"csv") + 5
     data[at] ^= 0xFF
@@ -68,9 +75,9 @@ def test_a_link_and_a_damaged_zip_are_refused(tmp_path: Path) -> None:
 
 
 def test_an_entry_that_hides_another_or_swells_is_refused(tmp_path: Path) -> None:
-    write_zip(package(tmp_path / "P"), tmp_path / "p.zip", "n")
+    write_zip(package(tmp_path / "P"), tmp_path / "p.zip")
     with zipfile.ZipFile(tmp_path / "p.zip", "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
-        archive.writestr("n/z.txt", "another")
+        archive.writestr("z.txt", "another")
     with (
         pytest.raises(DatasetError, match="another member has the same name"),
         open_package(tmp_path / "p.zip"),

@@ -8,7 +8,6 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import pytest
 
@@ -16,7 +15,6 @@ from plushsense.core.errors import DatasetError
 from plushsense.dataset.files import sha256_of
 from plushsense.dataset.publishing import checking
 from plushsense.dataset.publishing.checking import VALIDATORS, PackageView, check_folder, validate_package
-from plushsense.dataset.publishing.metadata import CRATE_FILE
 from plushsense.dataset.publishing.package import PublishResult
 from plushsense.dataset.publishing.tables import write_checksums, write_zip
 from support.requirements import LONG
@@ -127,18 +125,6 @@ def an_unknown_kind(root: Path) -> None:
     edit(root, "datacite.json", lambda t: t["types"].update(resourceTypeGeneral="Touch"))
 
 
-def another_title_in_xml(root: Path) -> None:
-    change(root / "datacite.xml", "Touch of two people", "Touch of three people")
-
-
-def crate_lists_what_is_not_there(root: Path) -> None:
-    edit(root, "ro-crate-metadata.json", lambda t: t["@graph"][-1].update({"@id": "gone.csv"}))
-
-
-def crate_without_root(root: Path) -> None:
-    edit(root, "ro-crate-metadata.json", lambda t: t["@graph"].pop(1))
-
-
 def a_true_time(root: Path) -> None:
     path = first_csv(root)
     lines = path.read_text().splitlines()
@@ -160,7 +146,7 @@ def reseal(root: Path, before: dict[str, str]) -> None:
             file = path.relative_to(root).as_posix()
             old, new = before.get(file, ""), sha256_of(path)
             if old and old != new:
-                for other in ("recordings.csv", "streams.csv", "croissant.json", "datapackage.json", CRATE_FILE):
+                for other in ("recordings.csv", "streams.csv", "croissant.json", "datapackage.json"):
                     (root / other).write_text((root / other).read_text("utf-8").replace(old, new), "utf-8")
                 before[file] = new
 
@@ -168,12 +154,6 @@ def reseal(root: Path, before: dict[str, str]) -> None:
             entry[key] = type(entry[key])((root / file).stat().st_size)
 
         edit(root, "datapackage.json", lambda t: [size(r, r["path"], "bytes") for r in t["resources"]])
-        edit(
-            root,
-            CRATE_FILE,
-            lambda t: [size(e, unquote(e["@id"]), "contentSize") for e in t["@graph"] if "contentSize" in e],
-        )
-    before[CRATE_FILE] = sha256_of(root / CRATE_FILE)
     write_checksums(root)
 
 
@@ -208,10 +188,7 @@ CONTRADICTIONS: dict[str, tuple[str, Damage]] = {
     "the licence for machines": ("metadata", lambda r: edit(r, "croissant.json", lambda t: t.update(license="x"))),
     "a version": ("metadata", lambda r: edit(r, "croissant.json", lambda t: t.update(version="2.0.0"))),
     "a title": ("metadata", lambda r: edit(r, "datapackage.json", lambda t: t.update(title="Another"))),
-    "the crate's day": (
-        "metadata",
-        lambda r: edit(r, CRATE_FILE, lambda t: t["@graph"][1].update(datePublished="2001-01-01")),
-    ),
+    "a day": ("metadata", lambda r: edit(r, "croissant.json", lambda t: t.update(datePublished="2001-01-01"))),
     "nobody is virtual": (
         "metadata",
         lambda r: change(r / "data/dataset.toml", "simulated = false", "simulated = true"),
@@ -242,39 +219,33 @@ def test_what_plushsense_leaves_in_an_opened_folder_is_no_part_of_a_zip(package:
     (root / "data" / "cache").mkdir()
     (root / "data" / "cache" / "who.txt").write_text("P1 is Anna")
     assert check_folder(root).valid
-    write_zip(root, tmp_path / "p.zip", "package")
+    write_zip(root, tmp_path / "p.zip")
     found = validate_package(tmp_path / "p.zip")
-    assert {(p.validator, p.file) for p in found.problems} == {
-        ("checksums", "data/cache/who.txt"),
-        ("ro-crate", "data/cache/who.txt"),
-    }
+    assert [(p.validator, p.file) for p in found.problems] == [("checksums", "data/cache/who.txt")]
 
 
 @pytest.mark.parametrize(
     ("damage", "by"),
     [
-        (flip_a_digit, {"data", "frictionless", "ro-crate"}),
-        (remove_a_file, {"data", "frictionless", "ro-crate"}),
-        (add_a_file, {"ro-crate"}),
-        (cut_a_file, {"data", "croissant", "frictionless", "ro-crate"}),
-        (words_for_a_number, {"data", "croissant", "frictionless", "ro-crate"}),
-        (another_gesture, {"data", "croissant", "frictionless", "ro-crate"}),
-        (swap_columns, {"croissant", "ro-crate"}),
-        (lose_a_record_set, {"croissant", "ro-crate"}),
-        (break_a_field, {"croissant", "ro-crate"}),
-        (croissant_is_no_json, {"croissant", "ro-crate"}),
-        (croissant_would_fetch, {"croissant", "ro-crate"}),
-        (context_would_be_fetched, {"croissant", "ro-crate"}),
-        (croissant_leaves_the_package, {"croissant", "ro-crate"}),
-        (frictionless_would_fetch, {"frictionless", "ro-crate"}),
-        (another_type, {"frictionless", "ro-crate"}),
-        (an_unknown_type, {"frictionless", "ro-crate"}),
-        (no_publisher, {"datacite", "ro-crate"}),
-        (an_unknown_kind, {"datacite", "ro-crate"}),
-        (another_title_in_xml, {"datacite", "ro-crate"}),
-        (crate_lists_what_is_not_there, {"ro-crate"}),
-        (crate_without_root, {"ro-crate"}),
-        (a_true_time, {"times", "data", "frictionless", "ro-crate"}),
+        (flip_a_digit, {"data", "frictionless"}),
+        (remove_a_file, {"data", "frictionless"}),
+        (add_a_file, set()),
+        (cut_a_file, {"data", "croissant", "frictionless"}),
+        (words_for_a_number, {"data", "croissant", "frictionless"}),
+        (another_gesture, {"data", "croissant", "frictionless"}),
+        (swap_columns, {"croissant"}),
+        (lose_a_record_set, {"croissant"}),
+        (break_a_field, {"croissant"}),
+        (croissant_is_no_json, {"croissant"}),
+        (croissant_would_fetch, {"croissant"}),
+        (context_would_be_fetched, {"croissant"}),
+        (croissant_leaves_the_package, {"croissant"}),
+        (frictionless_would_fetch, {"frictionless"}),
+        (another_type, {"frictionless"}),
+        (an_unknown_type, {"frictionless"}),
+        (no_publisher, {"datacite"}),
+        (an_unknown_kind, {"datacite"}),
+        (a_true_time, {"times", "data", "frictionless"}),
         (a_true_time_in_a_name, {"times", "data"}),
     ],
 )

@@ -29,7 +29,7 @@ from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
 from plushsense.dataset.quality.checking import CHECKS, Check, CheckReport, check
 from plushsense.dataset.quality.findings import CheckLimits, Issue
-from plushsense.dataset.quality.measurements import Examination, backward_steps
+from plushsense.dataset.quality.measurements import Examination, backward_steps, rows_at_one_time
 from plushsense.dataset.store import Dataset
 from plushsense.recording.simulate import simulate
 from plushsense.studio.app.words import Words
@@ -232,6 +232,10 @@ def spiky(folder: Path) -> str:
     return change(recording(folder), with_values(np.arange(40, 280, 40), 11, 9000))
 
 
+def failed(folder: Path) -> str:
+    return change(recording(folder), with_values(120, 11, 8388607))
+
+
 def malformed(folder: Path) -> str:
     path = recording(folder)
     lines = path.read_text().splitlines(keepends=True)
@@ -249,6 +253,11 @@ def duplicate(folder: Path) -> str:
     target.write_text(format_header(PLUSH) + format_rows(moved, PLUSH), newline="\n")
     target = renamed(target, len(moved))
     return target.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
+def copied_inside(folder: Path) -> str:
+    taken = read_recording(recording(folder, label="Tail tap 1"), PLUSH).frames.values[100:]
+    return change(recording(folder, 2, "Tail tap 1", "P4"), with_values(slice(30, 30 + len(taken)), slice(None), taken))
 
 
 def overlapping(folder: Path) -> str:
@@ -297,6 +306,20 @@ def one_row(folder: Path) -> str:
     path = recording(folder)
     change(path, lambda f: f.slice(0, 1))
     path = renamed(path, 1)
+    return path.relative_to(folder / "recordings").with_suffix("").as_posix()
+
+
+def standing(folder: Path) -> str:
+    return clocked(folder, lambda t: t // 10**6 * 10**6)
+
+
+def stalling(folder: Path) -> str:
+    return clocked(folder, lambda t: t // 1000 * 1000)
+
+
+def clocked(folder: Path, clock: Callable[[np.ndarray], np.ndarray]) -> str:
+    path = recording(folder)
+    change(path, lambda f: Frames(f.values, clock(f.device_ms), f.host_ms))
     return path.relative_to(folder / "recordings").with_suffix("").as_posix()
 
 
@@ -397,8 +420,10 @@ PLANTS: list[tuple[str, Callable[[Path], str]]] = [
     ("garbage", garbage),
     ("blank-rows", blank),
     ("spikes", spiky),
+    ("garbage", failed),
     ("malformed", malformed),
     ("duplicate", duplicate),
+    ("duplicate", copied_inside),
     ("overlap", overlapping),
     ("missing", missing),
     ("several-gestures", two_in_one),
@@ -411,6 +436,8 @@ PLANTS: list[tuple[str, Callable[[Path], str]]] = [
     ("cut-line", cut),
     ("resumed", resumed),
     ("resumed", next_day),
+    ("clock-still", standing),
+    ("clock-still", stalling),
     ("clock-reset", reset),
     ("clock-reset", leap),
     ("out-of-order", overtaken),
@@ -465,6 +492,28 @@ def test_rows_that_came_late_are_no_reset_of_the_clock(copy: Path) -> None:
 )
 def test_late_rows_are_told_from_resets(times: np.ndarray, resets: list[int], late: list[int]) -> None:
     assert [found.tolist() for found in backward_steps(times)] == [resets, late]
+
+
+@pytest.mark.parametrize(
+    ("times", "rows"),
+    [
+        (np.full(100, 1.5e12), 100),
+        (np.full(4, 0.0), 0),
+        (np.float32(1_700_000_000 + 0.01 * np.arange(300)), 300),
+        (np.repeat(np.arange(6), 50), 50),
+        (np.repeat(np.arange(10), 10), 0),
+        (np.arange(100), 0),
+        (np.array([]), 0),
+    ],
+)
+def test_a_clock_that_stands_still_is_told_from_packets(times: np.ndarray, rows: int) -> None:
+    assert rows_at_one_time(times) == rows
+
+
+def test_a_clock_that_stands_still_is_not_called_too_short(copy: Path) -> None:
+    standing(copy)
+    assert {f.severity for f in check(open_dataset(copy), only=["clock-still"]).findings} == {"error"}
+    assert check(open_dataset(copy), only=["too-short"]).findings == ()
 
 
 def test_every_check_has_a_planted_fault() -> None:

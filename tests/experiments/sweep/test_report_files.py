@@ -20,7 +20,7 @@ def test_a_sweeps_folder_makes_its_page(cli: Callable[..., Any], tmp_path: Path)
     assert Path(done["report"]) == folder / "report.html" and Path(done["files"], "table-4.csv").is_file()
     page = tmp_path / "other.html"
     ran = cli("report", folder, "--page", page, "--title", "Mine")
-    assert ran.status == 0 and f"{page}: 1 of 1 trials" in ran.out
+    assert ran.status == 0 and f"{page}: 1 of 1 trial" in ran.out
     assert "<h1>Mine</h1>" in page.read_text(encoding="utf-8")
     assert (tmp_path / "other-files" / "table-4.csv").is_file()
 

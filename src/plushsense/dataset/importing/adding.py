@@ -141,8 +141,8 @@ def add_to_dataset(
         if account.rejected and not account.kept and not copier.already:
             file, reason = account.rejected[0].values()
             raise DatasetError(
-                f"Nothing of the source fits '{dest}', whose layout is '{head.layout.name}': all "
-                f"{len(account.rejected)} files are rejected. The first: '{file}': {reason.rstrip('.')}.",
+                f"Nothing of the source fits '{dest}', whose layout is '{head.layout.name}': "
+                f"rejected are all files ({len(account.rejected)}). The first: '{file}': {reason.rstrip('.')}.",
                 reason="import_unreadable",
                 layout=head.layout.name,
                 first=reason,

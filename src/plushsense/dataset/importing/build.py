@@ -190,6 +190,7 @@ NO_PEOPLE = Sentence(
 )
 
 
+PATTERN = "pattern"
 WINDOWS = "windows"
 NO_PEOPLE_OF_WINDOWS = (
     "the windows do not name the people, so splits by subject are not possible: import the recordings, if they exist"
@@ -426,7 +427,8 @@ def summarize_import(
     dataset: Dataset, account: ImportedFiles, notes: list[str], new: set[str], trims: int = 0
 ) -> ImportSummary:
     """Return the summary of an import that added the files ``new``, and ``trims`` of recordings."""
-    unknown = any(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings)
+    # A search by a pattern has said so.
+    unknown = account.search.shape != PATTERN and any(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings)
     mine = [r for r in dataset.recordings if r.file in new]
     flagged = [s for s in dataset.streams if s.file in new] + mine
     return ImportSummary(

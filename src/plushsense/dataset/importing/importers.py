@@ -18,17 +18,20 @@ from plushsense.core.files import temporary_folder, work_folder, write_file
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, plural
 from plushsense.dataset.importing.adding import add_to_dataset
 from plushsense.dataset.importing.archives import UnpackLimits, unpack
 from plushsense.dataset.importing.build import (
+    PATTERN,
     WINDOWS,
     ImportSummary,
     create_dataset,
     folder_name,
     group_flags,
 )
-from plushsense.dataset.importing.pattern import STREAM_ROLE, ImportPattern, check_roles, read_pattern
+from plushsense.dataset.importing.counters import counters_note
+from plushsense.dataset.importing.intervals import read_intervals
+from plushsense.dataset.importing.pattern import ImportPattern, check_roles, read_pattern
 from plushsense.dataset.importing.preview import ImportPreview, preview
 from plushsense.dataset.importing.proposals import (
     SELF_CALIBRATION,
@@ -57,10 +60,11 @@ from plushsense.dataset.importing.sources import (
 )
 from plushsense.dataset.importing.tables import TableImport
 from plushsense.dataset.importing.truncation import CHOSEN, choices_of, original_of, split_backups
-from plushsense.dataset.importing.xdf import person_and_session, read_xdf
+from plushsense.dataset.importing.xdf import ENDINGS, is_xdf, person_and_session, read_xdf
 from plushsense.dataset.index import rebuild_index
 from plushsense.dataset.store import (
     HEAD,
+    UNKNOWN_SUBJECT,
     DatasetHead,
     Generation,
     Progress,
@@ -68,8 +72,14 @@ from plushsense.dataset.store import (
 )
 
 FOLDER = "folder"
-PATTERN = "pattern"
 SHOWN = 5
+# Recordings in which channels that are no readings are looked for.
+_SAMPLED = 40
+NO_PEOPLE_OF_PATTERN = Sentence(
+    "the pattern finds no person, so the people are not known, and splits by subject are not possible: put {subject} "
+    "into paths, give its column, or import again with --subjects map.csv (columns file,subject)",
+    reason="people_unknown",
+)
 
 
 @dataclass(frozen=True)
@@ -141,7 +151,12 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     gestures = options.known_gestures(layout)
     in_session = [f for f in files if sessions and session_of(f, sessions) is not None]
     rest = sorted(set(files) - set(in_session)) if in_session else files
-    plain = [f for f in rest if f.suffix.lower() != ".xdf"]
+    plain = [f for f in rest if not is_xdf(f)]
+    if options.columns and len(plain) == len(rest):
+        role = next(iter(options.columns))
+        raise ConfigError(
+            f"--column {role}=… is for a table or XDF files; '{source}' is a folder: describe it with --pattern FILE."
+        )
     mapping = None if options.mapping is None else dict(options.mapping)
     shape = "labelled-rows" if layout.is_labelled else "gesture-recorder"
     classified = (
@@ -155,7 +170,8 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     search = SourceScan(
         layout, gestures, shape if rest else "sessions", classified, people, notes=notes, choices=choices
     )
-    for file in (f for f in rest if f.suffix.lower() == ".xdf"):
+    files_of: dict[tuple[str, str], list[str]] = {}
+    for file in filter(is_xdf, rest):
         name = printable_path(file.relative_to(source))
         person = None if file.parent == around else file.parent.resolve().name
         if file.parent == source and options.person is not None:
@@ -163,9 +179,14 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
         if mapping is not None:
             person = mapping.get(name, mapping.get(file.name))
         try:
-            _add_xdf(file, name, person, options, search)
+            files_of.setdefault(_add_xdf(file, name, person, options, search), []).append(name)
         except FileFormatError as cause:
             search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
+    for (subject, session), names in files_of.items():
+        if len(names) > 1:
+            message = f"{len(names)} files are the session '{session}' of '{subject}': {', '.join(names[:SHOWN])}"
+            values = {"n": len(names), "session": session, "person": subject, "files": ", ".join(names[:SHOWN])}
+            search.notes.append(Sentence(message, reason="session_shared", **values))
     if mapping is not None:
         present = {name for f in rest for name in (f.name, f.relative_to(source).as_posix())}
         if missing := [name for name in mapping if name not in present]:
@@ -192,7 +213,8 @@ def scan_pattern(source: Path, options: ImportOptions, *, around: Path | None = 
     search.found += [replace(f, origin=printable_path(f.source.relative_to(base))) for f in refused]
     tables = TableImport(options.new_folder("converted"), layout, pattern)
     remarks: list[tuple[str, str]] = []
-    for file in files:
+    of_labels = _add_intervals(base, files, pattern, tables, search)
+    for file in (f for f in files if f not in of_labels):
         relative = file.relative_to(base).as_posix()
         name = printable_path(file.relative_to(base))
         place = pattern.match(relative)
@@ -203,7 +225,7 @@ def scan_pattern(source: Path, options: ImportOptions, *, around: Path | None = 
             )
             search.found.append(SourceFile(file, LEFT_OUT, origin=name, reason=reason))
             continue
-        person = options.person or None
+        person = options.person or (UNKNOWN_SUBJECT if options.person is None else None)
         if options.mapping is not None:
             person = options.mapping.get(relative, options.mapping.get(file.name))
         try:
@@ -216,7 +238,29 @@ def scan_pattern(source: Path, options: ImportOptions, *, around: Path | None = 
             search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
     search.found += tables.origins()
     search.notes += group_flags(remarks, "files")
+    if any(f.subject == UNKNOWN_SUBJECT for f in search.found):
+        search.notes.append(NO_PEOPLE_OF_PATTERN)
     return search
+
+
+def _add_intervals(
+    base: Path, files: Iterable[Path], pattern: ImportPattern, tables: TableImport, search: SourceScan
+) -> set[Path]:
+    """Read the files of intervals that the pattern describes; return their paths."""
+    found: set[Path] = set()
+    for file in files:
+        place = pattern.interval_place(file.relative_to(base).as_posix())
+        if place is None:
+            continue
+        found.add(file)
+        name = printable_path(file.relative_to(base))
+        try:
+            tables.intervals.append(read_intervals(file, name, pattern, place))
+        except FileFormatError as cause:
+            search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
+        else:
+            search.found.append(SourceFile(file, LEFT_OUT, origin=name, reason="its intervals label other files"))
+    return found
 
 
 def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
@@ -249,8 +293,8 @@ def _scan_of_file(path: Path, shape: str, options: ImportOptions, own: Layout | 
     return SourceScan(layout, options.known_gestures(layout), shape, [], notes=notes, simulated=simulated)
 
 
-def _add_xdf(path: Path, name: str, person: str | None, options: ImportOptions, search: SourceScan) -> None:
-    """Convert an XDF file, and add its recordings and notes to ``search``."""
+def _add_xdf(path: Path, name: str, person: str | None, options: ImportOptions, search: SourceScan) -> tuple[str, str]:
+    """Convert an XDF file, and add its recordings and notes to ``search``; return the person and the session."""
     subject, session = person_and_session(path, person)
     if options.mapping is not None:
         subject = person
@@ -260,9 +304,10 @@ def _add_xdf(path: Path, name: str, person: str | None, options: ImportOptions, 
             "file sub-<code>_ses-<session>.xdf as LabRecorder does",
             reason="person_unknown",
         )
-    folder = options.new_folder("converted") / "xdf"
-    stream = options.columns.get(STREAM_ROLE, "")
-    _add(read_xdf(path, name, folder, subject, session, search.layout, search.gestures, stream), search)
+    folder = options.new_folder("converted")
+    choices, limits = options.columns, options.limits
+    _add(read_xdf(path, name, folder, subject, session, search.layout, search.gestures, choices, limits), search)
+    return subject, session
 
 
 def scan_table(path: Path, options: ImportOptions) -> SourceScan:
@@ -272,8 +317,8 @@ def scan_table(path: Path, options: ImportOptions) -> SourceScan:
     search = _scan_of_file(path, "table", options)
     check_roles(options.columns, search.layout)
     person = (options.mapping or {}).get(path.name) or options.person or None
-    columns = {role: name for role, name in options.columns.items() if role != STREAM_ROLE}
-    tables = TableImport(options.new_folder("converted"), search.layout, ImportPattern(columns=columns))
+    pattern = ImportPattern(columns=dict(options.columns))
+    tables = TableImport(options.new_folder("converted"), search.layout, pattern)
     _add(tables.convert(path, path.name, person), search)
     return search
 
@@ -299,7 +344,7 @@ def _add(entries: Iterable[SourceFile | str], search: SourceScan) -> None:
 
 FORMATS: dict[str, Callable[[Path, ImportOptions], SourceScan]] = {
     ".zip": scan_zip,
-    ".xdf": scan_xdf,
+    **dict.fromkeys(ENDINGS, scan_xdf),
     ".parquet": scan_table,
     ".csv": scan_table,
     ".mat": scan_windows,
@@ -331,18 +376,15 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
         if options.pattern is not None and source.exists() and source.suffix.lower() != ".zip":
             search = scan_pattern(source, options)
         elif source.is_dir():
-            if unused := sorted(set(options.columns) - {STREAM_ROLE}):
-                raise ConfigError(
-                    f"--column {unused[0]}=… is for a table; '{source}' is a folder: describe it with --pattern FILE."
-                )
             search = scan_folder(source, options)
         elif source.is_file():
-            if source.suffix.lower() not in FORMATS:
+            scan = next((scan for ending, scan in FORMATS.items() if source.name.lower().endswith(ending)), None)
+            if scan is None:
                 raise DatasetError(
                     f"'{source}' cannot be imported: give a folder, or a file that ends in {', '.join(FORMATS)}.",
                     reason="file_no_recording",
                 )
-            search = FORMATS[source.suffix.lower()](source, options)
+            search = scan(source, options)
         else:
             raise DatasetError(
                 f"There is no '{source}': give the recorder's folder, or a file that ends in {', '.join(FORMATS)}."
@@ -360,7 +402,8 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
         elif search.shape == "labelled-rows":
             expected += " (or CSVs with a label column)"
         raise DatasetError(
-            f"'{source}' holds no recording: expected {expected}; found {len(search.found)} other files.{first}"
+            f"'{source}' holds no recording: expected {expected}; found "
+            f"{plural(len(search.found), 'other file')}.{first}"
             + ("" if options.pattern is not None else " Other files can be described with --pattern FILE.toml."),
             reason="person_unknown" if unknown else "import_nothing",
             n=len(search.found),
@@ -368,19 +411,36 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
     return search
 
 
-def _propose(done: ImportSummary, adopting: bool = False, added: bool = False) -> None:
-    """Measure a data set; add what fits it better to the summary, and to its layout if ``adopting``.
+_OF_ADDED = (SELF_CALIBRATION, "valid_min", "valid_max")
 
-    If recordings were ``added``, only sensors that differ are proposed on: the layout has been chosen.
+
+def propose(done: ImportSummary, adopting: bool = False, added: bool = False) -> None:
+    """Measure the data set of an import; add what fits it better to the summary, and if ``adopting`` to its layout.
+
+    A layout adopts only what is proven, and a note says what that was. Warn of channels that are no readings.
+
+    If recordings were ``added``, only failed readings and sensors that differ are proposed on: the layout has been
+    chosen.
     """
+    used = done.dataset.used
+    some = used[:: max(1, len(used) // _SAMPLED)][:_SAMPLED]
+    done.notes += counters_note(done.dataset.layout, [done.dataset.read(recording) for recording in some])
     sensors = find_sensors(done.dataset)
     done.sensors = [sensor.to_dict() for sensor in sensors]
-    found = [p for p in propose_settings(done.dataset, sensors) if not added or p.key == SELF_CALIBRATION]
+    found = [p for p in propose_settings(done.dataset, sensors) if not added or p.key in _OF_ADDED]
     head = done.dataset.head
     layout = adopt(head.layout, found) if adopting else head.layout
+    reasons: dict[str, list[str]] = {}
     for p in found:
-        adopted = adopting and (p.key != SELF_CALIBRATION or set(p.value) <= set(layout.self_calibration))
-        done.proposals.append({**p.to_dict(), "advice": p.advice(adopted)})
+        adopted = adopting and p.proven and (p.key != SELF_CALIBRATION or set(p.value) <= set(layout.self_calibration))
+        done.proposals.append({**p.to_dict(), "advice": p.advice(adopted), "adopted": adopted})
+        if adopted:
+            reasons.setdefault(p.reason, []).append(p.setting)
+    if reasons:
+        settings = [f"{', '.join(texts)} ({reason})" for reason, texts in reasons.items()]
+        what = [text for texts in reasons.values() for text in texts]
+        message = f"adopted in the layout (--no-adopt keeps it as given): {'; '.join(settings)}"
+        done.notes.append(Sentence(message, reason="adopted", settings=what))
     if layout != head.layout:
         head = replace(head, layout=layout)
         write_file(done.dataset.path / HEAD, head.to_toml())
@@ -442,9 +502,9 @@ def _check_layout(dest: Path, own: Layout, given: Layout | None, named: bool) ->
     Args:
         named: whether the user named the layout; otherwise it is that of a pattern.
     """
-    if named and given is not None and given.to_dict() != own.to_dict():
+    # Rate, gap, offsets and others may have been adopted from the recordings.
+    if named and given is not None and not (own.name == given.name and own.reads_as(given)):
         raise DatasetError(f"'{dest}' has the layout '{own.name}', not '{given.name}': leave --layout out.")
-    # The rate, gap and offsets may have been adopted from the recordings.
     if not named and given is not None and _grid(given) != _grid(own):
         raise DatasetError(
             f"'{dest}' has the channels {', '.join(own.names)}, but the pattern has {', '.join(given.names)}, or other "
@@ -468,7 +528,7 @@ def import_recordings(
     people: str | Path | None = None,
     columns: Mapping[str, str] | None = None,
     limits: UnpackLimits | None = None,
-    adopt_proposals: bool = False,
+    adopt_proposals: bool | None = None,
     person: str | None = None,
     guess_layout: bool = False,
     pattern: ImportPattern | str | Path | None = None,
@@ -486,10 +546,11 @@ def import_recordings(
         simulated: whether the virtual toy made the recordings; detected in folders that `plushsense simulate` wrote.
         progress: called with (files done, number of files).
         people: the path of a people's table, see `dataset.store.read_people`.
-        columns: the column of a table by role (``{"label": "activity"}``), or the ``stream`` of an XDF file.
+        columns: the column of a table by role (``{"label": "activity"}``); in XDF files the ``stream`` and the
+            ``markers`` by name or ``#number``, and the labels of channels.
         limits: limits of unpacking a zip.
-        adopt_proposals: put the proposed rate, gap, offsets and self-calibration (see `propose_settings`) into the
-            layout of the new data set; otherwise they are only reported.
+        adopt_proposals: whether the layout of a new data set takes what its recordings prove (see `propose_settings`):
+            rate, gap, offsets, units, valid ranges, self-calibration. Everything else is only reported.
         person: the person of files that name none: those directly in ``source``, in folders of gestures, and XDF files
             and tables without a person. "" refuses them; None takes the name of the folder where there is one.
         guess_layout: if no layout is given or stated, take the most probable built-in one that can read the files.
@@ -543,7 +604,7 @@ def import_recordings(
                 simulated=search.simulated,
             )
             done = create_dataset(source, dest, search, new_head, people_info, progress)
-            _propose(done, adopt_proposals)
+            propose(done, adopt_proposals is not False)
         else:
             try:
                 done = add_to_dataset(dest, search, known, people_info, progress, generation)
@@ -553,6 +614,6 @@ def import_recordings(
                     f"'{dest}' cannot be written ({cause.strerror or cause}, {cause.filename}), but is as valid as "
                     "before: check the disk and import again."
                 ) from None
-            _propose(done, added=True)
+            propose(done, added=True)
     done.seconds = time.perf_counter() - began
     return done

@@ -19,6 +19,7 @@ from plushsense.core.toml import load_table, read_toml
 
 PARTS = ("subject", "session", "label", "recording")
 """Parts of a recording that may stand in a path or a column; ``recording`` tells takes of one label apart."""
+INTERVAL = "interval_ms"
 # Accepted column names by role.
 ROLES: dict[str, tuple[str, ...]] = {
     "subject": ("subject", "participant", "person", "subject_id", "participant_id"),
@@ -27,9 +28,19 @@ ROLES: dict[str, tuple[str, ...]] = {
     "label": ("label", "gesture", "activity"),
     "time": (DEVICE_MS, "time", "timestamp", "time_ms", "time_s", "timestamp_ms", "timestamp_s", "t", "t_ms", "t_s"),
     HOST_MS: (HOST_MS,),
+    # Only where a pattern names it.
+    INTERVAL: (),
 }
-STREAM_ROLE = "stream"
-UNITS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1000.0}
+STREAM_ROLE, MARKERS_ROLE = "stream", "markers"
+LABELS = ("class", "event", "action", "touch", "kind", "movement", "trial_type", "text")
+"""Other usual names of columns of labels, which only a guess uses."""
+# Accepted column names of files that label intervals of time, as Label Studio, BIDS and others call them.
+INTERVAL_COLUMNS: dict[str, tuple[str, ...]] = {
+    "start": ("start", "start_time", "begin", "onset", "from", "t_start"),
+    "end": ("end", "end_time", "stop", "stop_time", "finish", "to", "t_end"),
+    "duration": ("duration", "length"),
+}
+UNITS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1000.0, "d": 86_400_000.0}
 ENDINGS = {".parquet": "parquet", ".jsonl": "json", ".ndjson": "json", ".json": "json"}
 """Formats by the ending of a file; any other is a table of text, ``csv``."""
 
@@ -99,12 +110,23 @@ class ImportPattern:
             value counts as invalid, so that readers repeat the last valid one (default: such rows are left out).
         bits: columns whose characters, joined in this order, are one digit for each channel without its own column,
             such as ``00101100``.
+        between: regular expression of whole lines that separate recordings, such as ``START.*``; ``none``: no line does
+            (default: empty lines, rows of empty cells, comments with #, % or //, and repeated lines of column names).
+        recording_rows: number of rows that are one recording, in files that hold recordings of equal length one after
+            the other; 1 is refused, 0: recordings have any length (from 0).
         row_rate_hz: rows for each second, for files without a clock. Rows that are left out take their time, too; 0:
             there is a column of times (from 0).
-        time_unit: unit of times; ``iso`` for dates (default: by the name of the column, else by the rate).
-        columns: column of each channel, and of ``subject``, ``session``, ``recording``, ``label``, ``time`` and
-            ``host_ms``: its name, ``x#2`` for the second column ``x``, ``#3`` for the third column, ``a.b`` for a value
-            within a JSON object (default: the columns of those names, as for one table).
+        time_unit: unit of times; ``iso`` for dates and for times such as ``12:01:02.5``, ``d`` for days, as those of
+            spreadsheets (default: by the name of the column, else by the rate).
+        intervals: pattern of the paths of files that label the rows of other files: each of their rows has ``start``
+            and ``end`` (or ``duration``), in the unit of the clock or in that of the column's name, and ``label``. A
+            file belongs to the samples whose path has the same parts (default: there are none).
+        columns: column of each channel, and of ``subject``, ``session``, ``recording``, ``label``, ``time``,
+            ``host_ms``, ``interval_ms`` (ms to the next row, in place of a time), and ``start``, ``end`` and
+            ``duration`` of intervals: its name, ``x#2`` for the second column ``x``, ``#3`` for the third column,
+            ``a.b`` for a value within a JSON object (default: the columns of those names, as for one table).
+        idle: labels in a column that mean that nothing happens, such as ``null``: these rows belong to no recording,
+            but to the stream of the session (default: none; a gesture with ``idle = true`` keeps such recordings).
         aliases: for each label, a list of other spellings of it in the source. Case, ``_`` and spaces never make a
             difference.
     """
@@ -122,9 +144,13 @@ class ImportPattern:
     decimal: Literal[".", ","] = "."
     missing: tuple[str, ...] = ()
     bits: tuple[str, ...] = ()
+    between: str = ""
+    recording_rows: int = 0
     row_rate_hz: float = 0.0
-    time_unit: Literal["", "s", "ms", "us", "ns", "iso"] = ""
+    time_unit: Literal["", "d", "s", "ms", "us", "ns", "iso"] = ""
+    intervals: str = ""
     columns: dict[str, str] = field(default_factory=dict)
+    idle: tuple[str, ...] = ()
     aliases: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -132,14 +158,20 @@ class ImportPattern:
             raise ConfigError(problem, key=key)
 
     def _problems(self) -> Iterator[tuple[str, str]]:
-        for text in (*self.paths, *self.exclude):
+        for text in (*self.paths, *self.exclude, self.intervals):
             path_expression(text)
         for key in ("skip_before", "skip_after"):
             if getattr(self, key) < 0:
                 yield key, f"{key} is {getattr(self, key)}: accepted are 0 and more lines."
+        if self.recording_rows < 0 or self.recording_rows == 1:
+            yield "recording_rows", f"recording_rows is {self.recording_rows}: accepted are 0 and 2 or more rows."
+        try:
+            re.compile(self.between)
+        except re.error as cause:
+            yield "between", f"between is '{self.between}', an expression that is not valid: {cause}."
         if self.row_rate_hz < 0:
             yield "row_rate_hz", f"row_rate_hz is {self.row_rate_hz:g}: accepted is a number above 0."
-        if self.row_rate_hz and (self.time_unit or "time" in self.columns):
+        if self.row_rate_hz and (self.time_unit or {"time", INTERVAL} & set(self.columns)):
             yield (
                 "row_rate_hz",
                 "row_rate_hz is for files without a clock: leave it, or time_unit and columns.time, out.",
@@ -175,6 +207,11 @@ class ImportPattern:
         match = next((m for m in found if m is not None), None)
         return None if match is None else {part: text.strip() for part, text in match.groupdict().items() if text}
 
+    def interval_place(self, relative: str) -> dict[str, str] | None:
+        """Return the parts in the path of a file of intervals; None for any other file."""
+        match = path_expression(self.intervals).fullmatch(relative) if self.intervals else None
+        return None if match is None else {part: text.strip() for part, text in match.groupdict().items() if text}
+
     def excluded_by(self, relative: str) -> str:
         """Return the pattern that excludes a path; "" if none does."""
         return next((text for text in self.exclude if path_expression(text).fullmatch(relative)), "")
@@ -182,6 +219,10 @@ class ImportPattern:
     def label_of(self, text: str) -> str:
         """Return the label of which ``text`` is a spelling; other labels stay as they are."""
         return self._spellings.get(text) or self._spellings.get(plain_label(text), text)
+
+    def names_gesture(self, label: str) -> bool:
+        """Return whether ``label`` names a gesture, not idle time."""
+        return bool(plain_label(label)) and plain_label(label) not in map(plain_label, self.idle)
 
     @functools.cached_property
     def _spellings(self) -> dict[str, str]:
@@ -225,7 +266,7 @@ def read_pattern(path: str | Path) -> ImportPattern:
 
 def check_roles(columns: Mapping[str, str], layout: Layout, where: str = "--column ") -> None:
     """Raise ConfigError for an unknown role in ``columns``; ``where`` stands before it in the message."""
-    known = (*ROLES, STREAM_ROLE, *layout.names)
+    known = (*ROLES, STREAM_ROLE, *INTERVAL_COLUMNS, *layout.names)
     for role in columns:
         if role not in known:
             raise ConfigError(f"{where}{role}=…: accepted are {', '.join(known)}.{nearest(role, known)}")

@@ -10,8 +10,11 @@ from typing import Any
 from plushsense.core.errors import FileFormatError
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames, parse_name, read_recording, read_stream
-from plushsense.dataset.importing.build import unknown_labels
+from plushsense.dataset.importing.build import group_flags, unknown_labels
+from plushsense.dataset.importing.counters import counters_note
 from plushsense.dataset.importing.sources import LEFT_OUT, SourceFile, SourceScan
+from plushsense.dataset.quality.measurements import Examination
+from plushsense.dataset.quality.recordings import clock_still
 from plushsense.dataset.store import RECORDINGS, STREAMS
 
 ROWS, _RECORDINGS = 10, 5
@@ -58,6 +61,8 @@ def preview(search: SourceScan) -> ImportPreview:
     named = {f.source: name.label for f in recordings if (name := parse_name(f.source.name)) is not None}
     shown = _spread(recordings or files)
     rows: list[PreviewRow] = []
+    frames: list[Frames] = []
+    flags: list[tuple[str, str]] = []
     rejected = [{"file": f.origin, "reason": f.reason} for f in search.found if not f.kind]
     for file in shown:
         try:
@@ -65,10 +70,13 @@ def preview(search: SourceScan) -> ImportPreview:
         except FileFormatError as cause:
             rejected.append({"file": file.origin, "reason": str(cause)})
             continue
+        frames.append(read.frames)
         count = -(-ROWS // len(shown))
         rows += _rows(file, named.get(file.source, ""), read.frames.slice(0, count), search.layout)
+        examined = Examination(read.frames, search.layout)
+        flags += [(file.origin, str(issue.message)) for issue in clock_still(examined)]
     counts = Counter(named.values())
-    notes = list(search.notes)
+    notes = [*search.notes, *counters_note(search.layout, frames), *group_flags(flags)]
     if search.gestures is not None and (note := unknown_labels(search.gestures, named.values())):
         notes.append(note)
     return ImportPreview(

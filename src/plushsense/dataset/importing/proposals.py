@@ -1,6 +1,6 @@
-"""Propose settings that fit the recordings: layout by the header of the files; rate, gap, zeros and window by data.
+"""Propose settings that fit the recordings: layout by the header of the files; the others by data.
 
-Zero, scale and unit of accelerometers are measured for each session.
+Zero, scale and unit of accelerometers are measured for each session; rate, gap, valid ranges and window over all.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import FileFormatError, LayoutError
-from plushsense.core.layouts import ACCELERATION, DEVICE_MS, Layout, layout_names, load_layout
+from plushsense.core.layouts import ACCELERATION, DEVICE_MS, MEASURED, Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import read_recording
 from plushsense.dataset.quality.measurements import zeroing_limit
+from plushsense.dataset.quality.outliers import find_failed_readings
 from plushsense.dataset.store import Dataset, RecordingInfo
 
 DEFAULT_WINDOW_S = 2.5
@@ -62,27 +63,30 @@ Sphere = tuple[Floats, float]
 class Proposal:
     """A setting that fits the recordings better: the ``key`` of a layout or of window settings, and the reason.
 
-    ``groups`` are the sensors (`Sensor.to_dict`) that differ, if that is the reason.
+    ``groups`` are the sensors (`Sensor.to_dict`) that differ, if that is the reason. ``proven``: whether the recordings
+    leave no doubt, so that a layout may adopt it.
     """
 
     key: str
     value: Any
     reason: str
     groups: tuple[dict[str, Any], ...] = ()
+    proven: bool = True
+
+    @property
+    def setting(self) -> str:
+        """The key and its value in words."""
+        if isinstance(self.value, dict):
+            texts = (f"{k} {v if isinstance(v, str) else format(v, 'g')}" for k, v in self.value.items())
+            return f"{self.key}: {', '.join(texts)}"
+        plain = isinstance(self.value, int | float)
+        return f"{self.key} = {format(self.value, 'g') if plain else json.dumps(self.value, ensure_ascii=False)}"
 
     def advice(self, adopted: bool) -> str:
         """Say what to do, or what was done if the layout ``adopted`` the proposal."""
-        many = isinstance(self.value, dict)
-        if many:
-            value = ", ".join(f"{k} {v:g}" for k, v in self.value.items())
-        else:
-            value = (
-                format(self.value, "g") if self.key != SELF_CALIBRATION else json.dumps(self.value, ensure_ascii=False)
-            )
         if self.key == "window_s":
-            return f"try  [windows] window_s = {value}  in a --config file"
-        setting = f"{self.key}: {value}" if many else f"{self.key} = {value}"
-        return f"adopted {setting}" if adopted else f"import with --adopt, or give a layout with {setting}"
+            return f"try  [windows] {self.setting}  in a --config file"
+        return f"adopted {self.setting}" if adopted else f"give a layout with {self.setting}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values, ready for JSON; ``groups`` only if there are any."""
@@ -141,9 +145,8 @@ class Sensor:
     def people(self) -> str:
         """The people, the first of many, and the number of sessions if it is another."""
         names = list(dict.fromkeys(s["subject"] for s in self.sessions))
-        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
         total = f" ({len(self.sessions)} sessions)" if len(self.sessions) > len(names) else ""
-        return ", ".join(names[:_NAMED]) + more + total
+        return named(names) + total
 
     @property
     def summary(self) -> str:
@@ -165,6 +168,11 @@ class Sensor:
         """Return plain values, ready for JSON."""
         kept = {key: value for key, value in vars(self).items() if key != "radius"}
         return {**kept, "axes": list(self.axes), "sessions": list(self.sessions), "summary": self.summary}
+
+
+def named(people: Sequence[str]) -> str:
+    """List people, the first of many."""
+    return ", ".join(people[:_NAMED]) + (f" and {len(people) - _NAMED} more" if len(people) > _NAMED else "")
 
 
 def _recognised(one_g: float) -> str:
@@ -226,17 +234,25 @@ def propose_settings(dataset: Dataset, sensors: Sequence[Sensor] | None = None) 
     ``sensors`` are those of `find_sensors`, if they are known.
     """
     sensors = find_sensors(dataset) if sensors is None else sensors
-    return [*_rate_and_gap(dataset), *_zeros(dataset.layout, sensors), *_window(dataset)]
+    return [
+        *_rate_and_gap(dataset),
+        *_zeros(dataset.layout, sensors),
+        *_units(dataset.layout, sensors),
+        *_valid_ranges(dataset),
+        *_window(dataset),
+    ]
 
 
 def adopt(layout: Layout, proposals: Sequence[Proposal]) -> Layout:
-    """Return the layout with the proposed rate, gap, offsets and self-calibration.
+    """Return the layout with the proposals that are proven.
 
     Axes whose valid range is too wide for a self-calibration stay without.
     """
-    values = {p.key: p.value for p in proposals}
-    offsets: dict[str, float] = values.get("offset", {})
-    channels = tuple(replace(c, offset=offsets.get(c.name, c.offset)) for c in layout.channels)
+    values = {p.key: p.value for p in proposals if p.proven}
+    of_channels = [(key, values[key]) for key in MEASURED if key in values]
+    channels = tuple(
+        replace(c, **{key: named[c.name] for key, named in of_channels if c.name in named}) for c in layout.channels
+    )
     same = {key: values[key] for key in ("rate_hz", "gap_ms") if key in values}
     calibrated = (*layout.self_calibration, *values.get(SELF_CALIBRATION, ()))
     adopted = replace(layout, channels=channels, **same)
@@ -368,6 +384,33 @@ def _zeros(layout: Layout, sensors: Sequence[Sensor]) -> Iterator[Proposal]:
         yield Proposal(SELF_CALIBRATION, axes, reason, groups)
 
 
+def _units(layout: Layout, sensors: Sequence[Sensor]) -> Iterator[Proposal]:
+    """Propose the unit that 1 g tells, where the layout names another one of acceleration."""
+    wrong = [s for s in sensors if s.unit in _UNITS and s.recognised in _UNITS and s.unit != s.recognised]
+    units = {name: sensor.recognised for sensor in wrong for name in sensor.axes}
+    if units and all(s.recognised == units.get(s.axes[0], s.recognised) for s in sensors):
+        reason = "; ".join(dict.fromkeys(f"1 g is about {s.one_g:g}, and the layout says {s.unit}" for s in wrong))
+        yield Proposal("unit", units, f"held still, {reason}")
+
+
+def _valid_ranges(dataset: Dataset) -> Iterator[Proposal]:
+    """Propose valid ranges without failed readings: the range of all others, and as much again on both sides."""
+    failed = find_failed_readings(dataset)
+    for proven in (True, False):
+        mine = [f for f in failed if f.certain == proven]
+        reason = "; ".join(
+            f"{f.n} of {f.of} readings of {f.channel} ({named(f.people)}) are far beyond all others, which are "
+            f"{f.low:g} to {f.high:g}" + ("" if proven else f", in up to {f.longest} rows in succession")
+            for f in mine
+        )
+        if mine:
+            edges = {f.channel: (2 * f.low - f.high, 2 * f.high - f.low) for f in mine}
+            given = {c.name: (c.valid_min, c.valid_max) for c in dataset.layout.channels}
+            for at, key, narrower in ((0, "valid_min", max), (1, "valid_max", min)):
+                limits = {name: float(f"{narrower(pair[at], given[name][at]):.9g}") for name, pair in edges.items()}
+                yield Proposal(key, limits, reason, proven=proven)
+
+
 def _blocks(dataset: Dataset, axes: list[int]) -> tuple[list[tuple[str, str]], Floats, NDArray[np.int64]]:
     """Cut some recordings of each session into blocks of 0.3 s.
 
@@ -434,6 +477,7 @@ def _window(dataset: Dataset) -> Iterator[Proposal]:
             max(0.5, round(seconds, 1)),
             f"half of the recordings last less than {seconds:.1f} s, so windows of {DEFAULT_WINDOW_S} s, the default, "
             "mostly begin before their gesture",
+            proven=False,
         )
 
 

@@ -8,11 +8,13 @@ from __future__ import annotations
 import contextlib
 import csv
 import itertools
+import re
 from array import array
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from math import isfinite
+from math import inf, isfinite, isnan
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -22,10 +24,14 @@ from numpy.typing import NDArray
 from plushsense.core.errors import FileFormatError, need
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, Layout
 from plushsense.core.toml import loads_json
-from plushsense.dataset.importing.pattern import PARTS, ROLES, UNITS, ImportPattern
+from plushsense.dataset.importing.pattern import INTERVAL, PARTS, ROLES, UNITS, ImportPattern
 
 _NOT_A_NUMBER, _MISSING = float("nan"), float("inf")
 _SEPARATORS = ",;\t"
+# Beginnings of lines that are no rows, but comments and rulers between recordings.
+_COMMENTS = ("#", "%", "//", "--", "==", "**")
+# Time between two blocks of rows, of which nothing is known without a clock.
+_APART_MS = 10_000.0
 
 
 @dataclass(frozen=True)
@@ -42,6 +48,9 @@ class ImportedColumns:
         lines: line of the file of each row, from 1; empty if the format has no lines.
         in_ms: whether the times were dates and are milliseconds now.
         own_recordings: whether the file tells recordings apart itself, as by objects that hold whole recordings.
+        row_numbers: number of each row, from 0, with those that are left out; empty if no row is left out.
+        blocks: number of the block of each row, from 0: lines between recordings separate blocks; empty for one block.
+        text_lines: number of malformed rows that hold text only.
     """
 
     names: dict[str, str]
@@ -53,6 +62,37 @@ class ImportedColumns:
     lines: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     in_ms: bool = False
     own_recordings: bool = False
+    row_numbers: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    blocks: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    text_lines: int = 0
+
+    @property
+    def block_of_row(self) -> NDArray[np.int64]:
+        """Number of the block of each row (T,)."""
+        return self.blocks if len(self.blocks) else np.zeros(len(self.numbers["time"]), dtype=np.int64)
+
+    @property
+    def number_of_row(self) -> NDArray[np.int64]:
+        """Number of each row (T,), with those that are left out."""
+        return self.row_numbers if len(self.row_numbers) else np.arange(len(self.numbers["time"]), dtype=np.int64)
+
+
+_TIME_OF_DAY = re.compile(r"(?:(\d+):)?(\d+):(\d+(?:[.,]\d+)?)")
+
+
+def date_ms(text: str) -> float:
+    """Return the milliseconds of a date in ISO form, in UTC if it names no zone, or of a time; NaN if ``text`` is none.
+
+    Times are ``12:01:02.5`` and, as spreadsheets show them, minutes and seconds with decimals: ``01:02.5``.
+    """
+    text = text.strip()
+    with contextlib.suppress(ValueError):
+        found = datetime.fromisoformat(text)
+        return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp() * 1000.0
+    time = _TIME_OF_DAY.fullmatch(text)
+    if time is None or (time[1] is None and time[3].isdecimal()):
+        return _NOT_A_NUMBER
+    return 1000.0 * (3600.0 * int(time[1] or 0) + 60.0 * int(time[2]) + float(time[3].replace(",", ".")))
 
 
 @dataclass(frozen=True)
@@ -90,7 +130,10 @@ class TableFile:
         for key, role in ((DEVICE_MS, "time"), (HOST_MS, HOST_MS)):
             candidates[role] = (*candidates[role], headers.get(key, key))
         needed = {"label", "time", *layout.names} - set(self.place or ())
-        if self.pattern.row_rate_hz:
+        if self.pattern.intervals:
+            needed -= {"label"}
+            del candidates["label"]
+        if self.pattern.row_rate_hz or INTERVAL in given:
             needed -= {"time"}
             del candidates["time"]
         chosen: dict[str, int] = {}
@@ -144,7 +187,7 @@ class TableFile:
     def parser(self, role: str) -> Callable[[str], float]:
         """Return the function that reads the number in a cell: NaN if it holds none, infinite for a missing-value word.
 
-        Dates in a column of times become milliseconds, in UTC if they name no zone.
+        Dates in a column of times become milliseconds, see `date_ms`.
         """
         missing, comma = self.pattern.missing, self.pattern.decimal == ","
 
@@ -161,11 +204,8 @@ class TableFile:
             return value if isfinite(value) and "_" not in text else _NOT_A_NUMBER
 
         def date(text: str) -> float:
-            try:
-                found = datetime.fromisoformat(text.strip())
-            except ValueError:
-                return number(text)
-            return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp() * 1000.0
+            found = date_ms(text)
+            return number(text) if isnan(found) else found
 
         return date if self.pattern.time_unit == "iso" and role in ("time", HOST_MS) else number
 
@@ -187,7 +227,8 @@ class _Rows:
         self.texts: dict[str, list[str]] = {role: [] for role in self.roles if role in PARTS}
         self.numbers = {role: array("d") for role in (*self.roles, *self._by_digit) if role not in PARTS}
         self.lines = array("q")
-        self.malformed, self.first = 0, ""
+        self.malformed, self.first, self.text_lines = 0, "", 0
+        self._between: dict[int, float] = {}
         self.why_malformed = ImportedColumns.why_malformed
         same: dict[str, str] = {}
 
@@ -214,17 +255,22 @@ class _Rows:
         self.lines.append(line)
         return True
 
-    def leave_out(self, line: int, text: str) -> None:
+    def pass_over(self, lines: float) -> None:
+        """Count ``lines`` that are no rows, before the next row; infinitely many always separate recordings."""
+        self._between[len(self.lines)] = self._between.get(len(self.lines), 0) + lines
+
+    def leave_out(self, line: int, text: str, *, is_text: bool = False) -> None:
         self.malformed += 1
+        self.text_lines += is_text
         if not self.first:
             self.first = f"line {line}: '{text.strip()[:60]}'"
 
     def columns(self, row_numbers: Sequence[int], own_recordings: bool = False) -> ImportedColumns:
         """Return the columns; ``row_numbers`` are the numbers of all rows, from which times follow without a clock."""
         numbers = {role: np.array(values, dtype=np.float64) for role, values in self.numbers.items()}
-        rate = self._file.pattern.row_rate_hz
+        rate, blocks = self._file.pattern.row_rate_hz, number_blocks(self._between, len(self.lines))
         if rate:
-            numbers["time"] = np.array(row_numbers, dtype=np.float64) * (1000.0 / rate)
+            numbers["time"] = np.array(row_numbers, dtype=np.float64) * (1000.0 / rate) + blocks * _APART_MS
         return ImportedColumns(
             self.names | ({"time": "row number"} if rate else {}),
             self.texts,
@@ -235,6 +281,9 @@ class _Rows:
             np.array(self.lines, dtype=np.int64),
             bool(rate) or self._file.pattern.time_unit == "iso",
             own_recordings,
+            np.array(row_numbers, dtype=np.int64),
+            blocks,
+            self.text_lines,
         )
 
 
@@ -271,16 +320,20 @@ def read_csv(file: TableFile) -> ImportedColumns:
             for line, row in _numbered(text, begin, separator, skipped):
                 while len(row) > len(there) and not row[-1].strip():
                     row.pop()
+                if is_between(row, there, pattern):
+                    rows.pass_over(inf if row and row[0].strip() else 1)
+                    continue
                 if not row:
                     continue
                 if row[-1].endswith(";"):
                     # Some loggers end each line so.
                     row[-1] = row[-1].rstrip("; ")
-                whole = len(row) == len(there)
+                # Spreadsheets save a line of text as a row with text in its first cell only.
+                whole = len(row) == len(there) and (bool(row[-1] or any(row[1:])) or not (row[0] and is_text(row)))
                 if whole and rows.add(line, [row[k] for k in places], [row[k] for k in bits_at]):
                     numbers.append(row_number)
                 else:
-                    rows.leave_out(line, separator.join(row))
+                    rows.leave_out(line, separator.join(row), is_text=is_text(row))
                 # Rows that are left out have taken their time too.
                 row_number += 1
     except UnicodeError:
@@ -290,6 +343,41 @@ def read_csv(file: TableFile) -> ImportedColumns:
     except csv.Error as cause:
         raise file.error(f"is no CSV table: {cause}", reason="table_damaged", file=file.display_name) from None
     return rows.columns(numbers)
+
+
+def is_between(row: Sequence[str], there: Sequence[str], pattern: ImportPattern) -> bool:
+    """Return whether the cells of a line are no row, but separate recordings; see ``between`` of `ImportPattern`.
+
+    Args:
+        there: the names of the columns.
+    """
+    if pattern.between:
+        return re.fullmatch(pattern.between, (pattern.separator or ",").join(row).strip()) is not None
+    if not row or not row[0].strip():
+        # A row of empty cells may have missing values.
+        return not any(cell.strip() for cell in row) and not (row and "" in pattern.missing)
+    return row[0].lstrip().startswith(_COMMENTS) or row == there
+
+
+def number_blocks(between: Mapping[int, float], rows: int) -> NDArray[np.int64]:
+    """Return the number of the block of each of ``rows`` rows, from 0.
+
+    If every line of a file has two line ends, as after a wrong conversion, there is an empty line between any two rows:
+    a block ends where there are more of them than usual.
+
+    Args:
+        between: number of lines that are no rows before a row; infinite for lines that always end a block.
+    """
+    inside = {row: lines for row, lines in between.items() if 0 < row < rows}
+    usual = float(np.median(list(inside.values()))) if 2 * len(inside) > rows else 0.0
+    begins = np.zeros(rows, dtype=np.int64)
+    begins[[row for row, lines in inside.items() if lines > usual]] = 1
+    return np.cumsum(begins)
+
+
+def is_text(row: Sequence[str]) -> bool:
+    """Return whether no cell begins with a number."""
+    return not any(re.match(r"\s*[-+.,]?\d", cell) for cell in row)
 
 
 def _split(lines: Iterable[str], separator: str) -> Iterator[list[str]]:
@@ -311,7 +399,7 @@ def _numbered(text: TextIO, begin: list[str], separator: str, skipped: int) -> I
 def _bit_column(file: TableFile, name: str, there: Sequence[str]) -> int:
     at = file.column_index((name,), [t.strip().casefold() for t in there])
     if at is None:
-        listed = ", ".join(t.strip()[:30] for t in there[:20])
+        listed = ", ".join(filter(None, (t.strip()[:30] for t in there[:20]))) or "no names"
         raise file.error(f"has no column '{name}', which bits names; it has {listed}", reason="")
     return at
 
@@ -323,25 +411,25 @@ def read_json(file: TableFile) -> ImportedColumns:
         text = path.read_text(encoding=file.pattern.text_encoding)
     except UnicodeError:
         raise file.error("is not UTF-8: save it as UTF-8", reason="table_not_utf8", file=file.display_name) from None
-    objects = list(_objects(text))
-    first = next((item for _, item in objects if isinstance(item, dict)), None)
-    if first is None:
-        raise file.error("holds no JSON object: accepted is one object a line, or a list of objects")
     try:
+        objects = one_recording_each(json_objects(text))
+        first = next((item for _, item in objects if isinstance(item, dict)), None)
         there = list(dict.fromkeys(_paths(first)))
     except RecursionError:
         raise file.error("holds JSON objects that are nested too deeply") from None
+    if first is None:
+        raise file.error("holds no JSON object: accepted is one object a line, or a list of objects")
     at = file.choose_columns(there)
     for name in file.pattern.bits:
         _bit_column(file, name, there)
     paths = [there[k].split(".") for k in at.values()]
     in_objects = _length([_value(first, path) for path in paths]) is not None
-    # An object that holds a whole recording tells it apart from others by its line.
+    # An object that holds a whole recording tells it apart from others by its number.
     numbered = ("recording",) if in_objects and "recording" not in at else ()
     rows = _Rows(file, at, there, numbered)
     rows.why_malformed = "without a JSON object whose lists have one length"
     numbers, row_number, lists = array("q"), 0, False
-    for line, item in objects:
+    for number, (line, item) in enumerate(objects):
         values = [_value(item, path) for path in paths] if isinstance(item, dict) else []
         bits = [_value(item, name.split(".")) for name in file.pattern.bits]
         length = _length([*values, *bits]) if isinstance(item, dict) else -1
@@ -351,7 +439,7 @@ def read_json(file: TableFile) -> ImportedColumns:
             row_number += 1
             continue
         for k in range(1 if length is None else length):
-            cells = [_cell(value, k) for value in values] + [str(line) for _ in numbered]
+            cells = [_cell(value, k) for value in values] + [str(number) for _ in numbered]
             if rows.add(line, cells, [_cell(b, k) for b in bits]):
                 numbers.append(row_number)
             else:
@@ -360,8 +448,12 @@ def read_json(file: TableFile) -> ImportedColumns:
     return rows.columns(numbers, own_recordings=lists)
 
 
+def json_objects(text: str) -> list[tuple[int, Any]]:
+    """Return the line, from 1 (in a list the number of the item), and the value of each object; a text if damaged."""
+    return list(_objects(text))
+
+
 def _objects(text: str) -> Iterator[tuple[int, Any]]:
-    """Yield the line, from 1 (in a list the number of the item), and the value of each object; a text if damaged."""
     if text.lstrip()[:1] == "[":
         try:
             yield from enumerate(loads_json(text), 1)
@@ -384,18 +476,101 @@ def _objects(text: str) -> Iterator[tuple[int, Any]]:
         yield line, value
 
 
-def json_cells(text: str) -> dict[str, tuple[list[str], bool]]:
-    """Return the cells of each value in JSON objects by its path, and whether an object has a list of them."""
-    found: dict[str, tuple[list[str], bool]] = {}
-    for _, item in _objects(text):
-        for path in dict.fromkeys(_paths(item)) if isinstance(item, dict) else ():
-            value = _value(item, path.split("."))
+# Lists of so many values are series of samples; shorter ones are rather the axes of one sample.
+_SERIES = 8
+
+
+def one_recording_each(objects: list[tuple[int, Any]]) -> list[tuple[int, Any]]:
+    """Replace objects with lists of recordings by one object for each recording, with the values around it.
+
+    micro:bit CreateAI nests them so: ``{"name": …, "recordings": [{"data": {"x": […], …}}, …]}``. Sensors that a list
+    names beside rows of values, as in the data acquisition format of Edge Impulse, become ``sensors.NAME``.
+    """
+    found = {k: item for k, (_, item) in enumerate(objects) if isinstance(item, dict)}
+    for key in dict.fromkeys(key for item in found.values() for key in item):
+        held = {k: item[key] for k, item in found.items() if key in item}
+        listed = any(map(_are_recordings, held.values()))
+        lists = {k: value for k, value in held.items() if listed and isinstance(value, list)}
+        inner = [(k, value) for k, value in held.items() if isinstance(value, dict)]
+        inner += [(k, one) for k, value in lists.items() for one in value]
+        outer = one_recording_each(inner) if inner else []
+        if listed or any(one is not held[k] for k, one in outer):
+            others = [item for k, item in enumerate(objects) if k not in {*lists, *(k for k, _ in inner)}]
+            return others + [(objects[k][0], {**found[k], key: one}) for k, one in outer]
+    return [(line, _by_sensor(item)) for line, item in objects]
+
+
+def _are_recordings(value: Any) -> bool:
+    """Return whether a JSON value is a list of objects with series of samples, and not of single samples."""
+    if not isinstance(value, list) or not value or not all(isinstance(inner, dict) for inner in value):
+        return False
+    if any(_are_recordings(held) for inner in value for held in inner.values()):
+        return True
+    series = [list(_lengths(inner)) for inner in value]
+    longest = {max(lengths, default=0) for lengths in series}
+    # Samples of many cells have one length; a recording has several channels, or another length than the next.
+    several = any(sum(n == max(lengths) for n in lengths) > 1 for lengths in series if lengths)
+    return max(longest) >= _SERIES and (several or len(longest) > 1)
+
+
+def _lengths(item: Any) -> Iterator[int]:
+    """Yield the lengths of the lists in a JSON object, also of objects within it."""
+    for value in item.values() if isinstance(item, dict) else ():
+        if isinstance(value, list):
+            yield len(value)
+        else:
+            yield from _lengths(value)
+
+
+def _by_sensor(item: Any) -> Any:
+    """Return an object whose list ``sensors`` names the columns of ``values`` with the series of each sensor."""
+    if not isinstance(item, dict):
+        return item
+    sensors, values = item.get("sensors"), item.get("values")
+    if not isinstance(sensors, list) or not isinstance(values, list):
+        return item
+    names = [sensor.get("name") if isinstance(sensor, dict) else None for sensor in sensors]
+    if not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
+        return item
+    rows = [row if isinstance(row, list) else [row] for row in values]
+    if not names or any(len(row) != len(names) for row in rows):
+        return item
+    return {**item, "sensors": {name: [row[k] for row in rows] for k, name in enumerate(names)}}
+
+
+def json_cells(objects: Iterable[tuple[int, Any]]) -> dict[str, tuple[list[list[str]], bool]]:
+    """Return the cells of each value in JSON objects by its path, and whether an object has a list of them.
+
+    The cells of each list are apart; those of single values are together.
+    """
+    found: dict[str, tuple[list[list[str]], bool]] = {}
+    for _, item in objects:
+        values = {path: _value(item, path.split(".")) for path in _paths(item)} if isinstance(item, dict) else {}
+        rows: Counter[int] = Counter()
+        for value in values.values():
+            if isinstance(value, list) and not any(isinstance(cell, list | dict) for cell in value):
+                rows[len(value)] += len(value)
+        # A list of another length than the series describes something else.
+        length = max(rows, key=lambda n: (rows[n], n), default=0)
+        for path, value in values.items():
             in_list = isinstance(value, list)
             cells = value if in_list else [value]
-            if not any(isinstance(cell, list | dict) for cell in cells):
-                found.setdefault(path, ([], in_list))[0].extend(_cell(cell, 0) for cell in cells)
-    # The items of a list of plain values are its cells already.
-    return {path: cells for path, cells in found.items() if path.rpartition(".")[0] not in found}
+            if any(isinstance(cell, list | dict) for cell in cells) or (in_list and len(cells) != length):
+                continue
+            parts, _ = found.setdefault(path, ([], in_list))
+            texts = [_cell(cell, 0) for cell in cells]
+            if in_list or not parts:
+                parts.append(texts)
+            else:
+                parts[0] += texts
+    # The items of a list of plain values are its cells already, and sensors with names need no numbers.
+    lists = {path for path, (_, in_list) in found.items() if in_list}
+    numbered = {path.replace(".sensors.", ".values.").rpartition(".")[0] for path in found if ".sensors." in path}
+    return {
+        path: cells
+        for path, cells in found.items()
+        if path.rpartition(".")[0] not in lists | numbered and path not in numbered
+    }
 
 
 def _paths(item: Any, before: str = "") -> Iterator[str]:
@@ -514,7 +689,12 @@ def read_rows(file: TableFile) -> ImportedColumns:
         FileFormatError: for a table that cannot be read or lacks a column.
         MissingExtraError: for Parquet without polars.
     """
-    return READERS[file.pattern.format_of(file.path)](file)
+    columns = READERS[file.pattern.format_of(file.path)](file)
+    if INTERVAL not in columns.numbers:
+        return columns
+    times = np.cumsum(columns.numbers[INTERVAL])
+    numbers = {**columns.numbers, "time": np.concatenate([[0.0], times[:-1]]) if len(times) else times}
+    return replace(columns, numbers=numbers, names=columns.names | {"time": columns.names[INTERVAL]}, in_ms=True)
 
 
 def forward_steps(times: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -524,15 +704,19 @@ def forward_steps(times: NDArray[np.float64]) -> NDArray[np.float64]:
     return steps[np.isfinite(steps) & (steps > 0)]
 
 
+def unit_in_name(name: str) -> str:
+    """Return the unit of time that the name of a column ends in, as ``t_ms`` and ``t (ms)`` do; "" without one."""
+    plain = name.strip().casefold().rstrip(")")
+    return next((unit for unit in UNITS if plain.endswith((f"_{unit}", f"({unit}", f"[{unit}]"))), "")
+
+
 def unit_of_time(name: str, times: NDArray[np.float64], rate_hz: float) -> tuple[str, bool]:
     """Return the unit of a column of times, and whether its name states it.
 
     Otherwise the unit is the one that agrees best with the layout's rate.
     """
-    plain = name.strip().casefold().rstrip(")")
-    for unit in UNITS:
-        if plain.endswith((f"_{unit}", f"({unit}", f"[{unit}]")):
-            return unit, True
+    if unit := unit_in_name(name):
+        return unit, True
     forward = forward_steps(times[:100_000])
     if not len(forward):
         return "ms", False

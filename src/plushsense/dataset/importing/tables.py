@@ -5,8 +5,11 @@ recording or stream.
 
 Rows are grouped by person and session, in the order of the file. A recording is a run of rows with the same label (and
 the same ``recording``, if there is such a column); without that column it also ends where the time decreases or pauses
-for more than a second. A file whose path names the label or the take is one recording. Rows without a label belong to
-no recording; a session with such rows is also written as stream.
+for more than a second. Empty lines, and the other lines of ``between`` in `ImportPattern`, end a recording too, and so
+does every ``recording_rows`` rows. A file whose path names the label or the take is one recording otherwise.
+
+Rows without a label, or with one of ``idle``, belong to no recording. A session with such rows is also written as
+stream, and so is one in which most recordings begin where the one before ends.
 """
 
 from __future__ import annotations
@@ -35,10 +38,11 @@ from plushsense.core.recorder_csv import (
 )
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.files import sha256_of
+from plushsense.dataset.importing.intervals import IntervalFile, label_rows
 from plushsense.dataset.importing.pattern import UNITS, ImportPattern
 from plushsense.dataset.importing.sources import COMPANIONS, SourceFile
 from plushsense.dataset.importing.table_files import ImportedColumns, TableFile, forward_steps, read_rows, unit_of_time
-from plushsense.dataset.quality.measurements import in_order
+from plushsense.dataset.quality.measurements import SLOW_FACTOR, in_order, rows_at_one_time
 from plushsense.dataset.store import RECORDINGS, STREAMS
 
 ORIGIN = "origin.json"
@@ -46,6 +50,8 @@ LARGEST = 2.0**53
 # A channel with values between the steps of its layout, and a spread of few steps, probably has another scale.
 _FEW_STEPS = 10.0
 _BETWEEN = 0.05
+# More than 20 rows in turn would have one time.
+_FINEST_MS = 0.05
 
 
 @dataclass(frozen=True)
@@ -184,6 +190,8 @@ PAUSE_MS = 1000.0
 class _TableSamples:
     """The usable rows of a table: their ``frames`` (T,), and the number of each one's person, session, label and take.
 
+    ``row`` (T,) are the numbers of the rows in the file, with those that are left out.
+
     ``people``, ``sessions`` and ``labels`` have the texts of these numbers; labels are as the source spells them.
     """
 
@@ -192,6 +200,7 @@ class _TableSamples:
     session: NDArray[np.int64]
     label: NDArray[np.int64]
     take: NDArray[np.int64]
+    row: NDArray[np.int64]
     people: list[str]
     sessions: list[str]
     labels: list[str]
@@ -201,12 +210,14 @@ class _TableSamples:
 class TableImport:
     """Conversion of tables into recordings below the new ``folder``.
 
-    ``person`` is the person of files that name none, None if it is not known.
+    ``person`` is the person of files that name none, None if it is not known. ``intervals`` are the files that label
+    the rows of tables, if the pattern names such files.
     """
 
     folder: Path
     layout: Layout
     pattern: ImportPattern
+    intervals: list[IntervalFile] = field(default_factory=list)
     _taken: dict[tuple[str, str], set[str]] = field(default_factory=dict)
     _origins: dict[tuple[str, str], list[dict[str, Any]]] = field(default_factory=dict)
     _spellings: dict[str, list[str]] = field(default_factory=dict)
@@ -226,6 +237,9 @@ class TableImport:
         table = TableFile(path, display_name, self.layout, self.pattern, place)
         columns = read_rows(table)
         place = place or {}
+        notes: list[Sentence] = []
+        if self.pattern.intervals:
+            columns = self._labelled(table, columns, notes)
         subject = place.get("subject", person)
         if "subject" not in columns.names and subject is None:
             raise table.error(
@@ -233,7 +247,6 @@ class TableImport:
                 "(file,subject)",
                 reason="person_unknown",
             )
-        notes: list[Sentence] = []
         samples = self._samples(table, columns, subject or "", notes)
         yield from notes
         if not len(samples.frames):
@@ -247,6 +260,7 @@ class TableImport:
         edges = [0, *(np.flatnonzero(np.diff(group[order])) + 1).tolist(), len(order)]
         original = ConvertedSource(path, display_name, {"columns": columns.names})
         apart = "recording" in columns.names or columns.own_recordings or bool({"label", "recording"} & set(place))
+        apart |= self.pattern.recording_rows > 0
         for first, last in itertools.pairwise(edges):
             mine = order[first:last]
             moved = in_order(samples.frames.device_ms[mine])
@@ -254,6 +268,21 @@ class TableImport:
                 yield about_file(display_name, f"{n} rows put into the order of their times")
                 mine = mine[moved]
             yield from self._write(table, original, samples, mine, apart)
+
+    def _labelled(self, table: TableFile, columns: ImportedColumns, notes: list[Sentence]) -> ImportedColumns:
+        """Label the rows of a table by the file of intervals that belongs to it."""
+        mine = [intervals for intervals in self.intervals if intervals.fits(table.place or {})]
+        if len(mine) != 1:
+            listed = f"several files of intervals ({', '.join(i.name for i in mine[:3])})" if mine else "no such file"
+            raise table.error(
+                f"has its labels in another file, and {listed} belongs to it: intervals in the pattern, now "
+                f"'{self.pattern.intervals}', needs the same parts as paths"
+            )
+        times = columns.numbers["time"]
+        factor, _ = self._factor(columns, times)
+        labelled, found = label_rows(columns, times * factor, mine[0], factor)
+        notes += [about_file(table.display_name, note) for note in found]
+        return labelled
 
     def _samples(
         self, table: TableFile, columns: ImportedColumns, subject: str, notes: list[Sentence]
@@ -264,6 +293,7 @@ class TableImport:
         factor, note = self._factor(columns, times)
         notes += [about_file(name, note)] if note else []
         device = times * factor
+        notes += _too_fine(table, columns, device)
         host = columns.numbers.get(HOST_MS, device)
         rows = len(device)
 
@@ -276,12 +306,14 @@ class TableImport:
         sessions, session_names = part("session", table.path.stem if own_session else "")
         labels, spellings = part("label", "")
         takes, _ = part("recording", "")
+        takes = takes * (int(columns.block_of_row.max(initial=0)) + 1) + columns.block_of_row
         raw = np.column_stack([columns.numbers[n] for n in self.layout.names])
         invalid = np.isinf(raw)
         raw[invalid] = 0.0
         good = usable_rows(raw, device, host)
         known = np.array([bool(c) for c in codes], dtype=bool)[people] if rows else np.empty(0, bool)
         notes += _left_out(table, columns, good, known)
+        notes += _blocks(table, columns)
         good &= known
         values, note = whole_steps(raw[good], self.layout)
         notes += [about_file(name, note)] if note else []
@@ -293,7 +325,15 @@ class TableImport:
         device_ms, host_ms = (np.round(clock[good]).astype(np.int64) for clock in (device, host))
         frames = Frames(values, device_ms, host_ms)
         return _TableSamples(
-            frames, people[good], sessions[good], labels[good], takes[good], codes, session_names, spellings
+            frames,
+            people[good],
+            sessions[good],
+            labels[good],
+            takes[good],
+            columns.number_of_row[good],
+            codes,
+            session_names,
+            spellings,
         )
 
     def _write(
@@ -305,29 +345,69 @@ class TableImport:
         frames = Frames(every.values[mine], every.device_ms[mine], every.host_ms[mine])
         label, take = samples.label[mine], samples.take[mine]
         names = [self.pattern.label_of(text) for text in samples.labels]
-        named = np.array([bool(plain_label(n)) and len(n) <= LONGEST_LABEL for n in names], dtype=bool)[label]
+        good = [self.pattern.names_gesture(n) and len(n) <= LONGEST_LABEL for n in names]
+        named = np.array(good, dtype=bool)[label]
         new = (np.diff(label) != 0) | (np.diff(take) != 0)
         if not apart:
             steps = np.diff(frames.device_ms)
             new |= (steps < 0) | (steps > PAUSE_MS)
+        if self.pattern.recording_rows:
+            new |= self._ends_by_rows(new, samples.row[mine])
         runs = [0, *(np.flatnonzero(new) + 1).tolist(), len(mine)]
+        # Without a clock, nothing is known of the time between recordings that a file tells apart.
+        timed = not (apart and self.pattern.row_rate_hz)
+        with_stream = not named.all() or (timed and self._go_on(frames.device_ms, new))
         cuts = [
             LabelledSegment(names[label[a]], a, b, samples.labels[label[a]])
             for a, b in itertools.pairwise(runs)
             if named[a]
         ]
+        yield from self._short(table.display_name, [samples.row[mine[c.start : c.stop]] for c in cuts])
         key = samples.people[samples.person[mine[0]]], samples.sessions[samples.session[mine[0]]]
         taken = None if table.place is None else self._taken.setdefault(key, set())
         folder = self.folder / str(self._written)
         self._written += 1
         files = list(
-            write_session(folder, *key, frames, cuts, self.layout, original, with_stream=not named.all(), taken=taken)
+            write_session(folder, *key, frames, cuts, self.layout, original, with_stream=with_stream, taken=taken)
         )
         yield from files
         yield from self._merged(table.display_name, sorted({cut.label for cut in cuts}))
         if taken is not None:
             made = {f.source.name: f.origin for f in files if f.kind == RECORDINGS}
             self._origins.setdefault(key, []).append(original.table | {"recordings": made})
+
+    def _ends_by_rows(self, new: NDArray[np.bool_], row: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return after which rows (T − 1,) a recording ends by ``recording_rows``.
+
+        Args:
+            new: (T − 1,) whether another run of rows begins after the row; rows are counted from its beginning.
+            row: (T,) number of each row in the file.
+        """
+        begins = np.flatnonzero(np.append(True, new))
+        first = np.repeat(row[begins], np.diff([*begins.tolist(), len(row)]))
+        return np.asarray(np.diff((row - first) // self.pattern.recording_rows) != 0)
+
+    def _go_on(self, device_ms: NDArray[np.int64], new: NDArray[np.bool_]) -> bool:
+        """Return whether most runs of rows go on where the one before ends, so that they are parts of one stream.
+
+        Args:
+            new: (T − 1,) whether another run begins after the row.
+        """
+        steps = np.diff(device_ms)
+        forward = steps[steps > 0]
+        if not new.any() or not len(forward):
+            return False
+        gap_ms = max(self.layout.gap_ms, SLOW_FACTOR * float(np.median(forward)))
+        return float(np.mean((steps[new] > 0) & (steps[new] <= gap_ms))) > 0.5
+
+    def _short(self, source: str, recordings: Sequence[NDArray[np.int64]]) -> Iterator[Sentence]:
+        """Yield a note about recordings, given as the numbers of their rows, with fewer than ``recording_rows``."""
+        count = sum(int(np.ptp(rows)) + 1 < self.pattern.recording_rows for rows in recordings)
+        if count:
+            n = self.pattern.recording_rows
+            message = f"{count} of {len(recordings)} recordings have fewer than {n} rows: is recording_rows right?"
+            values = {"n": count, "of": len(recordings), "rows": n}
+            yield about_file(source, Sentence(message, reason="recordings_cut_short", **values))
 
     def _merged(self, source: str, labels: Sequence[str]) -> Iterator[Sentence]:
         """Yield a note for each label that becomes the same as another one, for want of characters in file names."""
@@ -354,8 +434,10 @@ class TableImport:
         unit, stated = unit_of_time(name, times, self.layout.rate_hz)
         if stated:
             return UNITS[unit], ""
-        suggests = len(forward_steps(times)) > 0
+        # Steps of a clock that stands still say nothing about its unit.
+        suggests = len(forward_steps(times)) > 0 and not rows_at_one_time(times[np.isfinite(times)])
         why = f", as the rate of {self.layout.rate_hz:g} Hz suggests" if suggests else ""
+        unit = unit if suggests else "ms"
         message = f"column '{name}' is read as {unit if suggests else 'milliseconds'}{why}"
         return UNITS[unit], Sentence(message, reason="time_unit", column=name, unit=unit)
 
@@ -377,8 +459,9 @@ def _left_out(
     def first(bad: NDArray[np.bool_]) -> str:
         return f"line {columns.lines[int(np.argmax(bad))]}" if len(columns.lines) and bad.any() else ""
 
+    ask = "; if such lines separate recordings, describe them with  between  in a pattern" if columns.text_lines else ""
     for count, reason, where in (
-        (columns.malformed, columns.why_malformed, columns.first_malformed),
+        (columns.malformed, columns.why_malformed, columns.first_malformed + ask),
         (int(np.sum(~good)), "without a number in every column", first(~good)),
         (int(np.sum(good & ~known)), "without a subject", first(good & ~known)),
     ):
@@ -386,3 +469,24 @@ def _left_out(
             at = f" (the first: {where})" if where else ""
             message = f"{count} row{'s' if count > 1 else ''} {reason} left out{at}"
             yield about_file(table.display_name, Sentence(message, reason="rows_left_out", n=count))
+
+
+def _too_fine(table: TableFile, columns: ImportedColumns, device: NDArray[np.float64]) -> Iterator[Sentence]:
+    """Yield a note if the times in ``device`` (T,), in ms, would stand still since they are kept in whole ms."""
+    steps = forward_steps(device)
+    if len(steps) and float(np.median(steps)) < _FINEST_MS:
+        name, step = columns.names["time"], float(np.median(steps))
+        message = f"by column '{name}', rows are {step:g} ms apart, but times are kept in whole ms: is its unit right?"
+        yield about_file(table.display_name, Sentence(message, reason="time_too_fine", column=name))
+
+
+def _blocks(table: TableFile, columns: ImportedColumns) -> Iterator[Sentence]:
+    """Yield a note about the blocks of rows, if a table has several."""
+    count = int(columns.block_of_row.max(initial=0)) + 1
+    if count > 1:
+        join = ': between = "none" in the pattern joins them' if table.place is not None else ""
+        message = (
+            f"{count} blocks of rows, separated by empty lines, comments or repeated column names, are recordings of "
+            f"their own{join}"
+        )
+        yield about_file(table.display_name, Sentence(message, reason="blocks_of_rows", n=count))

@@ -1,56 +1,106 @@
-"""Import XDF files (LabRecorder): the stream that matches the layout, cut into recordings by markers.
+"""Import XDF files (LabRecorder): the stream that matches the layout, cut into recordings by a stream of markers.
 
-A marker that names a gesture begins a recording, which ends at the next marker of any kind or the end of the stream.
-``start Tail pull`` and ``Tail pull/begin`` begin one too; ``end``, ``stop``, ``end Tail pull`` and the like only end
-one. Without a gesture set, every other marker is the name of a gesture.
+The toy's stream is the one whose channels have the names of the layout, or, if none has names, their number. Streams of
+one source that follow each other are joined. The markers are those of the studio, or of the stream whose texts name
+gestures (`plushsense.dataset.importing.markers`).
 """
 
 from __future__ import annotations
 
+import gzip
 import io
 import logging
 import os
 import re
 import struct
-from collections.abc import Iterator
-from dataclasses import dataclass
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import FileFormatError, need
+from plushsense.core.errors import ConfigError, FileFormatError, need
 from plushsense.core.gestures import GestureSet
-from plushsense.core.layouts import Layout, StreamColumns
-from plushsense.core.recorder_csv import LONGEST_LABEL, Frames
+from plushsense.core.layouts import DEVICE_MS, Layout, StreamColumns
+from plushsense.core.recorder_csv import Frames
 from plushsense.core.sentences import Sentence
+from plushsense.dataset.importing.archives import UnpackLimits
+from plushsense.dataset.importing.markers import Marker, MarkerCuts, cut_by_markers, read_marker
+from plushsense.dataset.importing.pattern import MARKERS_ROLE, STREAM_ROLE
 from plushsense.dataset.importing.sources import LEFT_OUT, SourceFile
-from plushsense.dataset.importing.tables import (
-    ConvertedSource,
-    LabelledSegment,
-    about_file,
-    usable_rows,
-    whole_steps,
-    write_session,
-)
+from plushsense.dataset.importing.tables import ConvertedSource, about_file, usable_rows, whole_steps, write_session
+from plushsense.devices.lsl import MARK, MARKERS
 
+ENDINGS = (".xdf", ".xdfz", ".xdf.gz")
 _MAGIC = b"XDF:"
 _HEADER, _SAMPLES = 2, 3
-# After clock synchronisation, equal times may differ by this much.
-_SAME_S = 1e-6
+# Equal rows of two streams, whose clocks were synchronised apart, may differ by this much.
+_SAME_S = 0.005
 _SIZES = {"string": 1, "int8": 1, "int16": 2, "int32": 4, "float32": 4, "int64": 8, "double64": 8}
-_BEGIN = re.compile(r"^(?:start|begin)[\s_:/-]+(?P<a>.+)$|^(?P<b>.+)[\s_:/-]+(?:start|begin)$", re.IGNORECASE)
-_END = re.compile(r"^(?:end|stop)(?:[\s_:/-].*)?$|^.*[\s_:/-](?:end|stop)$", re.IGNORECASE | re.DOTALL)
 _BIDS = re.compile(r"(?:^|_)(sub|ses|run)-([^_]+)")
+_CHUNK = 1 << 20
+# Values in a stream of numbers without a rate that may be markers.
+_MOST_EVENTS = 100_000
 
 
-@dataclass(frozen=True)
-class Marker:
-    """Text of a marker, and its time in seconds."""
+@dataclass(frozen=True, eq=False)
+class XdfStream:
+    """A stream of an XDF file: its number, what its header says, times (T,) in seconds, and samples: rows of values.
 
-    time_s: float
-    text: str
+    ``clock`` (T,) numbers the clock of each sample, which is another one after its computer was started again.
+    """
+
+    number: int
+    name: str
+    type: str
+    source: str
+    uid: str
+    format: str
+    rate: str
+    labels: list[str]
+    times_s: NDArray[np.float64]
+    clock: NDArray[np.int64]
+    samples: Any
+
+    @classmethod
+    def of(cls, stream: dict[str, Any]) -> XdfStream:
+        """Create a stream from what pyxdf returns."""
+        keys = ("name", "type", "source_id", "uid", "channel_format", "nominal_srate")
+        times = np.asarray(stream["time_stamps"], dtype=np.float64)
+        name, kind, source, uid, number_format, rate = (_text(stream, key) for key in keys)
+        number, labels, samples = int(stream["info"]["stream_id"]), _labels(stream), stream["time_series"]
+        clock = np.zeros(len(times), dtype=np.int64)
+        for first, _ in stream["info"]["clock_segments"][1:]:
+            clock[first:] += 1
+        return cls(number, name, kind, source, uid, number_format, rate, labels, times, clock, samples)
+
+    def __str__(self) -> str:
+        return f"'{self.name}' (#{self.number})"
+
+    @property
+    def is_text(self) -> bool:
+        return self.format == "string"
+
+    @property
+    def is_irregular(self) -> bool:
+        """Whether its samples are events: texts, or values without a rate."""
+        return self.is_text or not float(self.rate or 0.0)
+
+    def is_named(self, choice: str) -> bool:
+        """Return whether ``choice`` is its name or ``#`` and its number."""
+        return choice in (self.name, f"#{self.number}")
+
+
+def is_xdf(path: Path) -> bool:
+    """Return whether a file has one of the `ENDINGS`."""
+    return path.name.lower().endswith(ENDINGS)
+
+
+def _stem(path: Path) -> str:
+    return next((path.name[: -len(end)] for end in ENDINGS if path.name.lower().endswith(end)), path.stem)
 
 
 def person_and_session(path: Path, folder: str | None) -> tuple[str | None, str]:
@@ -58,40 +108,34 @@ def person_and_session(path: Path, folder: str | None) -> tuple[str | None, str]
 
     If the name lacks them, the person is ``folder`` (None if unknown), and the session the name of the file.
     """
-    entities = dict(_BIDS.findall(path.stem))
-    session = "-".join(entities[key] for key in ("ses", "run") if key in entities) or path.stem
+    entities = dict(_BIDS.findall(_stem(path)))
+    session = "-".join(entities[key] for key in ("ses", "run") if key in entities) or _stem(path)
     return entities.get("sub", folder), session
 
 
-def segments_of(
-    markers: list[Marker], times_s: NDArray[np.float64], gestures: GestureSet | None
-) -> tuple[list[LabelledSegment], list[str]]:
-    """Return the recordings that the markers delimit, as rows of ``times_s`` (T,), and markers that name no gesture."""
-    rising = np.maximum.accumulate(times_s)
-    cuts: list[LabelledSegment] = []
-    unknown: list[str] = []
-    label, start = "", 0
-    for marker in sorted(markers, key=lambda m: m.time_s):
-        row = int(np.searchsorted(rising, marker.time_s - _SAME_S, side="left"))
-        if label and row > start:
-            cuts.append(LabelledSegment(label, start, row))
-        label, start = _named(marker.text, gestures), row
-        if not label and not _END.match(marker.text.strip()):
-            unknown.append(marker.text)
-    if label and len(times_s) > start:
-        cuts.append(LabelledSegment(label, start, len(times_s)))
-    return cuts, unknown
+def uncompressed(path: Path, folder: Path, limits: UnpackLimits) -> Path:
+    """Return the path of an XDF file, or of its content in the new ``folder`` if it is compressed by gzip.
 
+    Of a file that is cut off or damaged, the content before is written.
 
-def _named(text: str, gestures: GestureSet | None) -> str:
-    """Return the gesture that a marker begins; "" if it begins none."""
-    text = " ".join(text.split())
-    begin = _BEGIN.match(text)
-    named = (begin["a"] or begin["b"]) if begin else text
-    if gestures is not None:
-        gesture = gestures.find(text) or gestures.find(named)
-        return gesture.label if gesture else ""
-    return "" if _END.match(named) or len(named) > LONGEST_LABEL // 2 else named
+    Raises:
+        DatasetError: if it is larger than ``limits`` allow.
+    """
+    with path.open("rb") as file:
+        if file.read(2) != b"\x1f\x8b":
+            return path
+    folder.mkdir(parents=True)
+    plain, size = folder / "content.xdf", 0
+    with gzip.open(path) as packed, plain.open("wb") as out:
+        try:
+            while chunk := packed.read1(_CHUNK):
+                size += len(chunk)
+                limits.check(path, 1, size, folder)
+                out.write(chunk)
+        except (EOFError, gzip.BadGzipFile, zlib.error):
+            # A chunk that is not complete, so that the file is reported as cut off.
+            out.write(b"\x01")
+    return plain
 
 
 def _varlen(file: BinaryIO) -> int:
@@ -105,7 +149,7 @@ def _varlen(file: BinaryIO) -> int:
     return int.from_bytes(raw, "little")
 
 
-def complete_chunks(path: Path) -> tuple[int, int]:
+def complete_chunks(path: Path, name: str) -> tuple[int, int]:
     """Return the number of leading bytes that are complete, plausible chunks, and the size of the file.
 
     The sample count of a chunk, which pyxdf does not check, is compared with its length.
@@ -117,8 +161,8 @@ def complete_chunks(path: Path) -> tuple[int, int]:
     widths: dict[int, int] = {}
     with path.open("rb") as file:
         if file.read(4) != _MAGIC:
-            message = f"'{path.name}' is no XDF file: it does not begin with {_MAGIC.decode()}"
-            raise FileFormatError(message, reason="xdf_damaged", file=path.name)
+            message = f"'{name}' is no XDF file: it does not begin with {_MAGIC.decode()}"
+            raise FileFormatError(message, reason="xdf_damaged", file=name)
         good = 4
         while good < size:
             try:
@@ -171,7 +215,7 @@ class _FirstBytes(io.FileIO):
         return super().readinto(memoryview(buffer)[:left]) or 0
 
 
-def _load(path: Path, length: int) -> list[dict[str, Any]]:
+def _load(path: Path, length: int, name: str) -> list[XdfStream]:
     pyxdf = need("pyxdf", extra="lsl")
     logging.getLogger("pyxdf").addHandler(logging.NullHandler())
     with io.BufferedReader(_FirstBytes(path, length)) as file, np.errstate(all="ignore"):
@@ -180,9 +224,9 @@ def _load(path: Path, length: int) -> list[dict[str, Any]]:
             streams, _ = pyxdf.load_xdf(file, dejitter_timestamps=False)
         except Exception as cause:  # noqa: BLE001, RUF100
             message = " ".join(str(cause).split())[:120] or type(cause).__name__
-            message = f"'{path.name}' cannot be read as XDF: {message}"
-            raise FileFormatError(message, reason="xdf_damaged", file=path.name) from None
-    return list(streams)
+            message = f"'{name}' cannot be read as XDF: {message}"
+            raise FileFormatError(message, reason="xdf_damaged", file=name) from None
+    return [XdfStream.of(stream) for stream in streams]
 
 
 def _text(stream: dict[str, Any], *keys: str) -> str:
@@ -200,22 +244,191 @@ def _labels(stream: dict[str, Any]) -> list[str]:
     return [str((c.get("label") or [""])[0] or "") if isinstance(c, dict) else "" for c in listed]
 
 
-def _frames(
-    stream: dict[str, Any], layout: Layout, columns: StreamColumns
-) -> tuple[Frames, NDArray[np.float64], list[str]]:
-    """Return the frames of a stream, the time of each frame in seconds, and warnings."""
-    series = np.asarray(stream["time_series"], dtype=np.float64).reshape(len(stream["time_stamps"]), -1)
-    times = np.asarray(stream["time_stamps"], dtype=np.float64)
+def _joined(streams: Sequence[XdfStream]) -> tuple[XdfStream, str] | None:
+    """Return streams of one source as one, and a note; None if they overlap and are not the same samples."""
+    whole, *later = sorted(streams, key=lambda s: float(s.times_s[0]))
+    again, gaps = 0, []
+    for stream in later:
+        last = float(whole.times_s.max())
+        n = int(np.sum(stream.times_s <= last + _SAME_S))
+        if n:
+            near = np.abs(whole.times_s - stream.times_s[0]) <= _SAME_S
+            same = (np.array_equal(whole.samples[at : at + n], stream.samples[:n]) for at in np.flatnonzero(near))
+            # A recorder that is asked for one stream twice, one of them a little later, stores it twice.
+            if not stream.uid or stream.uid != whole.uid or not any(same):
+                return None
+            again += 1
+        else:
+            gaps.append(float(stream.times_s[0]) - last)
+        times = np.concatenate([whole.times_s, stream.times_s[n:]])
+        clock = np.concatenate([whole.clock, whole.clock[-1] + stream.clock[n:]])
+        samples = np.concatenate([whole.samples, stream.samples[n:]])
+        whole = replace(whole, times_s=times, clock=clock, samples=samples)
+    note = f"the stream '{whole.name}' is in the file {len(streams)} times"
+    if again:
+        note += ", with equal rows: they are used once"
+    if gaps:
+        note += f", one after another: joined, with gaps of {', '.join(f'{gap:.3g} s' for gap in gaps[:5])}"
+    return whole, Sentence(note, reason="xdf_joined", stream=whole.name, n=len(streams))
+
+
+def _renamed(labels: Sequence[str], channels: Mapping[str, str]) -> list[str]:
+    """Return ``labels`` with the name of the channel for each that ``channels`` gives one, and of no other."""
+    named = {label.strip().casefold(): channel for channel, label in channels.items()}
+    taken = {channel.casefold() for channel in channels}
+    keys = [label.strip().casefold() for label in labels]
+    return [named.get(key, "" if key in taken else label) for key, label in zip(keys, labels, strict=True)]
+
+
+@dataclass
+class _Toy:
+    """The toy's stream with its columns, notes, and why the other streams are not it, by their numbers."""
+
+    stream: XdfStream
+    columns: StreamColumns
+    notes: list[str]
+    others: dict[int, str]
+
+
+def _find_toy(streams: Sequence[XdfStream], layout: Layout, choices: Mapping[str, str]) -> _Toy:
+    """Return the stream that fits the layout; ``choices`` are as in `read_xdf`.
+
+    Raises:
+        FileFormatError: if not exactly one stream fits.
+    """
+    choice = choices.get(STREAM_ROLE, "")
+    channels = {role: label for role, label in choices.items() if role not in (STREAM_ROLE, MARKERS_ROLE)}
+    fitting: list[tuple[XdfStream, StreamColumns]] = []
+    others: dict[int, str] = {}
+    for stream in streams:
+        labels = _renamed(stream.labels, channels)
+        columns = layout.match_columns(labels, np.shape(stream.samples)[-1], stream.format != "float32")
+        if isinstance(columns, str):
+            others[stream.number] = columns
+        elif not len(stream.times_s):
+            others[stream.number] = "it is empty"
+        elif choice and not stream.is_named(choice):
+            others[stream.number] = f"the stream '{choice}' was selected"
+        else:
+            fitting.append((stream, columns))
+    if len({c.by_number for _, c in fitting}) > 1:
+        for stream, _ in (f for f in fitting if f[1].by_number):
+            others[stream.number] = "its channels have no names, and those of another stream have"
+        fitting = [f for f in fitting if not f[1].by_number]
+    if not fitting:
+        reasons = "; ".join(f"{s}: {others[s.number]}" for s in streams[:5]) or "there are only streams of texts"
+        remedy = (
+            f"; --column {layout.names[0]}=LABEL names the label of a channel" if any(s.labels for s in streams) else ""
+        )
+        message = f"no stream fits layout '{layout.name}': {reasons}{remedy}"
+        raise FileFormatError(message, reason="xdf_streams", n=0, layout=layout.name)
+    found = [stream for stream, _ in fitting]
+    one_source = len({(s.name, s.source, s.format, tuple(s.labels)) for s in found}) == 1
+    joined = _joined(found) if len(found) > 1 and one_source else None
+    if len(found) > 1 and joined is None:
+        listed = ", ".join(f"{s}{f', source {s.source!r}' if s.source else ''}" for s in found[:6])
+        message = (
+            f"{len(found)} streams fit layout '{layout.name}': {listed}; choose one with --column stream=NAME or "
+            f"stream=#{found[0].number}"
+        )
+        raise FileFormatError(message, reason="xdf_streams", n=len(found), layout=layout.name)
+    stream, notes = (joined[0], [joined[1]]) if joined else (found[0], [])
+    notes += [about_file(f"stream {stream}", note) for note in fitting[0][1].notes]
+    return _Toy(stream, fitting[0][1], notes, others)
+
+
+def _find_markers(
+    streams: Sequence[XdfStream], gestures: GestureSet | None, choice: str
+) -> tuple[list[Marker], dict[int, str], str]:
+    """Return the markers, why other streams of events are not used, by their numbers, and a hint if there are none.
+
+    ``choice`` is a name, or # and a number; "" for the stream of the studio, or the only one that names gestures.
+
+    Raises:
+        FileFormatError: if several streams name gestures, or no stream has the chosen name.
+    """
+    events = [s for s in streams if s.is_irregular and (s.is_text or s.samples.size <= _MOST_EVENTS)]
+    read = {
+        s.number: [
+            marker
+            for time, sample in zip(s.times_s.tolist(), s.samples, strict=True)
+            if np.isfinite(time)
+            and (marker := read_marker(time, sample, gestures))
+            and not (s.name == MARKERS and marker.text == MARK)
+        ]
+        for s in events
+    }
+    events = [s for s in events if read[s.number]]
+    listed = "; ".join(f"{s} of {s.format}: {_quoted(m.text for m in read[s.number])}" for s in events[:5])
+    if choice:
+        chosen = [s for s in events if s.is_named(choice)]
+    else:
+        # Without a gesture set every text names a gesture; numbers are too often codes of something else.
+        naming = [s for s in events if s.is_text or gestures is not None]
+        naming = [s for s in naming if any(m.label for m in read[s.number])]
+        chosen = [s for s in naming if s.name == MARKERS] or naming
+    if (choice and not chosen) or len({s.name for s in chosen}) > 1:
+        why = (
+            f"no stream '{choice}' has markers" if choice else f"{len(chosen)} streams have texts that may be gestures"
+        )
+        message = f"{why} (there are {listed or 'none'}): choose one with --column markers=NAME or markers=#NUMBER"
+        raise FileFormatError(message, reason="xdf_marker_streams", streams=listed)
+    others = {s.number: "it is not the stream of markers" for s in events if s.is_text and chosen}
+    others |= {s.number: "" for s in chosen}
+    markers: list[Marker] = []
+    merged = [m for s in chosen for m in read[s.number]]
+    for marker in sorted(merged, key=lambda m: m.time_s) if len(chosen) > 1 else merged:
+        twice = len(chosen) > 1 and markers and markers[-1].text == marker.text
+        if not (twice and marker.time_s - markers[-1].time_s <= _SAME_S):
+            markers.append(marker)
+    hint = ""
+    if events and not chosen:
+        hint = f"; there are {listed}: a gesture set (--gestures FILE) says which are gestures"
+        if gestures is None and not all(s.is_text for s in events):
+            hint += ", or --column markers=NAME takes numbers as gestures"
+    return markers, others, hint
+
+
+def _frames(toy: _Toy, layout: Layout) -> tuple[Frames, NDArray[np.float64], list[int]]:
+    """Return the frames of the toy, the time of each in seconds, and the rows after a reset of the clock.
+
+    Notes on rows and values are added to the toy.
+    """
+    stream, columns = toy.stream, toy.columns
+    series = np.asarray(stream.samples, dtype=np.float64).reshape(len(stream.times_s), -1)
+    times = stream.times_s
     device = times * 1000.0 if columns.clock is None else series[:, columns.clock]
     good = usable_rows(series[:, columns.channels], times * 1000.0, device)
-    notes: list[str] = []
     if lost := int(np.sum(~good)):
         message = f"{lost} samples without a number in every channel left out"
-        notes.append(Sentence(message, reason="rows_left_out", n=lost))
+        toy.notes.append(Sentence(message, reason="rows_left_out", n=lost))
     values, warning = whole_steps(series[good][:, columns.channels], layout)
+    toy.notes += [warning] if warning else []
     host_ms = np.round(times[good] * 1000.0).astype(np.int64)
     device_ms = np.round(device[good]).astype(np.int64)
-    return Frames(values, device_ms, host_ms), times[good], notes + ([warning] if warning else [])
+    resets = (np.flatnonzero(np.diff(stream.clock[good])) + 1).tolist()
+    return Frames(values, device_ms, host_ms), times[good], resets
+
+
+def _quoted(texts: Iterable[str]) -> str:
+    few = list(dict.fromkeys(texts))
+    return ", ".join(f"'{text[:40]}'" for text in few[:8]) + (", …" if len(few) > 8 else "")
+
+
+def _about_cuts(cuts: MarkerCuts, hint: str) -> Iterator[Sentence]:
+    """Yield what is to be said about markers that give no recording, or not quite."""
+    for texts, reason, message in (
+        (cuts.unknown, "xdf_markers", "markers name no gesture and begin no recording"),
+        (cuts.zeros, "xdf_zeros", "markers end a recording; a gesture set can make them a gesture (--gestures FILE)"),
+        (cuts.empty, "xdf_empty", "markers name a gesture where the stream has no samples, and give no recording"),
+        (cuts.shortened, "xdf_shortened", "recordings are cut short by the stream or a marker that names no gesture"),
+    ):
+        if texts:
+            listed = _quoted(texts)
+            yield Sentence(f"{len(texts)} {message}: {listed}", reason=reason, n=len(texts), markers=listed)
+    if not cuts.segments:
+        message = f"no marker gives a recording{hint}"
+        yield Sentence(message, reason="xdf_no_gesture")
 
 
 def read_xdf(
@@ -226,67 +439,44 @@ def read_xdf(
     session: str,
     layout: Layout,
     gestures: GestureSet | None,
-    stream_name: str = "",
+    choices: Mapping[str, str],
+    limits: UnpackLimits,
 ) -> Iterator[SourceFile | str]:
     """Write the recordings of an XDF file into the new ``folder``; yield the files, and warnings as text.
 
-    ``stream_name`` selects one of several streams that match the layout.
+    Args:
+        choices: the name, or # and the number, of the ``stream`` of the toy and of that of the ``markers``, and the
+            label of channels of the layout that have another name in the file.
 
     Raises:
+        ConfigError: for an unknown key in ``choices``.
         FileFormatError: for a damaged file, or if not exactly one stream matches.
         MissingExtraError: without pyxdf.
     """
-    good, size = complete_chunks(path)
-    streams = _load(path, good)
+    accepted = (STREAM_ROLE, MARKERS_ROLE, DEVICE_MS, *layout.names)
+    for role in set(choices) - set(accepted):
+        raise ConfigError(f"--column {role}=…: in an XDF file, accepted are {', '.join(accepted)}.")
+    plain = uncompressed(path, folder / "uncompressed", limits)
+    good, size = complete_chunks(plain, display_name)
+    streams = _load(plain, good, display_name)
     if good < size:
         message = f"{display_name}: cut off or damaged from byte {good} of {size} on; the bytes before are used"
         yield Sentence(message, reason="xdf_cut", file=display_name)
-    texts = [s for s in streams if _text(s, "channel_format") == "string"]
-    fitting, others = [], []
-    for stream in streams:
-        name = _text(stream, "name")
-        if _text(stream, "channel_format") == "string":
-            continue
-        columns = layout.match_columns(_labels(stream), np.shape(stream["time_series"])[-1])
-        if isinstance(columns, str):
-            others.append((name, columns))
-        elif not len(stream["time_stamps"]):
-            others.append((name, "it is empty"))
-        elif stream_name and name != stream_name:
-            others.append((name, f"the stream '{stream_name}' was selected"))
-        else:
-            fitting.append((stream, name, columns))
-    if len(fitting) != 1:
-        names = ", ".join(f"'{name}'" for _, name, _ in fitting)
-        why = (
-            f"{len(fitting)} streams fit layout '{layout.name}' ({names}): name one with --column stream=NAME"
-            if fitting
-            else f"no stream fits layout '{layout.name}': "
-            + ("; ".join(f"'{n}': {r}" for n, r in others[:5]) or f"there are {len(texts)} of texts and no other")
-        )
-        raise FileFormatError(why, reason="xdf_streams", n=len(fitting), layout=layout.name)
-    stream, name, columns = fitting[0]
-    frames, times, notes = _frames(stream, layout, columns)
-    markers = [
-        Marker(float(time), str(sample[0]))
-        for text in texts
-        for time, sample in zip(text["time_stamps"], text["time_series"], strict=True)
-        if np.isfinite(time) and sample and sample[0]
-    ]
-    cuts, unknown = segments_of(markers, times, gestures) if len(times) else ([], [])
-    if unknown:
-        listed = ", ".join(f"'{u[:40]}'" for u in dict.fromkeys(unknown[:20]))
-        message = f"{len(unknown)} markers name no gesture and begin no recording: {listed}"
-        notes.append(Sentence(message, reason="xdf_markers", n=len(unknown), markers=listed))
-    if not cuts:
-        notes.append(Sentence("no marker names a gesture: only the stream is imported", reason="xdf_no_gesture"))
-    yield from (about_file(display_name, note) for note in notes)
+    toy = _find_toy([s for s in streams if not s.is_text], layout, choices)
+    events = [s for s in streams if s.is_text or s.name != toy.stream.name]
+    markers, others, hint = _find_markers(events, gestures, choices.get(MARKERS_ROLE, ""))
+    frames, times, resets = _frames(toy, layout)
+    tolerance_s = max(layout.gap_ms / 1000.0, 2.0 / layout.rate_hz)
+    cuts = cut_by_markers(markers, times, resets, tolerance_s) if len(times) else MarkerCuts()
+    yield from (about_file(display_name, note) for note in [*toy.notes, *_about_cuts(cuts, hint)])
     if not len(frames):
-        message = f"the stream '{name}' has no sample with a number in every channel"
+        message = f"the stream '{toy.stream.name}' has no sample with a number in every channel"
         raise FileFormatError(message, reason="rows_unusable", n=layout.n_channels)
-    about = {"stream": name, "type": _text(stream, "type"), "nominal_rate_hz": _text(stream, "nominal_srate")}
+    about = {"stream": toy.stream.name, "type": toy.stream.type, "nominal_rate_hz": toy.stream.rate}
+    original = ConvertedSource(path, display_name, about)
     yield from write_session(
-        folder, subject, session, frames, cuts, layout, ConvertedSource(path, display_name, about), with_stream=True
+        folder / "session", subject, session, frames, cuts.segments, layout, original, with_stream=True
     )
-    for other, reason in others:
-        yield SourceFile(path, LEFT_OUT, origin=f"{display_name}: stream '{other}'", reason=reason)
+    for stream in streams:
+        if reason := (toy.others | others).get(stream.number):
+            yield SourceFile(path, LEFT_OUT, origin=f"{display_name}: stream '{stream.name}'", reason=reason)

@@ -6,7 +6,6 @@ times        every time is shifted
 metadata     title, version, licence and day are the same in every metadata file
 croissant    mlcroissant accepts the metadata and loads exactly the values of the files
 frictionless frictionless accepts the descriptor, and every cell has the type that its schema requires
-ro-crate     rocrate opens the crate, which lists every file with the right size and checksum
 datacite     the metadata agree with DataCite's schema
 """
 
@@ -17,13 +16,11 @@ import io
 import json
 import re
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
-from urllib.parse import unquote
 
 from plushsense.core.errors import MissingExtraError, PlushSenseError, need
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name, read_stream
@@ -37,7 +34,7 @@ from plushsense.dataset.publishing.croissant import (
     compare_records,
 )
 from plushsense.dataset.publishing.description import CHECKSUMS, DATA, Description, find_licence
-from plushsense.dataset.publishing.metadata import CRATE_FILE, DATACITE_FILE, DATACITE_XML_FILE, DATAPACKAGE_FILE
+from plushsense.dataset.publishing.metadata import DATACITE_FILE, DATAPACKAGE_FILE
 from plushsense.dataset.publishing.tables import build_tables, list_package_files, open_package, read_checksums
 from plushsense.dataset.store import PEOPLE, DatasetHead, read_people
 
@@ -260,12 +257,6 @@ _STATEMENTS: dict[str, dict[str, tuple[str | int, ...]]] = {
         "licence": ("licenses", 0, "name"),
         "day": ("created",),
     },
-    CRATE_FILE: {
-        "title": ("name",),
-        "version": ("version",),
-        "licence": ("license", "@id"),
-        "day": ("datePublished",),
-    },
     DATACITE_FILE: {
         "title": ("titles", 0, "title"),
         "version": ("version",),
@@ -280,11 +271,9 @@ def _metadata(p: PackageView) -> None:
     head = dataset.head
     d = Description(dataset, find_licence(head.licence), head.about, head.consent, "", ())
     documents = {file: p.load(file) for file in _STATEMENTS}
-    graph = _get(documents[CRATE_FILE], "@graph") or ()
-    documents[CRATE_FILE] = next((e for e in graph if _get(e, "@id") == "./"), None)
     day = _get(documents[DATACITE_FILE], "dates", 0, "date")
     for file, statements in _STATEMENTS.items():
-        by_url = file in (CROISSANT_FILE, CRATE_FILE)
+        by_url = file == CROISSANT_FILE
         expected = {
             "title": d.title,
             "version": d.version,
@@ -377,37 +366,6 @@ def _frictionless(p: PackageView) -> None:
     p.looked_at = f"{len(package.resources)} resources, {rows} rows"
 
 
-def _crate(p: PackageView) -> None:
-    document = p.load(CRATE_FILE)
-    if document is None:
-        return
-    rocrate = need("rocrate.rocrate", EXTRA)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        crate = rocrate.ROCrate(str(p.root))
-    for warning in caught:
-        p.report(CRATE_FILE, str(warning.message))
-    for key in ("name", "description", "datePublished", "license"):
-        if not crate.root_dataset.get(key):
-            p.report(CRATE_FILE, f"the crate has no {key}")
-    listed = set()
-    for entity in crate.data_entities:
-        path = unquote(str(entity.id))
-        listed.add(path)
-        if not p.is_local(path):
-            p.report(CRATE_FILE, f"it lists {path!r}, which is no path of the package")
-        elif path not in p.sums:
-            p.report(path, "is listed in the crate but is not there")
-        elif entity.get("sha256") != p.sums[path]:
-            p.report(path, "has another SHA-256 than the crate states")
-        elif str(entity.get("contentSize")) != str((p.root / path).stat().st_size):
-            p.report(path, "has another size than the crate states")
-    for path in sorted(p.sums.keys() - listed - {CRATE_FILE, CHECKSUMS}):
-        if not p.is_own(path):
-            p.report(path, "is not listed in the crate")
-    p.looked_at = f"{len(listed)} files"
-
-
 def _datacite(p: PackageView) -> None:
     document = p.load(DATACITE_FILE)
     if document is None:
@@ -416,10 +374,6 @@ def _datacite(p: PackageView) -> None:
     for error in sorted(schema.validator.iter_errors(document), key=lambda e: list(map(str, e.absolute_path))):
         where = "/".join(map(str, error.absolute_path))
         p.report(DATACITE_FILE, f"{f'{where}: ' if where else ''}{error.message[:300]}")
-    if not p.problems:
-        xml = (p.root / DATACITE_XML_FILE).read_text(encoding="utf-8")
-        if xml != schema.tostring(document):
-            p.report(DATACITE_XML_FILE, f"differs from {DATACITE_FILE}")
     p.looked_at = "schema 4.5"
 
 
@@ -430,6 +384,5 @@ VALIDATORS: dict[str, Callable[[PackageView], None]] = {
     "metadata": _metadata,
     "croissant": _croissant,
     "frictionless": _frictionless,
-    "ro-crate": _crate,
     "datacite": _datacite,
 }

@@ -8,15 +8,17 @@ author, reason and time.
 from __future__ import annotations
 
 import hmac
-import re
 import secrets
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import DatasetError
+from plushsense.core.gestures import NOBODY, Gesture, GestureSet
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, CsvFormat
 from plushsense.core.recorder_csv import (
     STREAM_NAME,
@@ -30,7 +32,8 @@ from plushsense.core.recorder_csv import (
 )
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.index import DUPLICATE_FOLDER, build_index
-from plushsense.dataset.marks import MARKS, Mark, MarkState, mark_line, read_marks
+from plushsense.dataset.marks import MARKS, PRACTICE, Mark, MarkState, mark_line, read_marks
+from plushsense.dataset.publishing.texts import is_misread, label_prefix, public_label
 from plushsense.dataset.store import (
     HEAD,
     PEOPLE,
@@ -104,8 +107,6 @@ def shift_of(subject: str, firsts: list[int], device: bool, key: bytes) -> Shift
 
 
 PUBLIC_COLUMNS = ("age_group", "gender")
-# Codes that pandas would read as a number or a missing value.
-_NOT_A_CODE = re.compile(r"[-+]?[\d.]+(e\d+)?|na|n/a|null|none|nan|inf(inity)?|true|false", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ class PublishOptions:
 
 @dataclass(frozen=True)
 class PackageContents:
-    """Published data set, its people, and the original recording of each published id."""
+    """Published data set, its people, and the original recording of each published id, under public labels."""
 
     dataset: Dataset
     people: dict[str, PersonInfo]
@@ -159,7 +160,8 @@ class ContentsWriter:
         clocks = (HOST_MS, DEVICE_MS) if self._all_have_host() else (DEVICE_MS,)
         columns = (*clocks, *dataset.layout.names, *(("label",) if self.labelled else ()))
         self.layout = replace(dataset.layout, csv=CsvFormat(columns, columns, ","))
-        self.head = replace(head, layout=self.layout, source="")
+        self.label = public_labels(dataset)
+        self.head = replace(head, layout=self.layout, gestures=self._gestures(), source="")
         folders = {_folder_of(r.file) for r in self.kept} | {_folder_of(s.file) for s in self.streams}
         self.codes = {folder: public for folder, public in public_codes(dataset).items() if folder in folders}
         self.shifts = self._shifts()
@@ -182,7 +184,7 @@ class ContentsWriter:
         (self.folder / HEAD).write_text(self.head.to_toml(), encoding="utf-8", newline="\n")
         built = build_index(self.folder, self.head)
         published = {r.id: r for r in built.dataset.recordings}
-        origin = {ids[r.id]: r for r in self.kept}
+        origin = {ids[r.id]: replace(r, gesture=self.label(r.gesture)) for r in self.kept}
         if built.unreadable or published.keys() != origin.keys():
             odd = next(iter([*built.unreadable, *(published.keys() ^ origin.keys())]))
             raise DatasetError(
@@ -208,10 +210,12 @@ class ContentsWriter:
         number = self.sessions[code][stream.session]
         folder = f"{STREAMS}/{self.codes[code]}"
         if self.labelled:
-            target = self._free(f"{folder}/session-{number}.csv")
+            target = self._free(f"{folder}/{number}.csv")
         else:
             target = self._free(f"{folder}/{self._inner(code, stream.session)}{STREAM_NAME}")
         raw = read_stream(self.source.path / stream.file, self.source.layout).frames
+        if raw.labels is not None:
+            raw = replace(raw, labels=np.array(list(map(self.label, raw.labels.tolist()))))
         self._put(target, self.shifts[code].frames(raw, self._host), raw.values)
         return target
 
@@ -237,7 +241,7 @@ class ContentsWriter:
             clock = shifted.host_ms if shifted.host_ms is not None else shifted.device_ms
             epoch = int(clock[0])
         folder = f"{RECORDINGS}/{self.codes[code]}/{self._inner(code, recording.session)}"
-        target = self._free(folder + recording_filename(name.label, max(0, epoch), name.rows))
+        target = self._free(folder + recording_filename(self.label(name.label), max(0, epoch), name.rows))
         self._put(target, shifted, frames.values)
         return target
 
@@ -275,11 +279,22 @@ class ContentsWriter:
     def _id(self, recording: RecordingInfo, files: dict[str, str]) -> str:
         target = Path(files[recording.file])
         identity = target.relative_to(target.parts[0]).with_suffix("").as_posix()
-        return identity if not self.labelled else f"{identity}#{recording.id.rpartition('#')[2]}"
+        if not self.labelled:
+            return identity
+        number = recording.id.removeprefix(f"{recording.stream}#").partition(" ")[0]
+        return f"{identity}#{number} {self.label(recording.recorded)}"
 
     @property
     def _host(self) -> bool:
         return HOST_MS in self.layout.csv.columns
+
+    def _gestures(self) -> GestureSet:
+        def public(g: Gesture) -> Gesture:
+            labels = tuple(map(self.label, g.labels))
+            return replace(g, label=self.label(g.label), family=self.label(g.family), labels=labels)
+
+        gestures = self.source.gestures
+        return replace(gestures, gestures=tuple(map(public, gestures.gestures)))
 
     def _all_have_host(self) -> bool:
         if HOST_MS not in self.source.layout.csv.columns:
@@ -355,7 +370,7 @@ class ContentsWriter:
             if (mark.start, mark.stop) != (0, -1):
                 marks.append(Mark(identity, "trim", "", start=mark.start, stop=mark.stop))
             if mark.gesture:
-                marks.append(Mark(identity, "relabel", "", gesture=mark.gesture))
+                marks.append(Mark(identity, "relabel", "", gesture=self.label(mark.gesture)))
             if mark.excluded:
                 marks.append(Mark(identity, "exclude", ""))
             marks += [Mark(identity, "accept", "", check=check) for check in sorted(mark.accepted)]
@@ -363,7 +378,9 @@ class ContentsWriter:
             # The rows of a stream are those of the source, so the rows of its labels are, too.
             identity = Path(files[stream.file]).relative_to(STREAMS).with_suffix("").as_posix()
             stretches = states.get(stream.id, MarkState()).stretches
-            marks += [Mark(identity, "label", "", start=s.start, stop=s.stop, label=s.label) for s in stretches]
+            for s in stretches:
+                label = f"{PRACTICE}{self.label(s.gesture)}" if s.gesture else s.label
+                marks.append(Mark(identity, "label", "", start=s.start, stop=s.stop, label=label))
         if marks:
             (self.folder / MARKS).write_text("".join(map(mark_line, marks)), encoding="utf-8", newline="\n")
 
@@ -401,6 +418,11 @@ class ContentsWriter:
                 "a P in front."
             )
             self.notes.append(Sentence(message, "codes_renamed", n=len(renamed)))
+        odd = sorted(r for r in {r.gesture for r in self.kept} if self.label(r) != r)
+        if odd:
+            listed = ", ".join(f"'{label}' is now '{self.label(label)}'" for label in odd)
+            message = f"Renamed: gestures that other programs read as a number, a date or no value; {listed}."
+            self.notes.append(Sentence(message, "gestures_renamed", n=len(odd), listed=listed))
         if self.streams and published.recordings and not self.labelled:
             lost = sum(origin[r.id].stream_row >= 0 and r.stream_row < 0 for r in published.recordings)
             if lost:
@@ -420,8 +442,7 @@ def _folder_of(file: str) -> str:
 def public_codes(dataset: Dataset) -> dict[str, str]:
     """Return the public code of each person's folder; P is prepended to those that look like a number or no value."""
     folders = {_folder_of(r.file) for r in dataset.recordings} | {_folder_of(s.file) for s in dataset.streams}
-    # "none" is the code for nobody.
-    fine = {f for f in folders if f == "none" or not _NOT_A_CODE.fullmatch(f)}
+    fine = {f for f in folders if f == NOBODY or not is_misread(f)}
     codes: dict[str, str] = {}
     taken = {f.casefold() for f in fine}
     for folder in sorted(folders):
@@ -431,3 +452,10 @@ def public_codes(dataset: Dataset) -> dict[str, str]:
         taken.add(public.casefold())
         codes[folder] = public
     return codes
+
+
+def public_labels(dataset: Dataset) -> Callable[[str], str]:
+    """Return the function that gives the public label of a gesture or family of a data set."""
+    used = {label for g in dataset.gestures.gestures for label in (g.label, *g.labels)}
+    used |= {label for r in dataset.recordings for label in (r.gesture, r.recorded)}
+    return partial(public_label, prefix=label_prefix(used))

@@ -9,7 +9,7 @@ import csv
 import glob
 import itertools
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -41,7 +41,6 @@ _TYPES = {INTEGER: "cr:Int64", NUMBER: "cr:Float64", TEXT: "sc:Text", YES_NO: "s
 
 def croissant(d: Description) -> dict[str, Any]:
     """Return the metadata as JSON-LD; ``d.files`` must contain the tables, whose checksums are included."""
-    files = {f.path: f for f in d.files}
     people = [
         {"@type": "sc:Person", "name": c.name}
         | ({"url": f"https://orcid.org/{c.orcid}"} if c.orcid else {})
@@ -68,7 +67,7 @@ def croissant(d: Description) -> dict[str, Any]:
             "None: a simulation." if d.simulated else f"Touch recordings of people under codes. Consent: {d.consent}"
         ),
         "rai:dataLimitations": " ".join([d.about.limits, *d.notes]).strip() or "See README.md.",
-        "distribution": [_distribution(t, files) for t in d.tables],
+        "distribution": [_distribution(t, d.files) for t in d.tables],
         "recordSet": [_record_set(t) for t in d.tables],
     }
     if d.url:
@@ -82,7 +81,7 @@ def _source_id(table: PackageTable) -> str:
     return table.file or f"{table.name}-files"
 
 
-def _distribution(table: PackageTable, files: dict[str, FileEntry]) -> dict[str, Any]:
+def _distribution(table: PackageTable, files: Mapping[str, FileEntry]) -> dict[str, Any]:
     described = {"@id": _source_id(table), "name": _source_id(table), "description": table.text}
     if not table.file:
         return {"@type": "cr:FileSet"} | described | {"encodingFormat": "text/csv", "includes": table.glob}
@@ -115,7 +114,8 @@ def _record_set(table: PackageTable) -> dict[str, Any]:
 
 def _field(table: PackageTable, column: TableColumn, extract: dict[str, str] | None = None) -> dict[str, Any]:
     unit = f" [{column.unit}]" if column.unit else ""
-    made: dict[str, Any] = {
+    # No `references`, though `refers` names some: mlcroissant would load no records when they are read once more.
+    return {
         "@type": "cr:Field",
         "@id": f"{table.name}/{column.name}",
         "name": column.name,
@@ -126,10 +126,6 @@ def _field(table: PackageTable, column: TableColumn, extract: dict[str, str] | N
             "extract": extract or {"column": column.name},
         },
     }
-    if column.refers:
-        other, _, name = column.refers.partition(".")
-        made["references"] = {"field": {"@id": f"{other}/{name}"}}
-    return made
 
 
 ReportProblem = Callable[[str, str], None]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -88,16 +89,18 @@ class PackageTable:
     glob: str = ""
     key: str = ""
 
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """Paths of the files of the table, from the root of the package."""
+        return (self.file,) if self.file else self.files
+
 
 @dataclass(frozen=True)
 class FileEntry:
-    """File of the package; ``media`` is its media type, ``text`` its description."""
+    """Size and checksum of a file of the package."""
 
-    path: str
     bytes: int
     sha256: str
-    media: str
-    text: str
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,8 @@ class Description:
     tables: tuple[PackageTable, ...]
     notes: tuple[Sentence, ...] = ()
     """Notes on what was left out or changed, one sentence each."""
-    files: tuple[FileEntry, ...] = field(default=())
+    files: Mapping[str, FileEntry] = field(default_factory=dict)
+    """The files of the tables by path."""
 
     @property
     def name(self) -> str:
@@ -176,23 +180,9 @@ class Description:
         return f"https://doi.org/{self.about.doi}" if self.about.doi else self.about.homepage
 
 
-_MEDIA = {
-    ".csv": "text/csv",
-    ".tsv": "text/tab-separated-values",
-    ".json": "application/json",
-    ".jsonl": "application/jsonlines",
-    ".md": "text/markdown",
-    ".toml": "application/toml",
-    ".txt": "text/plain",
-    ".xml": "application/xml",
-    ".sha256": "text/plain",
-}
-
-
-def file_entry(root: Path, path: Path, text: str) -> FileEntry:
-    """Return the metadata of the file ``path`` in the package ``root``; ``text`` describes it."""
-    relative = path.relative_to(root).as_posix()
-    return FileEntry(relative, path.stat().st_size, sha256_of(path), _MEDIA.get(path.suffix, "text/plain"), text)
+def file_entry(path: Path) -> FileEntry:
+    """Return the size and checksum of a file."""
+    return FileEntry(path.stat().st_size, sha256_of(path))
 
 
 def sample_columns(layout: Layout) -> tuple[TableColumn, ...]:
@@ -248,10 +238,29 @@ def readme(d: Description, reidentification: str | None) -> str:
         findings=_findings(d),
         reidentification=reidentification,
         samples=samples,
+        samples_table="streams.csv" if d.dataset.layout.is_labelled else "recordings.csv",
+        tables=", ".join(f"`{t.name}`" for t in d.tables),
+        configs=[json.dumps(_config(t), ensure_ascii=False) for t in d.tables],
+        features=[json.dumps(_features(t), ensure_ascii=False) for t in d.tables if t.files],
         sample_folder=f"{DATA}/{STREAMS if d.dataset.layout.is_labelled else RECORDINGS}",
         DATA=DATA,
         REIDENTIFICATION=REIDENTIFICATION,
     )
+
+
+_DTYPES = {INTEGER: "int64", NUMBER: "float64", TEXT: "string"}
+
+
+def _config(table: PackageTable) -> dict[str, Any]:
+    """Return the configuration under which `datasets.load_dataset` of Hugging Face loads a table."""
+    default = {"default": True} if table.name == "recordings" else {}
+    return {"config_name": table.name, "data_files": table.file or table.glob} | default
+
+
+def _features(table: PackageTable) -> dict[str, Any]:
+    """Return the types of the columns, which would otherwise be those of the first file: of 1 where another has 1.5."""
+    features = [{"name": column.name, "dtype": _DTYPES[column.kind]} for column in table.columns]
+    return {"config_name": table.name, "features": features}
 
 
 def _facts(d: Description) -> Rows:
@@ -276,8 +285,7 @@ def _files(d: Description, reidentification: bool) -> Rows:
         (f"`{DATA}/`", "a PlushSense data set: the recordings with layout, gesture set and marks"),
         ("`croissant.json`", "metadata for machine learning (Croissant 1.1)"),
         ("`datapackage.json`, `schemas/`", "metadata of the tables (Frictionless)"),
-        ("`ro-crate-metadata.json`", "metadata of the files (RO-Crate 1.1)"),
-        ("`datacite.json`, `datacite.xml`", "metadata for a DOI (DataCite 4.5)"),
+        ("`datacite.json`", "metadata for a DOI (DataCite 4.5)"),
         *([(f"`{REIDENTIFICATION}`, `.json`", "whether people can be recognised")] if reidentification else []),
         ("`checksums.sha256`", "of all files; check with  `sha256sum -c checksums.sha256`"),
     ]

@@ -21,7 +21,6 @@ from plushsense.dataset.publishing.checking import EXTRA, StageProgress, Validat
 from plushsense.dataset.publishing.contents import ContentsWriter, PublishOptions
 from plushsense.dataset.publishing.croissant import CROISSANT_FILE, croissant
 from plushsense.dataset.publishing.description import (
-    CHECKSUMS,
     DATA,
     LICENCE,
     README,
@@ -35,15 +34,11 @@ from plushsense.dataset.publishing.description import (
     readme,
 )
 from plushsense.dataset.publishing.metadata import (
-    CRATE_FILE,
     DATACITE_FILE,
-    DATACITE_XML_FILE,
     DATAPACKAGE_FILE,
-    crate,
     datacite,
     datapackage,
     schemas,
-    write_bids,
     write_json,
     write_text,
 )
@@ -155,7 +150,7 @@ def missing_statements(head: DatasetHead) -> list[str]:
 
 def require_validators() -> None:
     """Raise MissingExtraError if a validator is not installed."""
-    for module in ("mlcroissant", "frictionless", "rocrate", "datacite", "jinja2"):
+    for module in ("mlcroissant", "frictionless", "datacite", "jinja2"):
         need(module, EXTRA)
 
 
@@ -194,7 +189,6 @@ def publish(
     head: DatasetHead,
     *,
     options: PublishOptions | None = None,
-    bids: bool = False,
     reidentification: Reidentification | None = None,
     published: str | None = None,
     thorough: bool = False,
@@ -206,7 +200,6 @@ def publish(
 
     Args:
         head: the head from `complete_head`.
-        bids: whether to add a Motion-BIDS tree.
         reidentification: None leaves the report out, which the README then states.
         published: the day of publication in ISO format; today by default.
         thorough: as in `validate_package`.
@@ -236,13 +229,11 @@ def publish(
                 contents.notes,
             )
             _write_texts(work, d, dataset, reidentification)
-            if bids:
-                write_bids(work, d)
             _write_metadata(work, d)
             checked = check_folder(work, thorough=thorough, progress=progress)
             if checked.valid:
                 missing = not target.exists()
-                write_zip(work, target, f"{d.name}-{d.version}", dataset.generation.writing)
+                write_zip(work, target, dataset.generation.writing)
                 zipped = missing
     except BaseException:
         # A zip without its folder would be in the way of the next call, and may contain a person removed since.
@@ -280,26 +271,11 @@ def _write_metadata(work: Path, d: Description) -> None:
     for path, schema in schemas(d).items():
         (work / path).parent.mkdir(exist_ok=True)
         write_json(work / path, schema)
-    d = _with_files(work, d)
+    d = replace(d, files={path: file_entry(work / path) for table in d.tables for path in table.paths})
     write_json(work / CROISSANT_FILE, croissant(d))
     write_json(work / DATAPACKAGE_FILE, datapackage(d))
-    cited = datacite(d)
-    write_json(work / DATACITE_FILE, cited)
-    xml = need("datacite.schema45", EXTRA).tostring(cited)
-    write_text(work / DATACITE_XML_FILE, xml)
-    write_json(work / CRATE_FILE, crate(_with_files(work, d)))
+    write_json(work / DATACITE_FILE, datacite(d))
     write_checksums(work)
-
-
-def _with_files(work: Path, d: Description) -> Description:
-    texts = {t.file: t.text for t in d.tables if t.file} | {f: t.text for t in d.tables for f in t.files}
-    texts |= {README: "what this is", LICENCE: "the licence"}
-    entries = tuple(
-        file_entry(work, path, texts.get(path.relative_to(work).as_posix(), "metadata"))
-        for path in list_package_files(work)
-        if path.name not in (CHECKSUMS, CRATE_FILE)
-    )
-    return replace(d, files=entries)
 
 
 def _warnings(source: Dataset, d: Description, people: dict[str, PersonInfo]) -> list[Sentence]:

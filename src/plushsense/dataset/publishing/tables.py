@@ -29,7 +29,8 @@ from plushsense.dataset.publishing.description import (
     TableColumn,
     sample_columns,
 )
-from plushsense.dataset.store import RECORDINGS, STREAMS, UNKNOWN_SUBJECT, Dataset, PersonInfo
+from plushsense.dataset.publishing.texts import changed_text, kind_of
+from plushsense.dataset.store import HEAD, PEOPLE, RECORDINGS, STREAMS, UNKNOWN_SUBJECT, Dataset, PersonInfo
 
 Row = Mapping[str, object]
 
@@ -38,11 +39,11 @@ def build_tables(contents: PackageContents) -> list[tuple[PackageTable, str]]:
     """Return the tables beside the data, each with its text in CSV."""
     d = contents.dataset
     rows = {
-        "recordings": _recordings(d),
-        "subjects": _people(contents),
-        "gestures": _gestures(d),
-        "channels": _channels(d),
-        **({"streams": _streams(d)} if d.streams else {}),
+        "recordings": list(_recordings(d)),
+        "subjects": list(_people(contents)),
+        "gestures": list(_gestures(d)),
+        "channels": list(_channels(d)),
+        **({"streams": list(_streams(d))} if d.streams else {}),
     }
     text = resources.files("plushsense.dataset.publishing").joinpath("tables.toml").read_text("utf-8")
     known = tomllib.loads(text)
@@ -52,9 +53,26 @@ def build_tables(contents: PackageContents) -> list[tuple[PackageTable, str]]:
         if name == "subjects":
             more = dict.fromkeys(key for p in contents.people.values() for key in p.more)
             own = tuple(TableColumn(key, TEXT, "as given by those who recorded") for key in more)
-            table = replace(table, columns=(*table.columns[:3], *own, *table.columns[3:]))
+            code, *given, recordings, sessions = table.columns
+            given = [replace(c, kind=kind_of(str(row[c.name]) for row in its_rows)) for c in (*given, *own)]
+            table = replace(table, columns=(code, *given, recordings, sessions))
+        _refuse_changed(table, its_rows)
         made.append((table, _text(table, its_rows)))
     return made
+
+
+def _refuse_changed(table: PackageTable, rows: Iterable[Row]) -> None:
+    """Raise DatasetError for a text that pandas, and thus mlcroissant, would read as something else."""
+    for column in table.columns:
+        if column.kind == TEXT and (text := changed_text(_cell(row[column.name]) for row in rows)) is not None:
+            where = PEOPLE if table.name == "subjects" else HEAD
+            raise DatasetError(
+                f"'{table.file}' would have the {column.name} '{text}', which other programs read as a number, a truth "
+                f"value or no value: write it in other words, or leave it empty, in '{where}' of the data set.",
+                reason="text_misread",
+                column=column.name,
+                text=text,
+            )
 
 
 def write_tables(root: Path, contents: PackageContents) -> tuple[PackageTable, ...]:
@@ -179,12 +197,10 @@ def read_checksums(root: Path) -> dict[str, str]:
     return sums
 
 
-def write_zip(
-    root: Path, target: Path, folder: str, finishing: Callable[[], AbstractContextManager[None]] = nullcontext
-) -> None:
-    """Write the package as the zip ``target`` with the top folder ``folder``, completely or not at all.
+def write_zip(root: Path, target: Path, finishing: Callable[[], AbstractContextManager[None]] = nullcontext) -> None:
+    """Write the package as the zip ``target``, completely or not at all; ``finishing`` is as in `replacing_file`.
 
-    ``finishing`` is as in `replacing_file`.
+    It has no top folder, since frictionless looks for ``datapackage.json`` at the root of a zip.
 
     Raises:
         DatasetError: if ``target`` exists with another content.
@@ -192,7 +208,7 @@ def write_zip(
     with work_folder(target) as work, replacing_file(target, within=work, finishing=finishing) as part:
         with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
             for path in list_package_files(root):
-                entry = zip_entry(f"{folder}/{path.relative_to(root).as_posix()}")
+                entry = zip_entry(path.relative_to(root).as_posix())
                 archive.writestr(entry, path.read_bytes())
         if target.exists() and not filecmp.cmp(part, target, shallow=False):
             raise DatasetError(

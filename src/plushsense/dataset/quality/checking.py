@@ -48,6 +48,7 @@ _TO_ONE = "trim it to one gesture, or exclude it"
 _SENSOR = "check the sensor; exclude it if the gesture is hit"
 _RADIO = "check cable and radio; exclude it if the gesture is hit"
 _RESTART = "nothing: readers restart there"
+_DIGITS = "import it again, with all digits of its times or with row_rate_hz in a pattern"
 _LEFT_OUT = "nothing: that line is left out"
 
 CHECKS: dict[str, Check] = {
@@ -56,6 +57,7 @@ CHECKS: dict[str, Check] = {
     "duration": Check(comparisons.duration, (_R,), "warning", _LOOK),
     "no-onset": Check(comparisons.no_onset, (_R,), "warning", "look whether the gesture was made; exclude it if not"),
     "several-gestures": Check(comparisons.several_gestures, (_R,), "warning", _TO_ONE),
+    "clock-still": Check(recordings.clock_still, (_R, _S), "error", _DIGITS, True),
     "clock-reset": Check(
         recordings.clock_reset, (_R, _S), "error", "trim it to one side, or exclude it", True, _RESTART
     ),

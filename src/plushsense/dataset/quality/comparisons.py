@@ -11,6 +11,7 @@ import numpy as np
 from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import BINARY, COUNT
 from plushsense.core.sentences import Sentence
+from plushsense.dataset.quality.copies import CopiedStretch, find_copied_stretches
 from plushsense.dataset.quality.findings import PARTLY_THERE, Issue
 from plushsense.dataset.quality.measurements import (
     LEVEL_KINDS,
@@ -380,7 +381,10 @@ def several_gestures(w: DatasetSummary) -> Iterator[Issue]:
 
 
 def duplicate(w: DatasetSummary) -> Iterator[Issue]:
-    """Find recordings with equal values (even if their clocks differ) and equal streams; the first is the original."""
+    """Find recordings with equal values, or stretches of them, and equal streams; the first is the original.
+
+    Clocks, people and gestures may differ. Of several stretches of a recording, the longest is reported.
+    """
     # Constant recordings can be equal without being copies.
     varying = (o for o in w.recordings if not (o.runs >= o.rows).all())
     originals: dict[bytes | str, str] = {}
@@ -389,6 +393,24 @@ def duplicate(w: DatasetSummary) -> Iterator[Issue]:
         if original != o.info.id:
             message = Sentence(f"the same content as {original}", "duplicate", original=original)
             yield Issue(message, about=o.info.id)
+    by_id = {o.info.id: o for o in w.recordings}
+    longest: dict[str, CopiedStretch] = {}
+    hashed = [o.hashed for o in w.recordings if o.hashed is not None]
+    for stretch in find_copied_stretches(hashed, w.dataset.layout.rate_hz):
+        known = longest.get(stretch.second.id)
+        if by_id[stretch.first.id].content == by_id[stretch.second.id].content:
+            continue
+        if known is None or known.rows < stretch.rows:
+            longest[stretch.second.id] = stretch
+    for about, stretch in longest.items():
+        first, row = stretch.first.start + stretch.first_row, stretch.second.start + stretch.second_row
+        n, of, other = stretch.rows, by_id[about].rows, stretch.first.id
+        text = f"{n} of its {of} rows (from row {row + 1}) are also in {other} (from row {first + 1})"
+        yield Issue(
+            Sentence(text, "copied_rows", n=n, of=of, row=row + 1, other=other, from_row=first + 1),
+            ((row, row + n),),
+            about=about,
+        )
 
 
 def overlap(w: DatasetSummary) -> Iterator[Issue]:

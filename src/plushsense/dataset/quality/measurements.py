@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.layouts import ACCELERATION, Layout
 from plushsense.core.recorder_csv import Frames
+from plushsense.dataset.quality.copies import HashedRows
 from plushsense.dataset.quality.findings import CheckLimits
 from plushsense.dataset.store import Dataset, RecordingInfo, StreamInfo
 from plushsense.recording.takes import measured_rate_hz
@@ -57,6 +58,23 @@ def backward_steps(times: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray
         if not late[k]:
             begin, top = at + 1, int(times[at + 1])
     return back[~late], back[late]
+
+
+_STILL_ROWS = 20
+_FEWEST_ROWS = 5
+
+
+def rows_at_one_time(times: NDArray[np.int64] | NDArray[np.float64]) -> int:
+    """Return how many rows in turn usually have one time (T,), if the clock stands still for so long; else 0.
+
+    A clock stands still if all of at least 5 rows have one time, or the median row shares its time with 20 neighbours.
+    Such times have lost digits, as 1.5E+12 in a spreadsheet or seconds since 1970 in float32, or are one for each
+    recording or second. Packets of some radios have one time for a few rows.
+    """
+    edges = [0, *(np.flatnonzero(times[1:] != times[:-1]) + 1).tolist(), len(times)]
+    lengths = np.diff(edges)
+    usual = int(np.median(np.repeat(lengths, lengths))) if len(times) else 0
+    return usual if usual > _STILL_ROWS or usual == len(times) >= _FEWEST_ROWS else 0
 
 
 def in_order(times: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -208,7 +226,8 @@ class RecordingSummary:
     ``top_at`` are the same at the highest or lowest value ``top``, which occurs in ``top_rows`` rows. ``spread`` (C,)
     is the range from the 2nd to the 98th percentile, ``lowest`` and ``highest`` the extremes, ``zeros`` counts the rows
     that are 0 and ``near_zeros`` those from 1 to `NEAR_ZERO` steps beside it, ``low`` the 10th percentile, ``lows`` (K,
-    C) the 10th percentile of every 10 s of a stream. ``content`` is a hash of the values, b"" for a stream.
+    C) the 10th percentile of every 10 s of a stream. ``content`` is a hash of the values, b"" for a stream, and
+    ``hashed`` has one of each row, None for a stream.
     """
 
     info: RecordingInfo | StreamInfo
@@ -231,6 +250,7 @@ class RecordingSummary:
     near_zeros: NDArray[np.int64]
     content: bytes
     lows: NDArray[np.float64] | None = None
+    hashed: HashedRows | None = None
 
     @property
     def first_row(self) -> int:
@@ -308,6 +328,7 @@ def summarize(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) 
         # Hash the values only, since copies may have other names and clocks.
         b"" if stream else hashlib.sha256(np.ascontiguousarray(frames.values).tobytes()).digest(),
         lows,
+        None if isinstance(info, StreamInfo) else HashedRows.of(info, frames.values),
     )
 
 

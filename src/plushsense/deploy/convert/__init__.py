@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ArchError, BadInput, BundleError, ConfigError, check_known
 from plushsense.core.files import write_file
+from plushsense.core.layouts import Layout
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import check_windows
 from plushsense.runtime.fixed import LOGIT_LIMIT
 from plushsense.runtime.integer import IntegerNetwork
-from plushsense.windows.features import Scaler
+from plushsense.windows.features import InputUnits, Scaler
 
 Floats = NDArray[np.float32]
 Windows = NDArray[np.int64]
@@ -169,6 +170,11 @@ class ConversionJob:
         made = len(self.windows) - self.given
         return f"{made} made-up windows" if not self.given else f"{self.given} given and {made} made-up windows"
 
+    @property
+    def values(self) -> Floats:
+        """The windows (N, C, T) as values for the input of a file."""
+        return InputUnits.of(self.bundle.layout).values(self.windows)
+
     def reference(self) -> NDArray[np.float64]:
         """Return the logits (N, K) of the float network."""
         return self.bundle.network().forward(self.bundle.scaler.apply(self.windows))
@@ -188,25 +194,26 @@ def made_up_windows(bundle: Bundle, n: int = 24) -> Windows:
     return np.asarray(np.rint(scaler.offset[:, None] + scaled * unit[:, None]), dtype=np.int64)
 
 
-def scaling(scaler: Scaler) -> tuple[Floats, Floats, Floats]:
-    """Return (whole, scale, rest), each (C,), so that ``(raw - whole) * scale + rest`` scales the inputs in float32.
+def in_float32(scaler: Scaler, start: NDArray[np.float64] | float = 0.0) -> tuple[Floats, ...]:
+    """Return (offset, gain, rest), each (C,), so that ``(x - offset) * gain + rest`` is the scaling plus ``start``.
 
-    Subtracting a whole number first avoids a loss of precision for large offsets.
+    The rest has the part of a large offset that float32 cannot hold.
     """
-    whole = np.rint(scaler.offset)
-    rest = (whole - scaler.offset) * scaler.scale
-    return whole.astype(np.float32), scaler.scale.astype(np.float32), rest.astype(np.float32)
+    offset = scaler.offset.astype(np.float32)
+    rest = (offset - scaler.offset) * scaler.scale + start
+    return offset, scaler.scale.astype(np.float32), rest.astype(np.float32)
 
 
-def input_codes(network: IntegerNetwork) -> tuple[Floats, Floats, Floats]:
-    """Return (offset, gain, start), each (C,): ``(raw - offset) * gain + start``, rounded and clipped to 0…255.
+def input_codes(network: IntegerNetwork) -> tuple[Scaler, NDArray[np.float64]]:
+    """Return a scaling of integers and what to add, (C,); rounded and clipped to 0…255, these are the first inputs.
 
-    These are the inputs of the first layer; because of rounding they can differ by 1 from those of `InputScale`.
+    Because of rounding they can differ by 1 from those of `InputScale`.
     """
     scale = network.inputs
     unit = np.ldexp(1.0, -scale.after)
     gain = scale.multiplier * unit * np.ldexp(1.0, -scale.before)
-    return scale.offset.astype(np.float32), gain.astype(np.float32), (scale.bias * unit - 0.5).astype(np.float32)
+    parts = [np.asarray(part, dtype=np.float64) for part in (scale.offset, gain, scale.bias * unit - 0.5)]
+    return Scaler(*parts[:2]), parts[2]
 
 
 def sum_scales(multiplier: NDArray[Any], before: NDArray[Any], after: NDArray[Any]) -> NDArray[np.float64]:
@@ -214,8 +221,12 @@ def sum_scales(multiplier: NDArray[Any], before: NDArray[Any], after: NDArray[An
     return np.asarray(np.maximum(multiplier * np.ldexp(1.0, -(before + after)), 2.0**-32))
 
 
-def describe(bundle: Bundle) -> dict[str, str]:
-    """Return the metadata for a file as texts (``metadata_props`` of ONNX, metadata of .tflite)."""
+def describe(bundle: Bundle, tensor: str) -> dict[str, str]:
+    """Return the metadata for a file as texts (``metadata_props`` of ONNX, metadata of .tflite).
+
+    Args:
+        tensor: name, type and shape of the input, for the sentence about it.
+    """
     arch, layout = bundle.arch, bundle.layout
     provenance = bundle.provenance
     facts: dict[str, Any] = {
@@ -229,15 +240,26 @@ def describe(bundle: Bundle) -> dict[str, str]:
         "span": arch.span,
         "step": arch.step,
         "rate_hz": layout.rate_hz,
-        "input": (
-            f"'{RAW}': integers as the toy measures them, at {layout.rate_hz:g} Hz after the clock rule"
-            f"{' and self-calibration' * bool(layout.self_calibration)}, derived channels included, not scaled; the "
-            "newest sample is the last"
-        ),
+        "units": list(InputUnits.of(layout).names),
+        "input": _input_text(layout, tensor),
         "simulated": bool(provenance.get("simulated", False)),
         "code_version": str(provenance.get("code_version", "")),
     }
     return {k: v if isinstance(v, str) else json.dumps(v, ensure_ascii=False) for k, v in facts.items()}
+
+
+def _input_text(layout: Layout, tensor: str) -> str:
+    """Return a sentence about the input: tensor, units, and what the caller computes before."""
+    offsets = {c.name: 0.0 if c.name in layout.self_calibration else c.offset for c in layout.channels}
+    measured = f"{'self-calibrated ' * bool(layout.self_calibration)}values as the toy sends them"
+    parts = [f"{measured}, in the units listed under 'units', at {layout.rate_hz:g} Hz after the clock rule"]
+    for derived in layout.derived:
+        of = [f"({name} - {offsets[name]:g})" if offsets[name] else name for name in derived.of]
+        root = f"sqrt({' + '.join(f'{part}^2' for part in of)})"
+        mean = f"the running mean of {of[0]} over {1 << layout.gravity_shift} samples"
+        if derived.name in layout.inputs:
+            parts.append(f"{derived.name} is {root if derived.kind == 'magnitude' else mean}")
+    return "; ".join([tensor, *parts, "the newest sample is the last"])
 
 
 def compared(
@@ -245,15 +267,15 @@ def compared(
     data: bytes,
     logits: NDArray[Any],
     title: str,
+    notes: tuple[str, ...],
     expected: NDArray[np.float64] | None = None,
-    note: str = NOT_EXACT,
 ) -> Conversion:
     """Compare the logits (N, K) of a file with the expected ones and return the conversion.
 
     Args:
+        notes: sentences about the file, for its users.
         expected: logits that the file approximates; None: those of the float network, which it must match up to
             rounding.
-        note: a sentence about the file.
 
     Raises:
         BundleError: if the logits of a float file differ from the network's.
@@ -270,4 +292,4 @@ def compared(
     sentence = (
         f"On {job.tried}: logits differ by at most {largest:.2g}, the same gesture in {same} of {len(reference)}."
     )
-    return Conversion(data, largest, (sentence, note))
+    return Conversion(data, largest, (sentence, *notes))

@@ -34,6 +34,7 @@ from plushsense.deploy.convert import (
 from plushsense.deploy.convert.onnx import OnnxGraph
 from plushsense.deploy.quantize import Ranges, folded, refuse_undeployable
 from plushsense.models.bundle import Bundle
+from plushsense.windows.features import InputUnits
 
 SCALED = "scaled"
 MAGIC = b"EDL2"
@@ -72,8 +73,8 @@ def to_espdl(job: ConversionJob, target: str) -> Conversion:
         ranges = Ranges.from_dict(bundle.calibration)
         some = np.clip(some, ranges.low[:, None], ranges.high[:, None]).astype(np.float32)
     model = plain_model(bundle)
-    facts = describe(bundle) | {"input": f"'{SCALED}': (value - offset) * scale a channel, (1, C, span)"}
-    facts |= {k: json.dumps(v) for k, v in bundle.scaler.to_dict().items()}
+    facts = describe(bundle, f"'{SCALED}' (1, C, span): channels, samples: (value - offset) * scale of each channel")
+    facts |= {k: json.dumps(v) for k, v in InputUnits.of(bundle.layout).scaler(bundle.scaler).to_dict().items()}
     data, logits = _quantized(bundle, model, some, scaled, target, facts)
     origin = (
         f"{len(some)} given windows" if job.given else "made-up windows only, so give windows of the training people"
@@ -82,7 +83,7 @@ def to_espdl(job: ConversionJob, target: str) -> Conversion:
         f"For {target}, quantized by esp-ppq with ranges from {origin}; compared in esp-ppq's simulation with the "
         "float network, not run on a chip."
     )
-    result = compared(job, data, logits, "ESP-DL", job.reference(), note)
+    result = compared(job, data, logits, "ESP-DL", (note,), job.reference())
     return replace(result, notes=result.notes[::-1])
 
 

@@ -1,7 +1,7 @@
 """Convert a network to ONNX: in floats, or quantized with QuantizeLinear and DequantizeLinear (QDQ).
 
-The input ``raw`` (N, C, span) is float32 with whole numbers in raw sensor counts; the outputs are ``logits`` and
-``probabilities`` (N, K). Opset 18, IR version 9.
+The input ``raw`` (N, C, span) is float32, in the units of the layout (`InputUnits`); the outputs are ``logits`` and
+``probabilities`` (N, K). Opset 13, for small compilers and older importers; 17 with layer normalisation.
 """
 
 from __future__ import annotations
@@ -25,19 +25,22 @@ from plushsense.deploy.convert import (
     Floats,
     compared,
     describe,
+    in_float32,
     input_codes,
-    scaling,
     sum_scales,
 )
 from plushsense.deploy.quantize import integer_network
 from plushsense.models.arch import NORM_EPSILON, Arch, ConvLayer, VectorLayer, reflected
 from plushsense.models.bundle import Bundle
+from plushsense.models.reference import affine
 from plushsense.models.vectors import LENGTH_EPSILON, TURN_EPSILON
 from plushsense.runtime.integer import IntegerNetwork
 from plushsense.runtime.vectors import AXIS_LIMIT
+from plushsense.windows.features import InputUnits, Scaler
 
-OPSET = 18
-IR_VERSION = 9
+OPSET = 13
+OPSET_OF_LAYER_NORMALIZATION = 17
+WEIGHT_ZERO = 128  # of the weights in 8 bits
 Shape = list[str | int]
 
 
@@ -50,7 +53,7 @@ class OnnxGraph:
         self.constants: list[Any] = []
 
     def constant(self, name: str, values: NDArray[Any]) -> str:
-        self.constants.append(self.onnx.numpy_helper.from_array(np.ascontiguousarray(values), name))
+        self.constants.append(self.onnx.numpy_helper.from_array(np.asarray(values, order="C"), name))
         return name
 
     def add(self, kind: str, out: str, *inputs: str, **settings: Any) -> str:
@@ -66,8 +69,10 @@ class OnnxGraph:
         helper, real = self.onnx.helper, self.onnx.TensorProto.FLOAT
         infos = [[helper.make_tensor_value_info(n, real, s) for n, s in part.items()] for part in (inputs, outputs)]
         graph = helper.make_graph(self.nodes, "plushsense", *infos, self.constants)
-        opset = [helper.make_opsetid("", OPSET)]
-        model = helper.make_model(graph, ir_version=IR_VERSION, opset_imports=opset, **settings)
+        normed = any(node.op_type == "LayerNormalization" for node in self.nodes)
+        opset = [helper.make_opsetid("", OPSET_OF_LAYER_NORMALIZATION if normed else OPSET)]
+        version = helper.find_min_ir_version_for(opset)
+        model = helper.make_model(graph, ir_version=version, opset_imports=opset, **settings)
         self.onnx.checker.check_model(model, full_check=True)
         return model
 
@@ -78,17 +83,21 @@ class OnnxGraph:
         classes: Shape = ["N", arch.classes]
         about = {"producer_name": "plushsense", "doc_string": f"Touch gestures, {arch.title}"}
         model = self.model(inputs, {LOGITS: classes, PROBABILITIES: classes}, **about)
-        self.onnx.helper.set_model_props(model, describe(bundle))
+        facts = _facts(bundle)
+        self.onnx.helper.set_model_props(model, facts)
+        model.graph.input[0].doc_string = facts["input"]
         return bytes(model.SerializeToString(deterministic=True))
+
+
+def _facts(bundle: Bundle) -> dict[str, str]:
+    shape = f"(N, {bundle.arch.channels}, {bundle.arch.span})"
+    return describe(bundle, f"'{RAW}', float32 {shape}, also for whole numbers: windows, channels, samples")
 
 
 def float_model(bundle: Bundle) -> bytes:
     """Return the float network as ONNX."""
     g, arch = OnnxGraph(), bundle.arch
-    whole, scale, rest = scaling(bundle.scaler)
-    z = g.add("Sub", "shifted", RAW, g.columns("scaler.offset", whole))
-    z = g.add("Mul", "sized", z, g.columns("scaler.scale", scale))
-    z = g.add("Add", "scaled", z, g.columns("scaler.rest", rest))
+    z = _scaled(g, RAW, InputUnits.of(bundle.layout).scaler(bundle.scaler))
     if arch.vector is not None:
         weights = bundle.weights["vector.weight"].astype(np.float64)
         z = _invariants(g, arch, arch.vector, z, weights, (LENGTH_EPSILON, TURN_EPSILON))
@@ -96,17 +105,17 @@ def float_model(bundle: Bundle) -> bytes:
         root = np.sqrt(bundle.weights["vector.var"].astype(np.float64) + NORM_EPSILON)
         z = g.add("Mul", "vector", z, g.columns("vector.gain", (1.0 / root).astype(np.float32)))
     for i, layer in enumerate(arch.layers):
-        z, pads = _padding(g, i, arch, layer, z)
+        z = _padded(g, i, arch, layer, z)
         w, b = (g.constant(n, bundle.weights[n]) for n in (f"conv{i}.weight", f"conv{i}.bias"))
-        z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel], pads=pads)
+        z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel])
         z = g.add("Relu", f"relu{i}", z)
-        if arch.norm == "none":
-            continue
-        gain, shift = (g.constant(n, bundle.weights[n]) for n in (f"norm{i}.gain", f"norm{i}.shift"))
         if arch.norm == "batch":
-            mean, var = (g.constant(n, bundle.weights[n]) for n in (f"norm{i}.mean", f"norm{i}.var"))
-            z = g.add("BatchNormalization", f"norm{i}", z, gain, shift, mean, var, epsilon=NORM_EPSILON)
-        else:
+            # No BatchNormalization, which onnx's own evaluator computes as in a training up to opset 13.
+            factor, term = (part.astype(np.float32) for part in affine(arch, i, bundle.weights))
+            z = g.add("Mul", f"gained{i}", z, g.columns(f"norm{i}.gain", factor))
+            z = g.add("Add", f"norm{i}", z, g.columns(f"norm{i}.shift", term))
+        elif arch.norm == "layer":
+            gain, shift = (g.constant(n, bundle.weights[n]) for n in (f"norm{i}.gain", f"norm{i}.shift"))
             z = g.add("Transpose", f"norm{i}.rows", z, perm=[0, 2, 1])
             z = g.add("LayerNormalization", f"norm{i}.normed", z, gain, shift, axis=-1, epsilon=NORM_EPSILON)
             z = g.add("Transpose", f"norm{i}", z, perm=[0, 2, 1])
@@ -117,17 +126,23 @@ def float_model(bundle: Bundle) -> bytes:
     return g.to_bytes(bundle)
 
 
-def _padding(g: OnnxGraph, i: int, arch: Arch, layer: ConvLayer, z: str) -> tuple[str, list[int]]:
+def _scaled(g: OnnxGraph, z: str, scaler: Scaler, start: NDArray[np.float64] | float = 0.0) -> str:
+    offset, gain, rest = in_float32(scaler, start)
+    z = g.add("Sub", "shifted", z, g.columns("input.offset", offset))
+    z = g.add("Mul", "sized", z, g.columns("input.gain", gain))
+    return g.add("Add", "scaled", z, g.columns("input.rest", rest))
+
+
+def _padded(g: OnnxGraph, i: int, arch: Arch, layer: ConvLayer, z: str) -> str:
     if arch.padding == "stream" or not layer.reach:
-        return z, [0, 0]
-    if arch.padding == "causal":
-        return z, [layer.reach, 0]
-    if layer.reach < arch.window:
-        pads = np.array([0, 0, layer.reach, 0, 0, 0], dtype=np.int64)
-        return g.add("Pad", f"mirror{i}", z, g.constant(f"mirror{i}.pads", pads), mode="reflect"), [0, 0]
-    # Pad reflects only once; longer padding needs several reflections.
-    indices = reflected(arch.window, layer.reach).astype(np.int64)
-    return g.add("Gather", f"mirror{i}", z, g.constant(f"mirror{i}.places", indices), axis=2), [0, 0]
+        return z
+    if arch.padding == "mirror" and layer.reach >= arch.window:
+        # Pad reflects only once; longer padding needs several reflections.
+        indices = reflected(arch.window, layer.reach).astype(np.int64)
+        return g.add("Gather", f"padded{i}", z, g.constant(f"padded{i}.places", indices), axis=2)
+    # Not by the attribute of Conv, of whose two sides OpenCV reads one.
+    pads = g.constant(f"padded{i}.pads", np.array([0, 0, layer.reach, 0, 0, 0], dtype=np.int64))
+    return g.add("Pad", f"padded{i}", z, pads, mode="reflect" if arch.padding == "mirror" else "constant")
 
 
 def _invariants(
@@ -150,8 +165,9 @@ def _invariants(
         edges = (np.array([v], dtype=np.int64) for v in (first, last, axis))
         return g.add("Slice", name, z, *(g.constant(f"{name}.{k}", v) for k, v in enumerate(edges)))
 
-    def length(name: str, z: str, keep: int) -> str:
-        squares = g.add("ReduceSumSquare", f"{name}.squares", z, one, keepdims=keep)
+    def length(name: str, z: str) -> str:
+        # With keepdims=0, the sums of some filters are wrong in OpenVINO 2026.4 where all shapes are fixed.
+        squares = g.add("ReduceSum", f"{name}.squares", g.add("Mul", f"{name}.each", z, z), one, keepdims=1)
         return g.add("Sqrt", name, g.add("Add", f"{name}.sum", squares, small))
 
     def turned(name: str, z: str, axis: int, order: Sequence[int]) -> str:
@@ -160,7 +176,7 @@ def _invariants(
     small, smaller = (g.constant(f"epsilon.{i}", np.array(e, dtype=np.float32)) for i, e in enumerate(epsilons))
     newest = part("newest", z, 2, layer.reach, arch.span)
     gravity = part("gravity", newest, 1, arch.channels - 3, arch.channels)
-    up = g.add("Div", "up", gravity, length("gravity.length", gravity, 1))
+    up = g.add("Div", "up", gravity, length("gravity.length", gravity))
     up = g.add("Unsqueeze", "up.rows", up, g.constant("axis.2", np.array([2], dtype=np.int64)))
     outputs = [part("others", newest, 1, 0, others)] if others else []
     for v, kernels in enumerate(weights):
@@ -189,19 +205,22 @@ def _invariants(
         power = g.constant(f"{n}.power", np.array(-0.25, dtype=np.float32))
         sense = g.add("Mul", f"{n}.sense", turn, g.add("Pow", f"{n}.root", sized, power))
         flat = g.add("Squeeze", f"{n}.v", vertical, one)
-        outputs += [flat, length(f"{n}.n", h, 0), sense]
+        outputs += [flat, g.add("Squeeze", f"{n}.n", length(f"{n}.length", h), one), sense]
     return g.add("Concat", "invariants", *outputs, axis=1)
 
 
 def _mean(g: OnnxGraph, z: str) -> str:
-    return g.add("ReduceMean", "pooled", z, g.constant("time", np.array([2], dtype=np.int64)), keepdims=0)
+    return g.add("Flatten", "pooled", g.add("GlobalAveragePool", "mean", z), axis=1)
 
 
 def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     """Return the integer network as ONNX with QuantizeLinear and DequantizeLinear.
 
-    Activations have the uint8 codes of `IntegerNetwork` with scale 1; the scale of each filter is applied to its int8
-    weights. The mean over time and the dense layer are computed in float32, the latter with int8 weights.
+    Activations have the uint8 codes of `IntegerNetwork` with scale 1; the scale of each filter is applied to its
+    weights. The mean over time and the dense layer are computed in float32, the latter with 8-bit weights.
+
+    Weights are uint8 with the zero point `WEIGHT_ZERO`: on processors without VNNI, onnxruntime and others add pairs of
+    products of uint8 and int8 in 16 bits, which saturate without an error.
     """
     g, arch = OnnxGraph(), network.arch
     one = g.constant("code.scale", np.array(1, dtype=np.float32))
@@ -211,32 +230,38 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
         z = g.add("QuantizeLinear", f"{name}.codes", z, one, zero)
         return g.add("DequantizeLinear", f"{name}.read", z, one, zero)
 
-    def dequantized(name: str, whole: NDArray[Any], scales: NDArray[np.float64]) -> str:
+    def dequantized(name: str, codes: NDArray[Any], scales: NDArray[np.float64], zero: int = 0) -> str:
         scale = g.constant(f"{name}.scale", scales.astype(np.float32))
-        none = g.constant(f"{name}.zero", np.zeros(len(scales), dtype=whole.dtype))
-        return g.add("DequantizeLinear", f"{name}.real", g.constant(name, whole), scale, none, axis=0)
+        zeros = g.constant(f"{name}.zero", np.full(len(scales), zero, dtype=codes.dtype))
+        return g.add("DequantizeLinear", f"{name}.real", g.constant(name, codes), scale, zeros, axis=0)
 
-    offset, gain, start = input_codes(network)
-    z = RAW
+    def weights_of(name: str, whole: NDArray[np.int8], scales: NDArray[np.float64]) -> str:
+        return dequantized(name, (whole.astype(np.int16) + WEIGHT_ZERO).astype(np.uint8), scales, WEIGHT_ZERO)
+
+    z, units, (scaler, start) = RAW, InputUnits.of(bundle.layout), input_codes(network)
     if arch.vector is not None and network.vectors is not None:
         # In floats, so that the codes may differ by the rounding of the integer layer.
         weights = network.vectors.weights / np.ldexp(1.0, network.vectors.down)[:, :, None]
         sizes = np.ldexp(1.0, network.vectors.shift)
+        z = g.add("Mul", "steps", z, g.columns("input.steps", units.steps.astype(np.float32)))
+        z = g.add("Sub", "integers", z, g.columns("input.zero", units.zero.astype(np.float32)))
         z = _invariants(g, arch, arch.vector, z, weights, (1.0, 1.0), sizes)
-    z = g.add("Sub", "shifted", z, g.columns("input.offset", offset))
-    z = g.add("Mul", "sized", z, g.columns("input.gain", gain))
-    z = quantized(g.add("Add", "scaled", z, g.columns("input.start", start)), "input")
+    else:
+        scaler = units.scaler(scaler)
+    z = quantized(_scaled(g, z, scaler, start), "input")
     for i, (layer, integer_layer) in enumerate(zip(arch.layers, network.layers, strict=True)):
         scales = sum_scales(integer_layer.scale.multiplier, integer_layer.scale.before, integer_layer.scale.after)
-        w = dequantized(f"conv{i}.weight", integer_layer.weights, scales)
+        w = weights_of(f"conv{i}.weight", integer_layer.weights, scales)
         b = dequantized(f"conv{i}.bias", integer_layer.bias.astype(np.int32), scales)
-        z, pads = _padding(g, i, arch, layer, z)
-        z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel], pads=pads)
+        z = _padded(g, i, arch, layer, z)
+        z = g.add("Conv", f"conv{i}", z, w, b, dilations=[layer.dilation], kernel_shape=[layer.kernel])
         z = quantized(g.add("Relu", f"relu{i}", z), f"layer{i}")
+    # Over images, because OpenVINO 2026.4 averages 8-bit codes (N, F, T) over time to 0 in all but the first F windows.
+    z = g.add("Unsqueeze", "image", z, g.constant("image.axis", np.array([2], dtype=np.int64)))
     z = _mean(g, z)
     dense = network.dense
     scales = sum_scales(dense.scale.multiplier, dense.scale.before, dense.scale.after) / 256
-    w = dequantized("dense.weight", dense.weights, scales * arch.pooled)
+    w = weights_of("dense.weight", dense.weights, scales * arch.pooled)
     z = g.add("Gemm", "dense", z, w, g.constant("dense.bias", (dense.bias * scales).astype(np.float32)), transB=1)
     low = g.constant("logits.low", np.array(-LIMIT, dtype=np.float32))
     high = g.constant("logits.high", np.array(LIMIT, dtype=np.float32))
@@ -245,18 +270,20 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     return g.to_bytes(bundle)
 
 
-def run_model(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32] | None:
-    """Run a model in onnxruntime on raw windows and return the logits (N, K); None if it is not installed."""
+def run_model(model: bytes, values: Floats) -> NDArray[np.float32] | None:
+    """Run a model in onnxruntime with its default settings; return the logits (N, K), or None if it is not installed.
+
+    Args:
+        values: windows (N, C, span) in the units of the layout.
+    """
     if importlib.util.find_spec("onnxruntime") is None:
         return None
     ort = need("onnxruntime", "onnx")
     settings = ort.SessionOptions()
-    settings.intra_op_num_threads = 1
+    settings.intra_op_num_threads = 1  # has no effect on the answers
     settings.log_severity_level = 3
-    # Otherwise sums of 8-bit products overflow in 16 bits on processors without VNNI.
-    settings.add_session_config_entry("session.x64quantprecision", "1")
     session = ort.InferenceSession(model, settings, providers=["CPUExecutionProvider"])
-    return np.asarray(session.run([LOGITS], {RAW: windows.astype(np.float32)})[0])
+    return np.asarray(session.run([LOGITS], {RAW: values})[0])
 
 
 _UNCHECKED = "Not tried: run  pip install 'plushsense[onnx]'  to have it compared in onnxruntime."
@@ -264,19 +291,18 @@ _UNCHECKED = "Not tried: run  pip install 'plushsense[onnx]'  to have it compare
 
 def to_onnx(job: ConversionJob) -> Conversion:
     """Convert the float network."""
-    note = f"Input '{RAW}' (N, {job.bundle.arch.channels}, span)."
-    return _conversion(job, float_model(job.bundle), None, note)
+    return _conversion(job, float_model(job.bundle), None)
 
 
 def to_integer_onnx(job: ConversionJob) -> Conversion:
     """Convert the integer network; its outputs are close to those of the exported C, but not bit-identical."""
     network = integer_network(job.bundle)
-    model = integer_model(job.bundle, network)
-    return _conversion(job, model, network.forward(job.windows) / 256, NOT_EXACT)
+    return _conversion(job, integer_model(job.bundle, network), network.forward(job.windows) / 256, NOT_EXACT)
 
 
-def _conversion(job: ConversionJob, model: bytes, expected: NDArray[np.float64] | None, note: str) -> Conversion:
-    logits = run_model(model, job.windows)
+def _conversion(job: ConversionJob, model: bytes, expected: NDArray[np.float64] | None, *notes: str) -> Conversion:
+    notes = (*notes, f"Input {_facts(job.bundle)['input']}.")
+    logits = run_model(model, job.values)
     if logits is None:
-        return Conversion(model, None, (_UNCHECKED, note))
-    return compared(job, model, logits, "ONNX", expected, note)
+        return Conversion(model, None, (_UNCHECKED, *notes))
+    return compared(job, model, logits, "ONNX", notes, expected)

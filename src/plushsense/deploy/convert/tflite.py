@@ -2,7 +2,7 @@
 
 Needs neither TensorFlow nor PyTorch.
 
-The input ``raw`` (1, span, C) is float32 with whole numbers in raw sensor counts, time before channels as usual in
+The input ``raw`` (1, span, C) is float32, in the units of the layout (`InputUnits`), time before channels as usual in
 LiteRT; the outputs are ``logits`` and ``probabilities`` (1, K). All operators are built into the interpreters of LiteRT
 and TensorFlow Lite Micro.
 """
@@ -19,6 +19,7 @@ from plushsense.core.errors import need
 from plushsense.deploy.convert import (
     LIMIT,
     LOGITS,
+    NOT_EXACT,
     PROBABILITIES,
     RAW,
     Conversion,
@@ -26,10 +27,10 @@ from plushsense.deploy.convert import (
     Floats,
     compared,
     describe,
+    in_float32,
     input_codes,
     refuse_vectors,
     refuse_window,
-    scaling,
     sum_scales,
 )
 from plushsense.deploy.quantize import integer_network
@@ -37,8 +38,10 @@ from plushsense.models.arch import NORM_EPSILON, Arch, ConvLayer, reflected
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import affine
 from plushsense.runtime.integer import IntegerNetwork
+from plushsense.windows.features import InputUnits, Scaler
 
 SCHEMA_VERSION = 3
+ALIGNMENT = 16  # bytes, of the data of each buffer (force_align in the schema)
 _ZERO = -128  # zero point of int8 codes, which are those of 0 to 255 minus 128
 
 
@@ -60,6 +63,19 @@ class _TfliteGraph:
         self.tensors.append(tensor)
         return len(self.tensors) - 1
 
+    def _buffer(self, data: bytes) -> int:
+        buffer = self.schema.BufferT()
+        buffer.data, pack = np.frombuffer(data, dtype=np.uint8), buffer.Pack
+
+        def aligned(builder: Any) -> Any:
+            # The generated code of the schema ignores force_align.
+            builder.Prep(ALIGNMENT, len(data))
+            return pack(builder)
+
+        buffer.Pack = aligned
+        self.buffers.append(buffer)
+        return len(self.buffers) - 1
+
     def value(self, name: str, *shape: int, dtype: str = "float32") -> int:
         """Add a computed tensor; an int8 one has codes with scale 1."""
         at = self._put(name, shape, dtype, 0)
@@ -69,11 +85,8 @@ class _TfliteGraph:
 
     def constant(self, name: str, values: NDArray[Any], scales: NDArray[np.float64] | None = None) -> int:
         """Add a constant tensor; ``scales`` (F,) are the quantization scales of its first dimension."""
-        buffer = self.schema.BufferT()
         little = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
-        buffer.data = np.frombuffer(little.tobytes(), dtype=np.uint8)
-        self.buffers.append(buffer)
-        at = self._put(name, values.shape, values.dtype.name, len(self.buffers) - 1)
+        at = self._put(name, values.shape, values.dtype.name, self._buffer(little.tobytes()))
         if scales is not None:
             self._quantized(at, scales, 0)
         return at
@@ -109,18 +122,15 @@ class _TfliteGraph:
         graph.inputs, graph.outputs = [raw], [logits, probabilities]
         model = schema.ModelT()
         model.version, model.subgraphs, model.buffers = SCHEMA_VERSION, [graph], self.buffers
-        model.description = f"PlushSense, touch gestures, {bundle.arch.title}"
+        model.description = f"PlushSense, touch gestures, {bundle.arch.title}. {_input_note(bundle)}"
         model.operatorCodes = []
         for kind, version in self.codes:
             code = schema.OperatorCodeT()
             code.builtinCode = code.deprecatedBuiltinCode = getattr(schema.BuiltinOperator, kind)
             code.version = version
             model.operatorCodes.append(code)
-        facts = schema.BufferT()
-        facts.data = np.frombuffer(json.dumps(describe(bundle), ensure_ascii=False).encode(), dtype=np.uint8)
-        self.buffers.append(facts)
         entry = schema.MetadataT()
-        entry.name, entry.buffer = "plushsense", len(self.buffers) - 1
+        entry.name, entry.buffer = "plushsense", self._buffer(json.dumps(_facts(bundle), ensure_ascii=False).encode())
         model.metadata = [entry]
         model.signatureDefs = [self._signature(raw, logits, probabilities)]
         builder = self.flatbuffers.Builder(1 << 16)
@@ -172,15 +182,21 @@ class _TfliteGraph:
         return self.add("RESHAPE", self.value(name, *shape, dtype=dtype), z, new)
 
 
+def _facts(bundle: Bundle) -> dict[str, str]:
+    shape = f"(1, {bundle.arch.span}, {bundle.arch.channels})"
+    return describe(bundle, f"'{RAW}', float32 {shape}, also for whole numbers: window, samples, channels")
+
+
+def _input_note(bundle: Bundle) -> str:
+    return f"Input {_facts(bundle)['input']}."
+
+
 def float_model(bundle: Bundle) -> bytes:
     """Return the float network as .tflite."""
     g, arch = _TfliteGraph(), bundle.arch
     shape_in = (1, arch.span, arch.channels)
     raw = z = g.value(RAW, *shape_in)
-    whole, scale, rest = scaling(bundle.scaler)
-    z = g.per_channel("SUB", "shifted", z, whole, *shape_in)
-    z = g.per_channel("MUL", "sized", z, scale, *shape_in)
-    z = g.raised(g.per_channel("ADD", "scaled", z, rest, *shape_in), "image", arch)
+    z = g.raised(_scaled(g, z, arch, InputUnits.of(bundle.layout).scaler(bundle.scaler)), "image", arch)
     for i, (layer, positions) in enumerate(zip(arch.layers, arch.positions, strict=True)):
         z = _padded(g, i, arch, layer, z)
         w = g.constant(f"conv{i}.weight", bundle.weights[f"conv{i}.weight"].transpose(0, 2, 1)[:, None])
@@ -192,6 +208,13 @@ def float_model(bundle: Bundle) -> bytes:
     w, b = (g.constant(n, bundle.weights[n]) for n in ("dense.weight", "dense.bias"))
     logits = g.add("FULLY_CONNECTED", g.value(LOGITS, 1, arch.classes), z, w, b, options="FullyConnectedOptions")
     return g.model(bundle, raw, logits, g.softmax(logits, arch.classes))
+
+
+def _scaled(g: _TfliteGraph, z: int, arch: Arch, scaler: Scaler, start: NDArray[np.float64] | float = 0.0) -> int:
+    names = (("SUB", "shifted"), ("MUL", "sized"), ("ADD", "scaled"))
+    for (kind, name), values in zip(names, in_float32(scaler, start), strict=True):
+        z = g.per_channel(kind, name, z, values, 1, arch.span, arch.channels)
+    return z
 
 
 def _padded(g: _TfliteGraph, i: int, arch: Arch, layer: ConvLayer, z: int) -> int:
@@ -234,10 +257,8 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     g, arch = _TfliteGraph(), network.arch
     shape_in = (1, arch.span, arch.channels)
     raw = z = g.value(RAW, *shape_in)
-    offset, gain, start = input_codes(network)
-    z = g.per_channel("SUB", "shifted", z, offset, *shape_in)
-    z = g.per_channel("MUL", "sized", z, gain, *shape_in)
-    z = g.per_channel("ADD", "scaled", z, start, *shape_in)
+    scaler, start = input_codes(network)
+    z = _scaled(g, z, arch, InputUnits.of(bundle.layout).scaler(scaler), start)
     z = g.add("QUANTIZE", g.value("codes", *shape_in, dtype="int8"), z)
     z = g.raised(z, "image", arch, "int8")
     for i, (layer, part, positions) in enumerate(zip(arch.layers, network.layers, arch.positions, strict=True)):
@@ -259,20 +280,23 @@ def integer_model(bundle: Bundle, network: IntegerNetwork) -> bytes:
     return g.model(bundle, raw, z, g.softmax(z, arch.classes))
 
 
-def run_model(model: bytes, windows: NDArray[Any]) -> NDArray[np.float32]:
-    """Run a model in the LiteRT interpreter on raw windows (N, C, T) and return the logits (N, K)."""
+def run_model(model: bytes, values: Floats) -> NDArray[np.float32]:
+    """Run a model in the LiteRT interpreter; return the logits (N, K).
+
+    Args:
+        values: windows (N, C, span) in the units of the layout.
+    """
     litert = need("ai_edge_litert.interpreter", "tflite")
     run = litert.Interpreter(model_content=model, num_threads=1).get_signature_runner("serving_default")
-    rows = windows.astype(np.float32).transpose(0, 2, 1)
-    return np.concatenate([run(**{RAW: np.ascontiguousarray(row[None])})[LOGITS] for row in rows])
+    rows = values.transpose(0, 2, 1)[:, None]
+    return np.concatenate([run(**{RAW: np.ascontiguousarray(row)})[LOGITS] for row in rows])
 
 
 def to_tflite(job: ConversionJob) -> Conversion:
     """Convert the float network."""
     refuse_vectors(job.bundle.arch, ".tflite")
     model = float_model(job.bundle)
-    note = f"Input '{RAW}' (1, span, {job.bundle.arch.channels})."
-    return compared(job, model, run_model(model, job.windows), "LiteRT", note=note)
+    return compared(job, model, run_model(model, job.values), "LiteRT", (_input_note(job.bundle),))
 
 
 def to_integer_tflite(job: ConversionJob) -> Conversion:
@@ -281,4 +305,5 @@ def to_integer_tflite(job: ConversionJob) -> Conversion:
     refuse_vectors(job.bundle.arch, ".tflite")
     network = integer_network(job.bundle)
     model = integer_model(job.bundle, network)
-    return compared(job, model, run_model(model, job.windows), "LiteRT", network.forward(job.windows) / 256)
+    logits, expected = run_model(model, job.values), network.forward(job.windows) / 256
+    return compared(job, model, logits, "LiteRT", (NOT_EXACT, _input_note(job.bundle)), expected)

@@ -56,11 +56,11 @@ def recorded_frames(dataset: Dataset, layout: Layout, *, subjects: Sequence[str]
     Raises:
         ConfigError: for another layout than the model's, or an unknown person.
     """
-    if dataset.layout.channels != layout.channels:
+    if not dataset.layout.reads_as(layout):
         raise ConfigError(
             f"The data set '{dataset.head.name}' holds layout '{dataset.layout.name}' "
             f"({', '.join(dataset.layout.names)}), but the model reads '{layout.name}' ({', '.join(layout.names)}), "
-            "with its own units and valid ranges: give recordings of the model's layout.",
+            "or other units or steps: give recordings of the model's layout.",
             reason="vectors_layout",
             name=dataset.head.name,
         )
@@ -234,7 +234,7 @@ class Export:
         try:
             return read_bytes(self._require_file(name), MOST_FILE_BYTES)
         except OSError as cause:
-            message = f"'{self.folder / name}' cannot be read ({cause.strerror}): export the model again."
+            message = f"'{self.folder / name}' cannot be read ({cause.strerror or cause}): export the model again."
             raise BadInput(message, reason="export_damaged", name=self.folder.name) from None
 
     def require_unchanged(self) -> None:

@@ -116,7 +116,12 @@ def protocol(
         with temporary_folder() as work:
             folder = work / "session"
             import_recordings(
-                Path(session), folder, layout=bundle.layout, gestures=bundle.gestures, name=Path(session).resolve().name
+                Path(session),
+                folder,
+                layout=bundle.layout,
+                gestures=bundle.gestures,
+                name=Path(session).resolve().name,
+                adopt_proposals=False,
             )
             made = _recorded(as_dataset(folder), bundle, asked, subjects, rules, progress)
     else:
@@ -192,7 +197,7 @@ def _recorded(
     progress: Progress | None,
 ) -> dict[str, Any]:
     """Run the protocol on recorded sessions and return the result."""
-    if dataset.layout.channels != bundle.layout.channels:
+    if not dataset.layout.reads_as(bundle.layout):
         raise ConfigError(
             f"'{dataset.head.name}' was recorded with layout '{dataset.layout.name}', but the network reads "
             f"'{bundle.layout.name}': take a network that was made for it."

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, TrainingError
+from plushsense.core.sentences import join_names
 from plushsense.models.arch import MAX_LAYERS, Arch, slashed
 from plushsense.trials.grid import GRIDS, GridSpec, grid_tables, over
 
@@ -85,17 +86,17 @@ def problems(spec: SearchSpec, folds: int | None = None) -> list[str]:
     found = []
     rungs = spec.rungs
     if not rungs or min(rungs) < 1 or list(rungs) != sorted(set(rungs)):
-        found.append(f"The rungs {_listed(rungs)} cannot be used: accepted are whole numbers from 1 that ascend.")
+        found.append(f"The rungs {join_names(rungs)} cannot be used: accepted are whole numbers from 1 that ascend.")
     if spec.folds:
         if len(spec.folds) != len(rungs) - 1:
             found.append(
-                f"The folds {_listed(spec.folds)} do not fit {len(rungs)} rungs: give one number for each rung but the "
-                "last, which looks at all folds."
+                f"The folds {join_names(spec.folds)} do not fit {len(rungs)} rungs: give one number for each rung but "
+                "the last, which looks at all folds."
             )
         elif min(spec.folds) < 1 or list(spec.folds) != sorted(spec.folds):
-            found.append(f"The folds {_listed(spec.folds)} cannot be used: whole numbers from 1 that do not fall.")
+            found.append(f"The folds {join_names(spec.folds)} cannot be used: whole numbers from 1 that do not fall.")
         elif folds is not None and spec.folds[-1] > folds:
-            found.append(f"The folds {_listed(spec.folds)} are more than the split has: it has {folds}.")
+            found.append(f"The folds {join_names(spec.folds)} are more than the split has: it has {folds}.")
     if spec.share is not None and not 0.0 < spec.share <= 1.0:
         found.append(f"The share {spec.share:g} cannot be used: accepted is above 0, up to 1.")
     if not (math.isfinite(spec.eta) and spec.eta > 1.0):
@@ -300,10 +301,6 @@ def standard_error(scores: Scores) -> float | None:
 
 def _up(share: float) -> float:
     return math.ceil(share * 1000) / 1000
-
-
-def _listed(values: Sequence[int]) -> str:
-    return ", ".join(map(str, values)) or "(none)"
 
 
 # Number of draws per wanted network after which the space counts as exhausted.

@@ -312,4 +312,6 @@ def write_events(path: str | os.PathLike[str], streams: Iterable[StreamEvents], 
     try:
         write_file(Path(path), out.getvalue())
     except OSError as cause:
-        raise BadInput(f"The events cannot be written to '{path}' ({cause.strerror}): give another file.") from None
+        raise BadInput(
+            f"The events cannot be written to '{path}' ({cause.strerror or cause}): give another file."
+        ) from None

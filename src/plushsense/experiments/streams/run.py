@@ -236,7 +236,7 @@ def streams_at(path: str | os.PathLike[str], bundle: Bundle | None = None) -> It
         return
     with temporary_folder() as folder:
         layout, gestures = (None, None) if bundle is None else (bundle.layout, bundle.gestures)
-        yield import_recordings(place, folder / "DS", layout=layout, gestures=gestures).dataset
+        yield import_recordings(place, folder / "DS", layout=layout, gestures=gestures, adopt_proposals=False).dataset
 
 
 def _people_of(dataset: Dataset, path: str | os.PathLike[str], subjects: Sequence[str] | None) -> list[str]:
@@ -315,7 +315,7 @@ def stream_eval(
             warn(f"TRAINED ON: the model was trained on {', '.join(met)}; their scores are too high and are no result")
         if alike := [p for p in wanted if p not in trained and p in known_people(bundle.provenance)]:
             warn(
-                f"the model was trained on people of the same codes in '{bundle.provenance.get('dataset')}': if "
+                f"the model was trained on people of the same codes in '{bundle.provenance.get('dataset', '?')}': if "
                 f"{', '.join(alike)} are the same people, their scores are too high"
             )
         if not known_people(bundle.provenance):

@@ -60,8 +60,8 @@ NAMED = 14
 def about(sweep: SweepResults) -> str:
     """Return the line below a figure: data set, split, number of runs, and whether it is leaky or simulated."""
     parts = [
-        f"data: {sweep.head.get('dataset')}",
-        f"split {sweep.head.get('split')}" + (" (LEAKY)" if sweep.leaky else ""),
+        f"data: {sweep.head.get('dataset') or '?'}",
+        f"split {sweep.head.get('split') or '?'}" + (" (LEAKY)" if sweep.leaky else ""),
         describe_runs(sweep.trials),
     ]
     if len(sweep.done) < sweep.total:

@@ -70,7 +70,9 @@ def _place(where: str) -> tuple[str, str | None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as cause:
-        raise ConfigError(f"'{where}' cannot be a folder for MLflow ({cause.strerror}): give another.") from None
+        raise ConfigError(
+            f"'{where}' cannot be a folder for MLflow ({cause.strerror or cause}): give another."
+        ) from None
     return f"sqlite:///{(folder / 'mlflow.db').as_posix()}", (folder / "artifacts").as_uri()
 
 

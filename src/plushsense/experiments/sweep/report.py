@@ -364,7 +364,7 @@ def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
     return [
         ("Data set", text(head.get("dataset"))),
         ("Hash (SHA-256)", text(head.get("dataset_hash"))),
-        ("Split", f"{how} (“{head.get('split')}”{', leaky' if sweep.leaky else ''})"),
+        ("Split", f"{how} (“{head.get('split') or '?'}”{', leaky' if sweep.leaky else ''})"),
         ("Who validates", who),
         *([("Beside the paper", tables.PAPERS_SPLIT)] if str(head.get("split")) in tables.HOLDOUTS else []),
         ("Windows scored", count(scored) if scored else DASH),

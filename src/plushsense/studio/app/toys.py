@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import ConfigError, DeviceError, PlushSenseError
 from plushsense.core.layouts import layout_names
 from plushsense.core.recorder_csv import Frames
+from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Device, Frame
 from plushsense.devices.opening import (
     DEFAULT_LAYOUT,
@@ -134,7 +135,7 @@ class TappedDevice(Device):
                 return
             if bad >= _MANY:
                 break
-        raise _unfit(self.url, self.layout.name, self.counters.malformed)
+        raise _unfit(self.url, self.device)
 
     @property
     def inner(self) -> Device:
@@ -150,6 +151,11 @@ class TappedDevice(Device):
     def gaps(self) -> list[ConnectionGap]:
         """The periods without a connection."""
         return list(getattr(self.device, "gaps", ()))
+
+    @property
+    def mismatch(self) -> Sentence:
+        """As in `Device`, of the wrapped device."""
+        return self.device.mismatch
 
     def read(self) -> list[Frame] | None:
         """Read from the device, store new frames in the buffer and pass them to the taps."""
@@ -203,16 +209,18 @@ class ConnectionTest:
         return _SLOW <= self.frames / (self.seconds * self.rate_hz) <= _FAST
 
 
-def _unfit(url: str, layout: str, malformed: int) -> DeviceError:
+def _unfit(url: str, device: Device) -> DeviceError:
     """Return the error for a toy that sends nothing, or lines that do not fit its layout."""
+    layout, malformed = device.layout.name, device.counters.malformed
     if malformed:
         return DeviceError(
             f"'{url}' sends lines ({malformed}) that are no frames of the layout '{layout}': "
-            "name its layout, as in ?layout=plush-14 at the end of the address.",
+            f"name its layout, as in ?layout=plush-14 at the end of the address. {device.mismatch}".rstrip(),
             reason="toy_unreadable",
             url=url,
             layout=layout,
             lines=malformed,
+            why=device.mismatch,
         )
     message = f"'{url}' sent nothing within {_TIMEOUT_S:g} s: check that the toy is switched on."
     return DeviceError(message, reason="toy_silent", url=url, s=f"{_TIMEOUT_S:g}")
@@ -353,8 +361,8 @@ class Toys:
                         first, until = time.monotonic(), time.monotonic() + TEST_S
                     frames += len(received)
                     last = time.monotonic()
-            layout, counters = device.layout, device.counters
+            layout, counters, unfit = device.layout, device.counters, _unfit(url, device)
         if first is None or last is None:
-            raise _unfit(url, layout.name, counters.malformed)
+            raise unfit
         seconds = max(last - first, 1.0 / layout.rate_hz) * speed
         return ConnectionTest(layout.name, frames, counters.malformed, seconds, layout.rate_hz)

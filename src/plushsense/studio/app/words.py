@@ -13,7 +13,7 @@ from importlib import import_module, resources
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import PlushSenseError
+from plushsense.core.errors import PlushSenseError, single_stops
 from plushsense.core.sentences import Sentence
 
 LANGUAGES = {"en": "English", "lv": "Latviešu"}
@@ -74,10 +74,12 @@ class Words:
             values = {key: self._value(key, value) for key, value in sentence.get("values", {}).items()}
             # A stored job of another version may lack a value.
             with suppress(KeyError):
-                return text.format(**values)
+                return single_stops(text.format(**values))
         return self._texts["sentences.note"].format(message=sentence["message"]) if sentence["message"] else ""
 
     def _value(self, key: str, value: object) -> str:
+        if value is None or value == [] or value == ():
+            return self._texts["shell.nothing"]
         if isinstance(value, list | tuple):
             return ", ".join(self._value(key, each) for each in value)
         if isinstance(value, Sentence | Mapping):
@@ -88,8 +90,8 @@ class Words:
             return self.channel(str(value))
         return self.gesture(str(value)) if key in ("gesture", "gestures") else str(value)
 
-    def error(self, error: PlushSenseError) -> str:
-        """Return the sentence of an error in this language, see `explain`."""
+    def error(self, error: PlushSenseError | Sentence) -> str:
+        """Return the sentence of an error, or another one of the library, in this language, see `explain`."""
         return self.explain(str(error), error.reason, error.values)
 
     def explain(self, message: str, reason: str = "", values: Mapping[str, object] | None = None) -> str:

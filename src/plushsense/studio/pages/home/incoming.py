@@ -35,7 +35,7 @@ ARCHIVE_BYTES = UPLOAD_BYTES - 1_000_000
 """Maximum size of an uploaded file in bytes; the request that carries it is slightly larger."""
 BUNDLE_BYTES = 64_000_000
 _LIMITS = UnpackLimits(total_bytes=4_000_000_000, files=50_000)
-_ACCEPTED = ".zip,.plush,.csv,.xdf,.parquet"
+_ACCEPTED = ".zip,.plush,.csv,.xdf,.xdfz,.parquet"
 # Files that desktops leave in folders; nobody chose them.
 _OF_DESKTOPS = (".DS_Store", "Thumbs.db", "desktop.ini")
 _MAX_LINES = 40

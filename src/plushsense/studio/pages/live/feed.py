@@ -13,6 +13,7 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
 from plushsense.core.errors import PlushSenseError
+from plushsense.core.sentences import Sentence
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.guard import is_loopback
 from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, LINES, on_change
@@ -51,7 +52,7 @@ class Feed:
         explain: returns the sentence of an error in the language of the page.
     """
 
-    def __init__(self, reader: LiveReader, explain: Callable[[PlushSenseError], str] = str) -> None:
+    def __init__(self, reader: LiveReader, explain: Callable[[PlushSenseError | Sentence], str] = str) -> None:
         self._reader, self._explain = reader, explain
         self.plot_s, self.decision_s = 1.0 / PLOT_HZ, PACE_S
         self.hidden = self.away = False
@@ -165,12 +166,15 @@ class Feed:
             self._performed = now.performed
         # These values change rarely, so they are sent only after a change.
         situation = _situation(now.situation)
-        rare = (situation, now.ended, now.next_gesture)
+        unread = now.mismatch if now.situation.kind == "unreadable" else Sentence()
+        warnings = [self._explain(each) for each in now.warnings if each != now.mismatch]
+        rare = (situation, now.ended, now.next_gesture, unread, warnings)
         if rare != self._rare:
             self._rare = rare
             message["now"] = {
                 **situation,
-                "why": "" if now.ended is None else self._explain(now.ended),
+                "why": self._explain(now.ended or unread) if now.ended or unread else "",
+                "warnings": warnings,
                 "next": now.next_gesture,
             }
         return message

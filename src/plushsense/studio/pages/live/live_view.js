@@ -45,7 +45,7 @@ const CSS = `
 .lv-line { font-size: clamp(1.45rem, 2.6vw, 2.1rem); line-height: 1.25; font-weight: 600; overflow-wrap: anywhere; }
 .lv-badge { display: inline-block; color: #fff; font-weight: 600; border-radius: 6px; padding: 1px 9px; }
 .lv-sure { font-weight: 600; font-size: 1.15rem; margin-left: .5em; font-variant-numeric: tabular-nums; }
-.lv-more { min-height: 1.5em; } .lv-did { border-left: 4px solid var(--ps-line); padding-left: 10px; margin-top: 8px; }
+.lv-more { min-height: 1.5em; } .lv-warn { border-left: 4px solid #b45309; padding-left: 10px; margin-top: 4px; } .lv-did { border-left: 4px solid var(--ps-line); padding-left: 10px; margin-top: 8px; }
 .lv-group h3 { font-size: 1rem; line-height: 1.4rem; font-weight: 600; margin: 0; }
 .lv-group { margin-bottom: 8px; } .lv ul, .lv ol { list-style: none; margin: 0; padding: 0; }
 .lv-bar { display: grid; grid-template-columns: minmax(7em, 11em) 1fr 3.2em; gap: 8px; align-items: center; line-height: 1.35rem; }
@@ -133,13 +133,16 @@ export default {
       n.sure.dataset.test = "sure";
       n.about = el("div", "lv-dim lv-more");
       n.about.dataset.test = "about";
+      n.warnings = el("div", "lv-warn");
+      n.warnings.dataset.test = "warnings";
+      n.warnings.setAttribute("role", "status");
       n.eyes = el("div", "lv-more");
       n.eyes.dataset.test = "reaction";
       n.did = el("div", "lv-did");
       n.did.dataset.test = "really";
       const affect = el("div");
       affect.append(n.badge, n.sure);
-      texts.append(n.state, affect, n.about, n.eyes, n.did);
+      texts.append(n.state, affect, n.about, n.warnings, n.eyes, n.did);
       top.append(n.face, texts);
       n.spoken = el("p", "lv-hidden");
       n.spoken.setAttribute("aria-live", "polite");
@@ -201,7 +204,7 @@ export default {
       this.did = [];
       this.t = 0;
       this.chances = null;
-      this.now = { kind: "stopped", why: "", eyes: "off", sound: "", next: "" };
+      this.now = { kind: "stopped", why: "", eyes: "off", sound: "", next: "", warnings: [] };
       this.nowDrawn = this.listed = false;
       this.n.signals.setAttribute("aria-label", fill(this.words.signals_label, { n: this.channels.length, s: s.window }));
       say(this.n.mark, [this.person ? this.words.did_row : "", this.gateRules ? this.words.gate_mark : this.words.gate_none].filter(Boolean).join(" "));
@@ -460,6 +463,8 @@ export default {
       say(this.n.sure, event && now.confidence !== null ? `${now.confidence} %` : "");
       const about = event ? w[now.source === "gate" ? "by_gate" : "by_network"] : fill(w[`about_${now.kind}`] || "", { layout: this.layout, n: this.numbers });
       say(this.n.about, now.why || about);
+      say(this.n.warnings, (now.warnings || []).join(" "));
+      this.n.warnings.hidden = !(now.warnings || []).length;
       const eyes = EYES[now.eyes] ? now.eyes : "off", parts = [w[`eyes_${eyes}`]];
       if (now.sound) parts.push(`♪ ${w[`sound_${now.sound}`] || now.sound}`);
       if (now.quiet) parts.push(w[`quiet_${now.quiet}`]);

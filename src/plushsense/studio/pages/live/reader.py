@@ -102,7 +102,7 @@ class LiveReader:
             self.stop()
             device = TappedDevice(open_device(url, bundle.layout, reconnect=True))
             try:
-                bundle_run = _BundleRun(bundle, run_on(device, classifier), reactor)
+                bundle_run = _BundleRun(bundle, run_on(device, classifier, warn=_kept), reactor)
             except BaseException:
                 device.close()
                 raise
@@ -149,7 +149,7 @@ class LiveReader:
                 fresh = _load(self._workspace.inside(bundle))
                 _refuse_strange(fresh, before)
             reactor = _reactor(reactions, fresh)
-            bundle_run = _BundleRun(fresh, run_on(device, _classifier(fresh, engine)), reactor)
+            bundle_run = _BundleRun(fresh, run_on(device, _classifier(fresh, engine), warn=_kept), reactor)
             with self._lock:
                 self._next = bundle_run
             self.choice = replace(self.choice, bundle=bundle, engine=engine, reactions=reactions)
@@ -314,6 +314,8 @@ class LiveReader:
             self.now = replace(
                 self.now,
                 connection=connection,
+                mismatch=device.mismatch,
+                warnings=tuple(bundle_run.run.warnings),
                 t_s=float(newest[0]) if len(newest) else 0.0,
                 latency_s=bundle_run.run.latency_s,
                 arrived=time.time() - age_s,
@@ -351,7 +353,7 @@ class LiveReader:
                 if span is not None:
                     self._change_event(span, eyes=reaction.eyes, sound=reaction.sound)
             over = self.now.reaction is not None and zero + decision.t_s >= self.now.reaction_ends_s
-            if over or decision.state in ("no signal", "sensor fault"):
+            if over or decision.state in ("no signal", "unreadable", "sensor fault"):
                 self.now = replace(self.now, reaction=None)
             if (current := self.now.event) is not None:
                 quiet = quiet_reason(reactor.profile if reactor is not None else None, current)
@@ -456,6 +458,10 @@ class LiveReader:
         if self.now.event is not None:
             self._change_event(self.now.event, end_s=max(t_s, self.now.event.begin_s))
             self.now = replace(self.now, changes=self._changes)
+
+
+def _kept(_: str) -> None:
+    """Leave a warning to `LiveRun.warnings`, which the pages show."""
 
 
 def _no_bundle() -> ConfigError:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from plushsense.core.errors import PlushSenseError
+from plushsense.core.sentences import Sentence
 from plushsense.live.reactions import Reaction, Reactions
 
 Connection = Literal["", "connecting", "gone", "unreadable"]
@@ -130,6 +131,8 @@ class LiveState:
         running: whether a toy is being read.
         ended: the error that ended the reading, if any.
         connection: what keeps frames from arriving.
+        mismatch: why the lines of the toy cannot be read, "" if they can.
+        warnings: what differs from the training of the network.
         state: state in the last decision; "" if no toy is being read.
         answer: answer of the network at its last step, see `plushsense.runtime.classifier.Decision`.
         probabilities: class probabilities in the order of the bundle; None while there is no prediction.
@@ -147,6 +150,8 @@ class LiveState:
     running: bool = False
     ended: PlushSenseError | None = None
     connection: Connection = ""
+    mismatch: Sentence = field(default_factory=Sentence)
+    warnings: tuple[Sentence, ...] = ()
     state: str = ""
     t_s: float = 0.0
     answer: str | None = None
@@ -184,6 +189,8 @@ class LiveState:
             return self.connection
         if self.state == "no signal":
             return "silent"
+        if self.state == "unreadable":
+            return "unreadable"
         if self.connection:
             return "connecting"
         if self.state == "sensor fault":

@@ -35,7 +35,7 @@ KEYS = "keys"
 # Pseudonymised dates are later than this time in ms since 1970 (see `dataset.privacy.pseudonyms`).
 _MOVED_MS = 4_102_444_800_000
 _TOOLS = {
-    "publish": ("mlcroissant", "frictionless", "rocrate", "datacite"),
+    "publish": ("mlcroissant", "frictionless", "datacite"),
     "baselines": ("sklearn",),
 }
 
@@ -143,7 +143,7 @@ def _files(folder: Path | None, packed: Path | None) -> dict[str, int]:
     if packed is not None:
         try:
             with zipfile.ZipFile(packed) as archive:
-                return {i.filename.partition("/")[2]: i.file_size for i in archive.infolist() if not i.is_dir()}
+                return {i.filename: i.file_size for i in archive.infolist() if not i.is_dir()}
         except (OSError, zipfile.BadZipFile):
             return {}
     return {}
@@ -162,10 +162,10 @@ def _contents(folder: Path | None, packed: Path | None) -> dict[str, tuple[int, 
 
 
 def _zip_root(packed: Path | None) -> zipfile.Path | None:
-    """Return the top-level folder in a zip, or None if the zip cannot be read."""
+    """Return the content of a zip, or None if the zip cannot be read."""
     try:
-        return next(zipfile.Path(packed).iterdir()) if packed is not None else None
-    except (OSError, StopIteration, zipfile.BadZipFile):
+        return zipfile.Path(packed) if packed is not None else None
+    except (OSError, zipfile.BadZipFile):
         return None
 
 

@@ -62,7 +62,7 @@ class PseudonymsForm:
 
 _TASKS = ("publish", "validate", "pseudonymise")
 _STAGES = {"recognising people": "recognising", "writing": "writing", "rewriting": "rewriting"}
-_SWITCHES = ("streams", "excluded", "bids", "reidentification", "thorough")
+_SWITCHES = ("streams", "excluded", "reidentification", "thorough")
 
 
 async def show(page: Page) -> None:

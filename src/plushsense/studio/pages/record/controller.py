@@ -12,7 +12,7 @@ from plushsense.core.layouts import Layout, layout_names
 from plushsense.core.sentences import Sentence
 from plushsense.core.toml import builtin_names
 from plushsense.core.version import __version__
-from plushsense.devices.lsl import LslMarkers
+from plushsense.devices.lsl import MARKERS, LslMarkers
 from plushsense.devices.opening import parse_url
 from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.recording.plan import save_protocol
@@ -49,8 +49,6 @@ LAYOUTS = "layouts"
 NO_CONSENT, PSEUDO = "no_consent", "pseudo"
 """Notices shown before recording; each is the key of a text in the table ``record``."""
 SOFTWARE = f"plushsense {__version__} studio"
-MARKERS = "PlushSense markers"
-"""Name of the LSL stream of a session's markers."""
 
 
 @dataclass

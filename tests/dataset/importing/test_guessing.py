@@ -1,0 +1,319 @@
+"""What `import --guess` takes for what: labels, people, clocks, counters, ranges, and JSON of other programs."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plushsense.core.errors import DatasetError
+from plushsense.dataset.importing import guessing
+from plushsense.dataset.importing.guessing import GuessedPattern, guess_pattern
+from plushsense.dataset.importing.importers import preview_import
+from plushsense.dataset.importing.preview import ImportPreview
+
+GESTURES = ("hug", "tap")
+
+
+def guessed(src: Path) -> tuple[dict[str, Any], GuessedPattern, ImportPreview]:
+    """Guess the pattern of ``src``; return its keys, the guess, and the preview of an import by it."""
+    guess = guess_pattern(src)
+    guess.write(src.parent / "guess.toml")
+    return tomllib.loads(guess.toml), guess, preview_import(src, pattern=src.parent / "guess.toml")
+
+
+def names(found: dict[str, Any]) -> list[str]:
+    return [channel["name"] for channel in found["layout"]["channels"]]
+
+
+def noise(rows: int, seed: int) -> list[float]:
+    return [round(float(value), 2) for value in np.random.default_rng(seed).normal(0, 3, rows)]
+
+
+def table(path: Path, columns: dict[str, list[Any]]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = [",".join(columns), *(",".join(map(str, row)) for row in zip(*columns.values(), strict=True))]
+    path.write_text("\n".join(rows) + "\n")
+
+
+def touches(path: Path, seed: int, rows: int = 60, **more: list[Any]) -> None:
+    table(path, {"t_ms": [20 * k for k in range(rows)], "left": noise(rows, seed), **more})
+
+
+def test_parts_of_a_data_set_are_neither_labels_nor_people(tmp_path: Path) -> None:
+    for seed, (split, gesture, take) in enumerate(
+        (s, g, t) for s in ("Training", "val", "Test") for g in GESTURES for t in range(3)
+    ):
+        touches(tmp_path / "src" / split / gesture / f"rep{take}.csv", seed)
+    found, guess, seen = guessed(tmp_path / "src")
+    assert found["paths"] == ["*/{label}/{recording}.csv"]
+    assert (seen.gestures, seen.subjects) == ({"hug": 9, "tap": 9}, ["unknown"])
+    assert "the label is taken from the path: 'hug' of Test/hug/rep0.csv and 'tap' of Test/tap/rep0.csv" in guess.doubts
+    assert "the folders Test, Training, val are parts of a data set, neither labels nor people" in guess.doubts
+    assert any("--subjects map.csv" in doubt for doubt in guess.doubts)
+    assert any("people are not known" in note for note in seen.warnings)
+
+
+def test_a_part_that_differs_in_every_file_is_the_take(tmp_path: Path) -> None:
+    for seed in range(8):
+        touches(tmp_path / "src" / f"{GESTURES[seed % 2]}_x{7919 * (seed + 11):x}q.csv", seed)
+    found, guess, seen = guessed(tmp_path / "src")
+    assert found["paths"] == ["{label}_{recording}.csv"]
+    assert seen.subjects == ["unknown"]
+    assert any("differs in every file, so that it is taken for the take" in doubt for doubt in guess.doubts)
+
+
+def test_people_by_number_before_or_behind_the_gesture_are_listed(tmp_path: Path) -> None:
+    for seed, (person, gesture, take) in enumerate((p, g, t) for p in "123" for g in GESTURES for t in "12"):
+        touches(tmp_path / "src" / person / f"{gesture}_{take}.csv", seed)
+        touches(tmp_path / "names" / f"{['ann', 'bob', 'cy'][int(person) - 1]}" / f"{gesture}_{take}.csv", seed)
+    for src, people in (("src", ["1", "2", "3"]), ("names", ["ann", "bob", "cy"])):
+        found, guess, seen = guessed(tmp_path / src)
+        (tmp_path / "guess.toml").unlink()
+        assert found["paths"] == ["{subject}/{label}_{recording}.csv"]
+        assert (seen.subjects, seen.gestures) == (people, {"hug": 6, "tap": 6})
+        listed = f"'{people[0]}' of {people[0]}/hug_1.csv and '{people[1]}' of {people[1]}/hug_1.csv"
+        assert f"the person is taken from the path: {listed}" in guess.doubts
+
+
+def test_clocks_and_counters_are_no_channels_whatever_they_are_called(tmp_path: Path) -> None:
+    for seed, gesture in enumerate(GESTURES * 3):
+        rows = 300
+        jitter = np.random.default_rng(seed).integers(0, 6, rows)
+        touches(
+            tmp_path / "src" / f"P{seed // 2}" / f"{gesture}.csv",
+            seed,
+            rows,
+            elapsed=[0.02 * k + 0.001 * j for k, j in enumerate(jitter.tolist())],
+            packet=[(k + 100 * seed) % 256 for k in range(rows)],
+            total=[5 * k + 1000 * seed for k in range(rows)],
+            remaining=[9000 - 20 * k for k in range(rows)],
+            warmth=[round(20 + 0.3 * seed + 0.001 * (seed + 1) * k, 3) for k in range(rows)],
+            wheel=[k % 7 for k in range(rows)],
+        )
+    found, guess, _ = guessed(tmp_path / "src")
+    assert names(found) == ["left", "warmth", "wheel"]
+    assert [doubt.split("'")[1] for doubt in guess.doubts if "not for a channel" in doubt] == [
+        "elapsed",
+        "packet",
+        "total",
+        "remaining",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("code", "(4, 5, 6), so that it is taken for the label"), ("Gesture", "are numbers")]
+)
+def test_few_whole_numbers_that_change_rarely_are_the_label(tmp_path: Path, name: str, said: str) -> None:
+    for seed in range(3):
+        codes = [k // 100 % 3 + 4 for k in range(900)]
+        touches(
+            tmp_path / "src" / f"P{seed}.csv", seed, 900, **{name: codes, "belly": [k // 150 % 2 for k in range(900)]}
+        )
+    found, guess, seen = guessed(tmp_path / "src")
+    assert names(found) == ["left", "belly"], "a cell that is touched has two values"
+    assert seen.gestures == {"4": 9, "5": 9, "6": 9}
+    assert any(said in doubt for doubt in guess.doubts)
+
+
+def test_whole_numbers_that_change_rarely_are_no_channel_beside_a_label(tmp_path: Path) -> None:
+    for seed, (person, gesture) in enumerate((p, g) for p in ("P1", "P2") for g in GESTURES):
+        touches(tmp_path / "src" / person / f"{gesture}.csv", seed, trial_number=[seed] * 60)
+    found, guess, _ = guessed(tmp_path / "src")
+    assert (found["paths"], names(found)) == (["{subject}/{label}.csv"], ["left"])
+    assert any("'trial_number' has whole numbers that change rarely (0, 1, 2, 3)" in d for d in guess.doubts)
+
+
+@pytest.mark.parametrize(
+    ("axes", "vector"),
+    [
+        (("aX", "aY", "aZ"), ["ax", "ay", "az"]),
+        (("accX", "accY", "accZ"), ["accx", "accy", "accz"]),
+        (("acc_x", "acc_y", "acc_z"), ["acc_x", "acc_y", "acc_z"]),
+        (("Accelerometer_x", "Accelerometer_y", "Accelerometer_z"), [f"accelerometer_{a}" for a in "xyz"]),
+        (("X", "Y", "Z"), ["x", "y", "z"]),
+        (("x_acc", "y_acc", "z_acc"), ["x_acc", "y_acc", "z_acc"]),
+        (("ax (m/s2)", "ay (m/s2)", "az (m/s2)"), ["ax_m_s2", "ay_m_s2", "az_m_s2"]),
+    ],
+)
+def test_accelerations_by_their_names_have_one_range(tmp_path: Path, axes: tuple[str, ...], vector: list[str]) -> None:
+    for seed, (person, gesture) in enumerate((p, g) for p in ("P1", "P2") for g in GESTURES):
+        values = {axis: [round(v * 4**k, 2) for v in noise(60, seed)] for k, axis in enumerate(axes)}
+        others = {"gX": noise(60, 9), "accuracy": noise(60, 8), "max_force": noise(60, 7)}
+        touches(tmp_path / "src" / person / f"{gesture}.csv", seed, 60, **values, **others)
+    found, guess, _ = guessed(tmp_path / "src")
+    assert found["layout"]["vectors"] == [vector]
+    channels = {channel["name"]: channel for channel in found["layout"]["channels"]}
+    assert {name for name, channel in channels.items() if channel["kind"] == "acceleration"} == set(vector)
+    assert len({(channels[name]["valid_min"], channels[name]["valid_max"]) for name in vector}) == 1
+    assert sum("is guessed (±" in doubt for doubt in guess.doubts) == 1
+
+
+def test_cells_of_files_with_other_columns_are_not_used(tmp_path: Path) -> None:
+    for seed, person in enumerate(("P1", "P2", "P3")):
+        touches(tmp_path / "src" / person / "touch.csv", seed, 60, gesture=["hug"] * 30 + ["tap"] * 30)
+        questions = {"question": [1, 2, 3], "answer": ["yes", "no", "maybe"], "seconds": [3, 4, 2]}
+        table(tmp_path / "src" / person / "answers.csv", questions)
+    found, guess, seen = guessed(tmp_path / "src")
+    assert "missing" not in found
+    assert found["exclude"] == [f"{person}/answers.csv" for person in ("P1", "P2", "P3")]
+    assert (seen.gestures, seen.rejected) == ({"hug": 3, "tap": 3}, [])
+    assert any("files without such rows are left out: P1/answers.csv" in doubt for doubt in guess.doubts)
+
+
+def test_a_document_of_json_is_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "src").mkdir()
+    recordings = [
+        {"subject": f"P{k % 2}", "label": GESTURES[k // 2], "time_ms": list(range(0, 5000, 10)), "left": noise(500, k)}
+        for k in range(4)
+    ]
+    text = json.dumps(recordings, indent=1)
+    assert text.count("\n") > guessing._LINES
+    (tmp_path / "src" / "all.json").write_text(text)
+    found, _, seen = guessed(tmp_path / "src")
+    assert (names(found), found["layout"]["rate_hz"]) == (["left"], 100.0)
+    assert (seen.recordings, seen.subjects, seen.gestures) == (4, ["P0", "P1"], {"hug": 2, "tap": 2})
+    monkeypatch.setattr(guessing, "_MOST_JSON", 1000)
+    with pytest.raises(DatasetError, match="one JSON document of 0 MB, too long to be guessed from"):
+        guess_pattern(tmp_path / "src")
+
+
+@pytest.mark.parametrize(("key", "rate_hz"), [("ID", 40.0), ("id", 50.0)])
+def test_actions_of_microbit_createai(tmp_path: Path, key: str, rate_hz: float) -> None:
+    (tmp_path / "src").mkdir()
+    for person in (1, 2):
+        actions = [
+            {
+                "icon": icon,
+                key: 17 + k,
+                "name": gesture,
+                "matrix": [True, False] * 12,
+                "recordings": [
+                    {key: 1000 * k + n, "data": {axis: noise(48 + n, 9 * k + n) for axis in "xyz"}} for n in range(3)
+                ],
+            }
+            for k, (icon, gesture) in enumerate(zip(("Heart", "No", "Yes"), (*GESTURES, "never"), strict=True))
+        ]
+        actions[2]["recordings"] = []
+        (tmp_path / "src" / f"P{person}.json").write_text(json.dumps(actions, indent=2))
+    found, guess, seen = guessed(tmp_path / "src")
+    assert (names(found), found["layout"]["vectors"]) == (["x", "y", "z"], [["x", "y", "z"]])
+    assert found["row_rate_hz"] == found["layout"]["rate_hz"] == rate_hz
+    assert (seen.recordings, seen.gestures) == (12, {"hug": 6, "tap": 6})
+    assert seen.rows[1].time_ms == 1000 / rate_hz
+    assert seen.warnings == []
+    assert any("micro:bit CreateAI" in doubt for doubt in guess.doubts)
+    assert "lists within objects are taken for recordings: 12 in 6 objects" in guess.doubts
+    assert any("'name' is taken for the label: 'hug', 'tap'" in doubt for doubt in guess.doubts)
+
+
+def test_files_of_edge_impulse_have_their_own_interval_label_and_sensors(tmp_path: Path) -> None:
+    sensors = [{"name": "accX", "units": "m/s2"}, {"name": "accY", "units": "m/s2"}, {"name": "accZ", "units": "m/s2"}]
+    for number, (split, gesture) in enumerate((s, g) for s in ("training", "testing") for g in (*GESTURES, "at rest")):
+        rows = list(zip(*(noise(50, 10 * number + k) for k in range(3)), strict=True))
+        order = [2, 1, 0] if number == 5 else [0, 1, 2]
+        payload = {
+            "device_name": f"aa:bb:{number % 2}",
+            "device_type": "TOY",
+            "interval_ms": 20 if number == 4 else 10,
+            "sensors": [sensors[k] for k in order],
+            "values": [[row[k] for k in order] for row in rows],
+        }
+        (tmp_path / "src" / split).mkdir(parents=True, exist_ok=True)
+        (tmp_path / "src" / split / f"{gesture}.json.3a{number}f.ingestion-5.json").write_text(
+            json.dumps({"protected": {"ver": "v1"}, "signature": "00" * 32, "payload": payload})
+        )
+    found, guess, seen = guessed(tmp_path / "src")
+    assert found["paths"] == ["*/{label:[^.]+}.{recording}.json"]
+    assert found["columns"]["interval_ms"] == "payload.interval_ms"
+    assert found["columns"]["accx"] == "payload.sensors.accX"
+    assert (found["layout"]["rate_hz"], found["layout"]["vectors"]) == (100.0, [["accx", "accy", "accz"]])
+    assert seen.gestures == {"at rest": 2, "hug": 2, "tap": 2}
+    by_file = {row.file: row for row in seen.rows[1::2]}
+    steps = {name.split("/")[0] + "/" + name.split("/")[1].split(".")[0]: row.time_ms for name, row in by_file.items()}
+    assert {steps[name] for name in steps if name == "training/tap" or name == "testing/tap"} <= {10, 20}
+    assert {row.time_ms for row in seen.rows} == {0, 10, 20}, "each file has its own interval"
+    assert any("the label is taken from the path" in doubt for doubt in guess.doubts)
+    assert not any("binary channels" in doubt for doubt in guess.doubts)
+
+
+def test_samples_in_json_are_no_recordings(tmp_path: Path) -> None:
+    (tmp_path / "src").mkdir()
+    for person in (1, 2):
+        lines = [
+            {
+                "label": gesture,
+                "samples": [{"t": 20 * k, "acc": [k, 1, v], "cells": [1] * 9} for k, v in enumerate(noise(40, n))],
+            }
+            for n, gesture in enumerate(GESTURES)
+        ]
+        (tmp_path / "src" / f"P{person}.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    _, _, seen = guessed(tmp_path / "src")
+    assert (seen.recordings, seen.gestures) == (4, {"hug": 2, "tap": 2})
+
+
+def test_numbers_without_columns_are_refused_with_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "src").mkdir()
+    (tmp_path / "src" / "a.json").write_text("[[1, 2], [3, 4]]")
+    with pytest.raises(DatasetError, match="it has no columns of one length"):
+        guess_pattern(tmp_path / "src")
+
+
+def test_a_number_of_takes_beside_the_label_tells_recordings_apart(tmp_path: Path) -> None:
+    (tmp_path / "src").mkdir()
+    for seed in range(2):
+        rows = 40 * 50
+        columns = {
+            "gesture": [GESTURES[k // 1000] for k in range(rows)],
+            "sample_id": [k // 40 for k in range(rows)],
+            "t_ms": [20 * k for k in range(rows)],
+            "left": noise(rows, seed),
+        }
+        table(tmp_path / "src" / f"P{seed}.csv", columns)
+    found, guess, seen = guessed(tmp_path / "src")
+    assert (found["columns"], names(found)) == ({"recording": "sample_id"}, ["left"])
+    assert seen.recordings == 100
+    assert any("'sample_id'" in d and "taken for the take" in d for d in guess.doubts)
+
+
+def test_a_second_word_for_the_gesture_is_no_person(tmp_path: Path) -> None:
+    for seed, (gesture, take) in enumerate((g, t) for g in ("squeeze", "stroke") for t in range(4)):
+        other = {"squeeze": "press", "stroke": "slide down"}[gesture]
+        touches(tmp_path / "src" / gesture / f"{other}_{take}.csv", seed)
+    found, _, seen = guessed(tmp_path / "src")
+    assert found["paths"] == ["{label}/*_{recording}.csv"]
+    assert (seen.gestures, seen.subjects) == ({"squeeze": 4, "stroke": 4}, ["unknown"])
+
+
+def test_names_that_end_in_a_date_are_not_those_of_the_gesture_recorder(tmp_path: Path) -> None:
+    for seed in range(6):
+        label = [seed % 3] * 60
+        touches(tmp_path / "src" / f"data_{seed % 3}_20251106_21150{seed}.csv", seed, 60, label=label)
+    found, _, seen = guessed(tmp_path / "src")
+    assert names(found) == ["left"]
+    assert (seen.recordings, sorted(seen.gestures)) == (6, ["0", "1", "2"])
+
+
+def test_a_number_of_the_row_is_no_clock(tmp_path: Path) -> None:
+    for seed, (person, gesture) in enumerate((p, g) for p in ("P1", "P2") for g in GESTURES):
+        table(tmp_path / "src" / person / f"{gesture}.csv", {"n": list(range(60)), "left": noise(60, seed)})
+    found, guess, _ = guessed(tmp_path / "src")
+    assert (found["row_rate_hz"], names(found)) == (50.0, ["left"])
+    assert any("have no clock" in doubt for doubt in guess.doubts)
+
+
+def test_recordings_of_which_one_lacks_a_channel_can_be_guessed_from(tmp_path: Path) -> None:
+    (tmp_path / "src").mkdir()
+    recordings = [
+        {"label": GESTURES[k % 2], "t_ms": list(range(0, 600 + 20 * k, 20)), "left": noise(30 + k, k)} for k in range(4)
+    ]
+    recordings[0]["right"], recordings[2]["right"] = noise(30, 7), noise(32, 8)
+    recordings[1]["tags"] = ["a", "b"]
+    (tmp_path / "src" / "P1.jsonl").write_text("\n".join(map(json.dumps, recordings)))
+    found, _, seen = guessed(tmp_path / "src")
+    assert names(found) == ["left", "right"]
+    assert any("without a number in every column left out" in note for note in seen.warnings)
