@@ -332,13 +332,6 @@ def litert_here() -> None:
 
 
 @pytest.fixture(scope="session")
-def espdl_here() -> None:
-    """Espressif's quantizer (extra espdl), which wants an environment of its own."""
-    if importlib.util.find_spec("esp_ppq") is None:
-        missing("espdl", "esp-ppq is not installed")
-
-
-@pytest.fixture(scope="session")
 def scikit_learn() -> None:
     """Scikit-learn (extra baselines)."""
     if importlib.util.find_spec("sklearn") is None:

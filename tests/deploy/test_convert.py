@@ -19,7 +19,6 @@ from plushsense.core.recorder_csv import read_stream
 from plushsense.deploy.convert import ConversionJob, compared, convert, describe, made_up_windows
 from plushsense.deploy.convert import onnx as as_onnx
 from plushsense.deploy.convert import tflite as as_tflite
-from plushsense.deploy.convert.espdl import plain_model
 from plushsense.deploy.quantize import calibrated, integer_network
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
@@ -205,7 +204,7 @@ def test_a_vector_layer_is_written_to_onnx_only(layout: str, tmp_path: Path, onn
     found = as_onnx.run_model(convert(bundle, tmp_path / "n", "onnx-int8").path.read_bytes(), values(bundle, raw))
     expected = integer_network(bundle).forward(raw) / 256
     assert found is not None and np.abs(found - expected).max() < 0.01 * max(1.0, np.abs(expected).max())
-    for name in ("tflite", "tflite-int8", "espdl"):
+    for name in ("tflite", "tflite-int8"):
         with pytest.raises(ArchError, match="begins with a vector layer, which PlushSense does not write to"):
             convert(bundle, tmp_path / "o", name)
 
@@ -421,9 +420,7 @@ def test_an_unknown_format_names_the_known_ones(tmp_path: Path) -> None:
         convert(made(NETS[1]), tmp_path / "m", "tflit")
 
 
-@pytest.mark.parametrize(
-    ("name", "module"), [("onnx", "onnx"), ("tflite", "ai_edge_litert.schema_py_generated"), ("espdl", "onnx")]
-)
+@pytest.mark.parametrize(("name", "module"), [("onnx", "onnx"), ("tflite", "ai_edge_litert.schema_py_generated")])
 def test_a_missing_package_says_how_to_install_it(
     name: str, module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -440,33 +437,3 @@ def test_int8_refuses_what_has_no_whole_numbers(name: str, tmp_path: Path) -> No
     with pytest.raises(ArchError, match="padding 'causal'"):
         convert(made(NETS[-2]), tmp_path / "m", name)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("net", [NETS[3], NETS[4]], ids=str)
-def test_espdl_refuses_what_cannot_be_folded(net: Any, tmp_path: Path) -> None:
-    with pytest.raises(ArchError, match="train 9d1_5d3 with"):
-        convert(made(net), tmp_path / "m", "espdl")
-
-
-@pytest.mark.parametrize("net", [NETS[0], NETS[-1]], ids=str)
-def test_the_folded_network_that_esp_ppq_reads_answers_as_the_network(net: Any, onnx_here: None) -> None:
-    import onnxruntime
-
-    bundle = made(net)
-    session = onnxruntime.InferenceSession(plain_model(bundle).SerializeToString(), providers=["CPUExecutionProvider"])
-    scaled = bundle.scaler.apply(others(bundle))
-    assert [[i.name, i.shape] for i in session.get_inputs()] == [["scaled", [1, *scaled.shape[1:]]]]
-    found = np.concatenate([session.run(["logits"], {"scaled": window[None]})[0] for window in scaled])
-    expected = bundle.network().forward(scaled)
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
-
-
-def test_espdl_in_its_own_simulation(tmp_path: Path, espdl_here: None, capfd: pytest.CaptureFixture[str]) -> None:
-    bundle = made(NETS[2])
-    for name in ("espdl", "espdl-esp32", "espdl-esp32p4"):
-        done = convert(bundle, tmp_path / name, name, windows=others(bundle, 32)[:-1])
-        assert done.path.read_bytes()[:4] == b"EDL2"
-        expected = bundle.network().forward(bundle.scaler.apply(others(bundle, 32)))
-        assert done.largest_difference is not None
-        assert done.largest_difference < 0.25 * np.abs(expected).max()
-        assert capfd.readouterr().out == "", "standard output belongs to --json"

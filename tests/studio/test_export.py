@@ -129,7 +129,7 @@ def test_a_link_takes_nothing_along(little: Workspace, tmp_path: Path) -> None:
 
 def test_formats_that_lack_something(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("plushsense.studio.pages.export.exports.importlib.util.find_spec", lambda name: None)
-    assert formats()["onnx-int8"] == "onnx" and formats()["tflite"] == "tflite" and formats()["espdl-esp32"] == "espdl"
+    assert formats()["onnx-int8"] == "onnx" and formats()["tflite"] == "tflite"
 
 
 def test_the_newest_work_on_a_place(little: Workspace) -> None:

@@ -81,9 +81,6 @@ CONVERTERS: dict[str, Format] = {
     "onnx-int8": Format("model.int8.onnx", "ONNX, int8 with QuantizeLinear", "onnx:to_integer_onnx"),
     "tflite": Format("model.tflite", "LiteRT, floats", "tflite:to_tflite"),
     "tflite-int8": Format("model.int8.tflite", "LiteRT, int8 convolutions", "tflite:to_integer_tflite"),
-    "espdl": Format("model.espdl", "ESP-DL for the ESP32-S3, int8", "espdl:to_esp32s3"),
-    "espdl-esp32": Format("model.esp32.espdl", "ESP-DL for the ESP32, int8", "espdl:to_esp32"),
-    "espdl-esp32p4": Format("model.esp32p4.espdl", "ESP-DL for the ESP32-P4, int8", "espdl:to_esp32p4"),
 }
 
 
@@ -136,7 +133,7 @@ def convert(bundle: Bundle, path: str | Path, format_name: str, *, windows: NDAr
 
 @dataclass(frozen=True)
 class ConversionJob:
-    """Input of a converter: the bundle, and raw windows (N, C, T) for calibration and comparison.
+    """Input of a converter: the bundle, and raw windows (N, C, T) for comparison.
 
     The first ``given`` windows are from the caller, the others are generated.
     """
@@ -158,11 +155,6 @@ class ConversionJob:
             given = windows[:, :, windows.shape[2] - bundle.arch.span :].astype(np.int64)
             all_windows = np.concatenate([given, all_windows])
         return cls(bundle, all_windows, 0 if windows is None else len(windows))
-
-    def thinned(self, most: int) -> ConversionJob:
-        """Return the job with at most ``most`` of the given windows, evenly spaced, and all generated ones."""
-        given = self.windows[: self.given][:: max(1, -(-self.given // most))]
-        return replace(self, windows=np.concatenate([given, self.windows[self.given :]]), given=len(given))
 
     @property
     def tried(self) -> str:

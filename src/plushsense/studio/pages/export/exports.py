@@ -23,7 +23,6 @@ from plushsense.studio.app.workspace import EXPORTS, Workspace
 _NEEDS = {
     "onnx": ("onnx", ("onnx", "onnxruntime")),
     "tflite": ("tflite", ("ai_edge_litert", "flatbuffers")),
-    "espdl": ("espdl", ("onnx", "esp_ppq", "torch")),
 }
 """The extra and the modules that an export format needs, by the first word of the format's name."""
 
