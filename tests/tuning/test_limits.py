@@ -34,7 +34,7 @@ def made(tmp_path):
             frames = stream(values)
             (folder / "fulldatastream.csv").write_text(format_rows(frames, ACCEL))
             write_recording(folder / f"tap_{int(frames.host_ms[249])}_200.csv", frames.slice(50, 250), ACCEL)
-        return import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3").dataset
+        return import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3", adopt_proposals=False).dataset
 
     return make
 

@@ -25,6 +25,8 @@ from plushsense.dataset.quality.outliers import find_failed_readings
 from plushsense.dataset.store import Dataset, RecordingInfo
 
 DEFAULT_WINDOW_S = 2.5
+# Clocks have whole milliseconds: a faster one has rows in another unit than it says.
+_FASTEST_HZ = 1000.0
 # A rate is proposed if the measured one differs by this factor, a zero if it is this share of the radius away.
 _RATE_FACTOR = 1.25
 _ZERO_SHARE = 0.15
@@ -268,6 +270,8 @@ def _rate_and_gap(dataset: Dataset) -> Iterator[Proposal]:
     if not rates:
         return
     rate = float(np.median(rates))
+    if rate > _FASTEST_HZ:
+        return
     if not 1 / _RATE_FACTOR < rate / layout.rate_hz < _RATE_FACTOR:
         yield Proposal(
             "rate_hz",
