@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import pkgutil
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
