@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from plushsense.dataset.importing.table_files import date_ms
 CODE_NAMES = ("label", "gesture", "activity", "class", "event", "action")
 # Labels as numbers: at most so many whole numbers, which change in a smaller share of the rows than this.
 MOST_CODES, _SELDOM = 30, 0.05
+# Fewer rows that follow another prove nothing about the order of texts.
+_LEAST_CHANGES = 20
 
 
 @dataclass
@@ -106,6 +109,12 @@ class SampledColumn:
             return []
         seldom = float(np.mean(self.steps != 0)) < _SELDOM
         return [int(value) for value in distinct] if seldom and (len(distinct) <= MOST_CODES or self.counts) else []
+
+    @property
+    def alternates(self) -> bool:
+        """Whether the cells of a file change in most of its rows, as names of sensors that are read in turn do."""
+        changes = [a != b for cells in self.parts for a, b in pairwise(cells)]
+        return not self.of_recording and len(changes) >= _LEAST_CHANGES and sum(changes) > 0.5 * len(changes)
 
     @property
     def counts(self) -> bool:

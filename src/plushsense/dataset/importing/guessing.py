@@ -66,12 +66,14 @@ _LABEL_NAMES = ("label", "gesture", "activity", *LABELS)
 _PERSON_NAMES = ("subject", "participant", "person", "user", "child", "who")
 # acc_x, x_acc, accX, aX, Accelerometer_x, and x, y, z alone; not accuracy.
 _ACCELERATION = re.compile(r"(?<![a-z])(acc(?!u)|accel|a_?[xyz](?![a-z]))|acc(el)?_?[xyz]?$|^[xyz](_\d+)?$")
-_NO_CHANNEL = re.compile(r"(index|row|frame|sample|no|nr|id|count_?er|unnamed.*|#)?", re.IGNORECASE)
+_AXES = ({"x", "y", "z"}, {"0", "1", "2"})
+_NO_CHANNEL = re.compile(r"index|row|frame|sample|no|nr|id|count_?er|unnamed.*|#", re.IGNORECASE)
 # The share of its rows that a recording of the GestureRecorder keeps when it is cut is above 1 / this.
 _MOST_CUT = 20
 _TAKE = re.compile(r"(^|_)(id|sample|take|trial|rep|repetition|recording|segment|window|block|session)", re.IGNORECASE)
 # Files of micro:bit CreateAI name no rate; older ones write ID, newer ones id.
 _MICROBIT_HZ = {"recordings.ID": 40.0, "recordings.id": 50.0}
+_RATE = re.compile(r"(sampl(e|ing)_?)?(frequency|freq|rate)(_?hz)?|fs|hz|sps", re.IGNORECASE)
 # Objects around channels in JSON that say nothing about them.
 _AROUND = re.compile(r"^((recordings|payload|data|sensors|values|samples)\.(?!\d+$))+")
 
@@ -326,7 +328,8 @@ def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[Sample
     _row_blocks([samples[k] for k in like], head, guess)
     for k, name in enumerate(names):
         seen[name.casefold()] += 1
-        key = f"{name}#{seen[name.casefold()]}" if counts[name.casefold()] > 1 else name or f"#{k + 1}"
+        # Columns without a name are counted among all columns.
+        key = f"{name}#{seen[name.casefold()]}" if name and counts[name.casefold()] > 1 else name or f"#{k + 1}"
         columns.append(
             SampledColumn(name, key, [[row[k] for row in rows] for rows in data], guess.keys.get("decimal", "."))
         )
@@ -446,6 +449,7 @@ def _roles(columns: list[SampledColumn], guess: _PatternDraft) -> None:
         take(INTERVAL, interval)
         guess.rate_hz = float(f"{1000.0 / float(np.median(interval.values)):.3g}")
     else:
+        guess.rate_hz = guess.rate_hz or (_stated_rate(columns, guess) if time is None else 0.0)
         _clock(take("time", time), guess)
     guess.times = time.moments if time is not None else []
     texts = [c for c in left if not c.is_numeric and c.words and not c.is_date]
@@ -455,6 +459,7 @@ def _roles(columns: list[SampledColumn], guess: _PatternDraft) -> None:
         take(role, next((c for c in left if c.name.casefold() in ROLES[role]), None))
     texts = [c for c in texts if c in left]
     take("label", _label(texts, left, guess))
+    _unused(left, guess)
     missing: Counter[str] = Counter()
     for column in [c for c in left if c.is_numeric and not c.of_recording]:
         kind = no_reading(_with_times(column, guess.times))
@@ -471,6 +476,15 @@ def _roles(columns: list[SampledColumn], guess: _PatternDraft) -> None:
         guess.keys["missing"] = sorted(missing)
         guess.doubts.append(f"the words {', '.join(sorted(missing))} are taken for missing values")
     _vectors(guess)
+
+
+def _unused(left: list[SampledColumn], guess: _PatternDraft) -> None:
+    """Add a doubt about columns that hold texts in place of numbers: a sensor that was off, or a description."""
+    texts = [c for c in left if not c.is_numeric and c.words and not c.of_recording]
+    if texts:
+        listed = ", ".join(f"'{c.key}' ('{next(iter(c.words))[:30]}')" for c in texts[:_FEW])
+        more = ", …" if len(texts) > _FEW else ""
+        guess.doubts.append(f"columns with texts are no channels: {listed}{more}")
 
 
 def _readable_clock(
@@ -524,6 +538,14 @@ def _label(texts: list[SampledColumn], left: list[SampledColumn], guess: _Patter
             if 1 < len(c.words) <= MOST_LABELS and INTERVAL not in guess.columns
             if len(c.words) < len(c.parts) or any(len(set(cells)) > 1 for cells in c.parts)
         ]
+        mixed = [c for c in few if c.alternates]
+        for column in mixed:
+            listed = ", ".join(repr(word) for word in list(column.words)[:2])
+            guess.doubts.append(
+                f"the column '{column.key}' changes from row to row ({listed}), so that it is not taken for the label: "
+                "if it names sensors, their rows are mixed; write a table with a column for each sensor"
+            )
+        few = [c for c in few if c not in mixed]
         label = next(iter([*(c for c in few if _ends(c.key.casefold(), "name")), *few]), None)
         if label is not None:
             listed = ", ".join(repr(word) for word in list(label.words)[:2])
@@ -551,7 +573,9 @@ def _codes(parts: PathParts, guess: _PatternDraft) -> None:
             guess.columns["recording"] = column.key
             guess.doubts.append(f"{seen} taken for the take: a recording ends where it changes")
         else:
-            guess.doubts.append(f"{seen} no channel: if it is a sensor, add it to channels")
+            guess.doubts.append(
+                f"{seen} no channel: if it is a sensor, add it to channels, and if it is the label, to columns"
+            )
     if not labelled:
         guess.doubts.append("the label of a recording was not found: put {label} into paths, or give its column")
 
@@ -625,8 +649,24 @@ def _exclude(without: list[Path], samples: list[Path], guess: _PatternDraft) -> 
     guess.doubts.append(f"files without such rows are left out: {listed}")
 
 
+def _stated_rate(columns: Sequence[SampledColumn], guess: _PatternDraft) -> float:
+    """Return the rate that values beside the samples state, such as ``emg.frequency``; 0 without one, or with several.
+
+    A doubt says where it stands.
+    """
+    stating = [c for c in columns if c.of_recording and c.is_numeric and _RATE.fullmatch(c.key.rpartition(".")[2])]
+    rates = {float(value) for c in stating for value in c.values}
+    if len(rates) != 1 or not 1.0 <= min(rates) <= 10_000.0:
+        return 0.0
+    guess.doubts.append(f"the files have no clock: the rate is that of '{stating[0].key}', {min(rates):g}")
+    guess.keys["row_rate_hz"] = rate = rates.pop()
+    return rate
+
+
 def _clock(time: SampledColumn | None, guess: _PatternDraft) -> None:
     """Find the unit of the times, and the rate."""
+    if time is None and "row_rate_hz" in guess.keys:
+        return
     if time is None:
         guess.doubts.append(
             f"the files have no clock; micro:bit CreateAI has {guess.rate_hz:g} rows a second with this key (40: ID, "
@@ -658,6 +698,7 @@ def _channel(name: str, kind: str, **more: Any) -> dict[str, Any]:
 def _measured(column: SampledColumn, guess: _PatternDraft) -> dict[str, Any]:
     """Return the channel of a column of numbers: its kind, and a step that keeps its decimals."""
     key = _AROUND.sub("", column.key) if guess.is_json else column.key
+    key = f"c{key[1:]}" if not column.name else key
     name = re.sub(r"\W+", "_", key.casefold()).strip("_") or f"channel{len(guess.channels) + 1}"
     if name != column.name.casefold() or column.key != column.name:
         guess.columns[name] = column.key
@@ -679,7 +720,7 @@ def _measured(column: SampledColumn, guess: _PatternDraft) -> dict[str, Any]:
 
 
 def _vectors(guess: _PatternDraft) -> None:
-    """Find triples of accelerations whose names differ only in x, y and z."""
+    """Find triples of accelerations whose names differ only in x, y and z, or that are a list of three in JSON."""
     by_stem: dict[str, dict[str, str]] = {}
     for channel in guess.channels:
         text = channel["name"].replace("_", " ")
@@ -687,7 +728,13 @@ def _vectors(guess: _PatternDraft) -> None:
         if channel["kind"] == "acceleration" and axis is not None and (at := axis.lastindex):
             stem = channel["name"][: axis.start(at)] + "?" + channel["name"][axis.end(at) :]
             by_stem.setdefault(stem, {})[axis[at]] = channel["name"]
-    guess.vectors = [[axes[a] for a in "xyz"] for axes in by_stem.values() if len(axes) == 3]
+        elif (
+            channel["kind"] == "acceleration"
+            and guess.is_json
+            and (item := re.fullmatch(r"(.+_)(\d+)", channel["name"]))
+        ):
+            by_stem.setdefault(item[1], {})[item[2]] = channel["name"]
+    guess.vectors = [[axes[a] for a in sorted(axes)] for axes in by_stem.values() if set(axes) in _AXES]
     _ranges(guess)
 
 
