@@ -381,3 +381,20 @@ def test_the_rate_that_json_states_is_used(tmp_path: Path) -> None:
     # A list of three accelerations is a vector, whose axes have one range.
     assert [len(vector) for vector in found["layout"]["vectors"]] == [3]
     assert len({channel["valid_max"] for channel in found["layout"]["channels"]}) == 1
+
+
+@pytest.mark.parametrize("head", ["0,1,2", ",0,1,2", "1,2,3,label"])
+def test_numbers_of_columns_are_no_row(tmp_path: Path, head: str) -> None:
+    for seed, (gesture, take) in enumerate((g, t) for g in GESTURES for t in range(3)):
+        rows = [f"{x},{y},{z}" for x, y, z in zip(*(noise(60, 3 * seed + k) for k in range(3)), strict=True)]
+        rows = [f"{k},{row}" if head.startswith(",") else row for k, row in enumerate(rows)]
+        rows = [f"{row},{gesture}" if "label" in head else row for row in rows]
+        path = tmp_path / "src" / gesture / f"take{take}.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join([head, *rows]) + "\n")
+    found, guess, seen = guessed(tmp_path / "src")
+    assert len(names(found)) == 3 and all(name.startswith("c") for name in names(found))
+    assert (seen.gestures, seen.rows[0].time_ms) == ({"hug": 3, "tap": 3}, 0)
+    first = [noise(60, k)[0] for k in range(3)]
+    assert list(seen.rows[0].values.values()) == pytest.approx(first)
+    assert not any("no line of column names" in doubt for doubt in guess.doubts)

@@ -61,6 +61,8 @@ _USUAL_HZ = 50.0
 _SEPARATORS = ("\t", ";", "|", ",", " ")
 _MOST_STEPS = 1e7
 _LEAST_ROWS, _COUNTED = 20, 200
+# Two columns that read 0 and 1, or 1 and 2, may be readings.
+_LEAST_NUMBERED = 3
 _IDLE_LABELS = frozenset(("0", "null", "null class", "none", "idle", "nothing", "background", "no gesture", "noise"))
 _LABEL_NAMES = ("label", "gesture", "activity", *LABELS)
 _PERSON_NAMES = ("subject", "participant", "person", "user", "child", "who")
@@ -255,8 +257,18 @@ def _form(rows: list[list[str]], width: int) -> TableForm:
     """Find the row of names, and the first row of data, of a table with rows of ``width`` cells."""
     begin = next((k for k, row in enumerate(rows) if len(row) == width and any(map(is_number, row))), len(rows))
     heads = [k for k in range(begin) if len(rows[k]) == width and any(cell.strip() for cell in rows[k])]
+    if not heads and begin + 1 < len(rows) and _numbers_columns(rows[begin]):
+        heads, begin = [begin], begin + 1
     names = tuple(cell.strip() for cell in rows[heads[0]]) if heads else ("",) * width
     return TableForm(names, heads[0] if heads else None, begin)
+
+
+def _numbers_columns(row: Sequence[str]) -> bool:
+    """Return whether a row numbers the columns: 0, 1, 2, … or 1, 2, 3, …, as pandas writes names of an array."""
+    numbers = [cell.strip() for cell in row if is_number(cell)]
+    return len(numbers) >= _LEAST_NUMBERED and any(
+        numbers == [str(first + k) for k in range(len(numbers))] for first in (0, 1)
+    )
 
 
 def _same(names: Sequence[str], others: Sequence[str]) -> bool:
@@ -698,7 +710,8 @@ def _channel(name: str, kind: str, **more: Any) -> dict[str, Any]:
 def _measured(column: SampledColumn, guess: _PatternDraft) -> dict[str, Any]:
     """Return the channel of a column of numbers: its kind, and a step that keeps its decimals."""
     key = _AROUND.sub("", column.key) if guess.is_json else column.key
-    key = f"c{key[1:]}" if not column.name else key
+    # A channel has no number for a name, since it would look like a reading at the head of a table.
+    key = f"c{key.lstrip('#')}" if not column.name or column.name.isdecimal() else key
     name = re.sub(r"\W+", "_", key.casefold()).strip("_") or f"channel{len(guess.channels) + 1}"
     if name != column.name.casefold() or column.key != column.name:
         guess.columns[name] = column.key
