@@ -27,8 +27,10 @@ from plushsense.dataset.importing.columns import (
     MOST_CODES,
     SampledColumn,
     TableForm,
+    find_form,
     is_number,
     named_column,
+    stated_rate,
 )
 from plushsense.dataset.importing.counters import CLOCK, COUNTER, Floats, no_reading
 from plushsense.dataset.importing.intervals import interval_columns
@@ -61,8 +63,6 @@ _USUAL_HZ = 50.0
 _SEPARATORS = ("\t", ";", "|", ",", " ")
 _MOST_STEPS = 1e7
 _LEAST_ROWS, _COUNTED = 20, 200
-# Two columns that read 0 and 1, or 1 and 2, may be readings.
-_LEAST_NUMBERED = 3
 _IDLE_LABELS = frozenset(("0", "null", "null class", "none", "idle", "nothing", "background", "no gesture", "noise"))
 _LABEL_NAMES = ("label", "gesture", "activity", *LABELS)
 _PERSON_NAMES = ("subject", "participant", "person", "user", "child", "who")
@@ -75,7 +75,6 @@ _MOST_CUT = 20
 _TAKE = re.compile(r"(^|_)(id|sample|take|trial|rep|repetition|recording|segment|window|block|session)", re.IGNORECASE)
 # Files of micro:bit CreateAI name no rate; older ones write ID, newer ones id.
 _MICROBIT_HZ = {"recordings.ID": 40.0, "recordings.id": 50.0}
-_RATE = re.compile(r"(sampl(e|ing)_?)?(frequency|freq|rate)(_?hz)?|fs|hz|sps", re.IGNORECASE)
 # Objects around channels in JSON that say nothing about them.
 _AROUND = re.compile(r"^((recordings|payload|data|sensors|values|samples)\.(?!\d+$))+")
 
@@ -253,24 +252,6 @@ def _json_text(path: Path, guess: _PatternDraft) -> str:
     return _text(path, guess, _MOST_JSON + 1)
 
 
-def _form(rows: list[list[str]], width: int) -> TableForm:
-    """Find the row of names, and the first row of data, of a table with rows of ``width`` cells."""
-    begin = next((k for k, row in enumerate(rows) if len(row) == width and any(map(is_number, row))), len(rows))
-    heads = [k for k in range(begin) if len(rows[k]) == width and any(cell.strip() for cell in rows[k])]
-    if not heads and begin + 1 < len(rows) and _numbers_columns(rows[begin]):
-        heads, begin = [begin], begin + 1
-    names = tuple(cell.strip() for cell in rows[heads[0]]) if heads else ("",) * width
-    return TableForm(names, heads[0] if heads else None, begin)
-
-
-def _numbers_columns(row: Sequence[str]) -> bool:
-    """Return whether a row numbers the columns: 0, 1, 2, … or 1, 2, 3, …, as pandas writes names of an array."""
-    numbers = [cell.strip() for cell in row if is_number(cell)]
-    return len(numbers) >= _LEAST_NUMBERED and any(
-        numbers == [str(first + k) for k in range(len(numbers))] for first in (0, 1)
-    )
-
-
 def _same(names: Sequence[str], others: Sequence[str]) -> bool:
     return sorted(name.casefold() for name in names) == sorted(name.casefold() for name in others)
 
@@ -278,7 +259,7 @@ def _same(names: Sequence[str], others: Sequence[str]) -> bool:
 def _fits(lines: list[str], guess: _PatternDraft) -> bool:
     """Return whether a file begins with the columns that were found, and has a row of them."""
     rows = list(_cells(lines, guess.separator))
-    form = _form(rows, guess.width)
+    form = find_form(rows, guess.width)
     return guess.form is not None and form.begin < len(rows) and _same(form.names, guess.form.names)
 
 
@@ -308,7 +289,7 @@ def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[Sample
     width, separator = _separator(samples)
     guess.width, guess.separator = width, separator
     tables = [list(_cells(lines, separator)) for lines in samples]
-    forms = [_form(rows, width) for rows in tables]
+    forms = [find_form(rows, width) for rows in tables]
     data = [[row for row in rows[form.begin :] if len(row) == width] for rows, form in zip(tables, forms, strict=True)]
     most: Counter[tuple[str, ...]] = Counter()
     for form, rows in zip(forms, data, strict=True):
@@ -461,7 +442,9 @@ def _roles(columns: list[SampledColumn], guess: _PatternDraft) -> None:
         take(INTERVAL, interval)
         guess.rate_hz = float(f"{1000.0 / float(np.median(interval.values)):.3g}")
     else:
-        guess.rate_hz = guess.rate_hz or (_stated_rate(columns, guess) if time is None else 0.0)
+        if time is None and not guess.rate_hz and (stated := stated_rate(columns)) is not None:
+            guess.rate_hz = guess.keys["row_rate_hz"] = stated[1]
+            guess.doubts.append(f"the files have no clock: the rate is that of '{stated[0]}', {stated[1]:g}")
         _clock(take("time", time), guess)
     guess.times = time.moments if time is not None else []
     texts = [c for c in left if not c.is_numeric and c.words and not c.is_date]
@@ -659,20 +642,6 @@ def _exclude(without: list[Path], samples: list[Path], guess: _PatternDraft) -> 
     guess.keys["exclude"] = [re.sub("[{}?]", "?", text) for text in dict.fromkeys(texts)]
     listed = ", ".join(path.as_posix() for path in without[:_FEW]) + (", …" if len(without) > _FEW else "")
     guess.doubts.append(f"files without such rows are left out: {listed}")
-
-
-def _stated_rate(columns: Sequence[SampledColumn], guess: _PatternDraft) -> float:
-    """Return the rate that values beside the samples state, such as ``emg.frequency``; 0 without one, or with several.
-
-    A doubt says where it stands.
-    """
-    stating = [c for c in columns if c.of_recording and c.is_numeric and _RATE.fullmatch(c.key.rpartition(".")[2])]
-    rates = {float(value) for c in stating for value in c.values}
-    if len(rates) != 1 or not 1.0 <= min(rates) <= 10_000.0:
-        return 0.0
-    guess.doubts.append(f"the files have no clock: the rate is that of '{stating[0].key}', {min(rates):g}")
-    guess.keys["row_rate_hz"] = rate = rates.pop()
-    return rate
 
 
 def _clock(time: SampledColumn | None, guess: _PatternDraft) -> None:
