@@ -85,6 +85,17 @@ def test_a_pattern_is_guessed_tried_and_used(cli: Cli, tmp_path: Path) -> None:
     assert cli("import", tmp_path / "src", tmp_path / "DS", "--pattern", pattern, "--json").json["recordings"] == 8
 
 
+def test_a_dry_run_counts_no_unknown_person(cli: Cli, tmp_path: Path) -> None:
+    for label in ("hug", "tap"):
+        rows = "".join(f"{20 * i},{i * i % 7}.5\n" for i in range(50))
+        (tmp_path / "src" / label).mkdir(parents=True)
+        (tmp_path / "src" / label / "1.csv").write_text("time_ms,left\n" + rows)
+    cli("import", tmp_path / "src", "--guess", tmp_path / "p.toml")
+    tried = cli("import", tmp_path / "src", "--pattern", tmp_path / "p.toml", "--dry-run")
+    assert "2 recordings of 0 people, 0 streams" in tried.out
+    assert "the people are not known" in tried.err
+
+
 def test_a_dry_run_of_sessions(cli: Cli, tmp_path: Path) -> None:
     session(tmp_path / "out" / "P1" / "s1", "P1", 1)
     found = cli("import", tmp_path / "out", "--dry-run", "--json").json

@@ -8,7 +8,9 @@ from typing import Any
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, say, table
 from plushsense.core.errors import ConfigError
+from plushsense.core.gestures import NOBODY
 from plushsense.core.sentences import plural
+from plushsense.dataset.store import UNKNOWN_SUBJECT
 from plushsense.jobs.progress import ProgressReporter
 
 _MOST_WARNINGS = 20
@@ -69,6 +71,7 @@ def _dry_run(args: argparse.Namespace, given: dict[str, Any]) -> int:
         + ["invalid" if row["values"][c] is None else format(row["values"][c], "g") for c in shown]
         for row in found["rows"]
     ]
+    people = set(found["subjects"]) - {NOBODY, UNKNOWN_SUBJECT}
     gestures = ", ".join(f"{label} ({n})" for label, n in found["gestures"].items())
     emit(
         args,
@@ -76,7 +79,7 @@ def _dry_run(args: argparse.Namespace, given: dict[str, Any]) -> int:
         [
             table(["person", "session", "gesture", "time in ms", *shown], rows),
             *more,
-            f"{plural(found['recordings'], 'recording')} of {plural(len(found['subjects']), 'person')}, "
+            f"{plural(found['recordings'], 'recording')} of {plural(len(people), 'person')}, "
             f"{plural(found['streams'], 'stream')}, layout {found['layout']}; nothing was written",
             *([f"gestures: {gestures}"] if gestures else []),
         ],

@@ -317,3 +317,84 @@ def test_recordings_of_which_one_lacks_a_channel_can_be_guessed_from(tmp_path: P
     found, _, seen = guessed(tmp_path / "src")
     assert names(found) == ["left", "right"]
     assert any("without a number in every column left out" in note for note in seen.warnings)
+
+
+def test_columns_without_a_name_are_channels_by_their_place(tmp_path: Path) -> None:
+    for seed, gesture in enumerate(GESTURES * 2):
+        lines = [",Ch1,,Ch2,,Ch3"]
+        lines += [
+            f"{k},{value},{change},{20 * k},{value * 2 + change},OL"
+            for k, (value, change) in enumerate(zip(noise(40, seed), noise(40, seed + 9), strict=True))
+        ]
+        path = tmp_path / "src" / gesture / f"take{seed}.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join(lines) + "\n")
+    found, guess, seen = guessed(tmp_path / "src")
+    # The third and the fifth column have no name; the first one counts the rows.
+    assert [found["columns"].get(name) for name in names(found)] == [None, "#3", "#5"]
+    assert names(found) == ["ch1", "c3", "c5"]
+    assert found["columns"]["time"] == "Ch2"
+    first = next(row for row in seen.rows if row.gesture == "hug")
+    assert sorted(first.values.values()) == pytest.approx(sorted(noise_row(0)))
+    assert "columns with texts are no channels: 'Ch3' ('OL')" in guess.doubts
+
+
+def noise_row(seed: int) -> list[float]:
+    value, change = noise(40, seed)[0], noise(40, seed + 9)[0]
+    return [value, change, value * 2 + change]
+
+
+def test_names_of_sensors_that_are_read_in_turn_are_no_labels(tmp_path: Path) -> None:
+    for seed, (gesture, take) in enumerate((g, t) for g in ("up", "down") for t in range(3)):
+        touches(tmp_path / "src" / gesture / f"{gesture}-{take}.csv", seed, tag=["t7", "t9", "t9", "t8"] * 15)
+    found, guess, seen = guessed(tmp_path / "src")
+    assert "label" not in found.get("columns", {})
+    assert (seen.gestures, seen.subjects) == ({"down": 3, "up": 3}, ["unknown"])
+    assert any("the column 'tag' changes from row to row ('t7', 't9')" in doubt for doubt in guess.doubts)
+
+
+@pytest.mark.parametrize("folder", ["", "Trial{}", "all/Trial{}"])
+def test_a_number_behind_the_label_is_the_take(tmp_path: Path, folder: str) -> None:
+    for seed, (trial, gesture, take) in enumerate((n, g, t) for n in (1, 2) for g in GESTURES for t in (0, 1, 12)):
+        if folder or trial == 1:
+            touches(tmp_path / "src" / folder.format(trial) / f"emg_{gesture}{take}.csv", seed)
+    found, guess, seen = guessed(tmp_path / "src")
+    assert seen.gestures == ({"hug": 6, "tap": 6} if folder else {"hug": 3, "tap": 3})
+    pattern = r"all/{recording}/emg_{label:.*\D}*.csv" if "all" in folder else r"emg_{label:.*\D}{recording}.csv"
+    assert found["paths"] == [("*/" if folder == "Trial{}" else "") + pattern]
+    assert seen.subjects == ["unknown"]
+    assert any("'hug0' and 'hug1' in the path are taken for one label" in doubt for doubt in guess.doubts)
+
+
+def test_the_rate_that_json_states_is_used(tmp_path: Path) -> None:
+    for seed, gesture in enumerate(GESTURES * 2):
+        rows = [[round(x / 9, 2) for x in noise(3, 90 * seed + k)] for k in range(60)]
+        path = tmp_path / "src" / gesture / f"take{seed}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(
+            json.dumps({"duration": 300, "imu": {"frequency": 200, "data": [{"acceleration": r} for r in rows]}})
+        )
+    found, guess, seen = guessed(tmp_path / "src")
+    assert (found["row_rate_hz"], found["layout"]["rate_hz"]) == (200.0, 200.0)
+    assert seen.rows[1].time_ms == 5
+    assert "the files have no clock: the rate is that of 'imu.frequency', 200" in guess.doubts
+    # A list of three accelerations is a vector, whose axes have one range.
+    assert [len(vector) for vector in found["layout"]["vectors"]] == [3]
+    assert len({channel["valid_max"] for channel in found["layout"]["channels"]}) == 1
+
+
+@pytest.mark.parametrize("head", ["0,1,2", ",0,1,2", "1,2,3,label"])
+def test_numbers_of_columns_are_no_row(tmp_path: Path, head: str) -> None:
+    for seed, (gesture, take) in enumerate((g, t) for g in GESTURES for t in range(3)):
+        rows = [f"{x},{y},{z}" for x, y, z in zip(*(noise(60, 3 * seed + k) for k in range(3)), strict=True)]
+        rows = [f"{k},{row}" if head.startswith(",") else row for k, row in enumerate(rows)]
+        rows = [f"{row},{gesture}" if "label" in head else row for row in rows]
+        path = tmp_path / "src" / gesture / f"take{take}.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join([head, *rows]) + "\n")
+    found, guess, seen = guessed(tmp_path / "src")
+    assert len(names(found)) == 3 and all(name.startswith("c") for name in names(found))
+    assert (seen.gestures, seen.rows[0].time_ms) == ({"hug": 3, "tap": 3}, 0)
+    first = [noise(60, k)[0] for k in range(3)]
+    assert list(seen.rows[0].values.values()) == pytest.approx(first)
+    assert not any("no line of column names" in doubt for doubt in guess.doubts)

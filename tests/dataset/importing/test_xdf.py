@@ -229,7 +229,7 @@ def test_numbers_are_gestures_only_if_they_are_chosen_or_named(
     codes = texts(xdf_stream, "codes", (50.5, [3]), (51.0, [0]), (51.5, [7]), (52.0, [0]), format="int32")
     path = xdf_writer(tmp_path / "sub-A.xdf", [toy, codes])
     with pytest.raises(
-        DatasetError, match=r"'codes' \(#2\) of int32: '3', '0', '7': a gesture set .*--column markers=NAME"
+        DatasetError, match=r"'codes' \(#2\) of int32: '3', '0', '7': a gesture set .*--column markers=codes takes"
     ):
         import_recordings(path, tmp_path / "DS", layout="accel-3")
     done = import_recordings(path, tmp_path / "DS", layout="accel-3", columns={"markers": "codes"})

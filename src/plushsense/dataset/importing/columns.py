@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,6 +18,11 @@ from plushsense.dataset.importing.table_files import date_ms
 CODE_NAMES = ("label", "gesture", "activity", "class", "event", "action")
 # Labels as numbers: at most so many whole numbers, which change in a smaller share of the rows than this.
 MOST_CODES, _SELDOM = 30, 0.05
+# Fewer rows that follow another prove nothing about the order of texts.
+_LEAST_CHANGES = 20
+# Two columns that read 0 and 1, or 1 and 2, may be readings.
+_LEAST_NUMBERED = 3
+_RATE = re.compile(r"(sampl(e|ing)_?)?(frequency|freq|rate)(_?hz)?|fs|hz|sps", re.IGNORECASE)
 
 
 @dataclass
@@ -108,6 +114,12 @@ class SampledColumn:
         return [int(value) for value in distinct] if seldom and (len(distinct) <= MOST_CODES or self.counts) else []
 
     @property
+    def alternates(self) -> bool:
+        """Whether the cells of a file change in most of its rows, as names of sensors that are read in turn do."""
+        changes = [a != b for cells in self.parts for a, b in pairwise(cells)]
+        return not self.of_recording and len(changes) >= _LEAST_CHANGES and sum(changes) > 0.5 * len(changes)
+
+    @property
     def counts(self) -> bool:
         """Whether the numbers go up by one, or stay, as those of takes do."""
         return bool(np.all(np.isin(self.steps, (0.0, 1.0)))) and len(np.unique(self.values)) > 2
@@ -135,3 +147,28 @@ def named_column(columns: Sequence[SampledColumn], names: Iterable[str]) -> Samp
     plain = [(c, c.name.strip().casefold()) for c in columns]
     exact = next((c for c, name in plain if {name, *name.split(".")} & set(known)), None)
     return exact or next((c for c, name in plain if any(k in name for k in known if len(k) > 3)), None)
+
+
+def find_form(rows: list[list[str]], width: int) -> TableForm:
+    """Find the row of names, and the first row of data, of a table with rows of ``width`` cells."""
+    begin = next((k for k, row in enumerate(rows) if len(row) == width and any(map(is_number, row))), len(rows))
+    heads = [k for k in range(begin) if len(rows[k]) == width and any(cell.strip() for cell in rows[k])]
+    if not heads and begin + 1 < len(rows) and _numbers_columns(rows[begin]):
+        heads, begin = [begin], begin + 1
+    names = tuple(cell.strip() for cell in rows[heads[0]]) if heads else ("",) * width
+    return TableForm(names, heads[0] if heads else None, begin)
+
+
+def _numbers_columns(row: Sequence[str]) -> bool:
+    """Return whether a row numbers the columns: 0, 1, 2, … or 1, 2, 3, …, as pandas writes names of an array."""
+    numbers = [cell.strip() for cell in row if is_number(cell)]
+    return len(numbers) >= _LEAST_NUMBERED and any(
+        numbers == [str(first + k) for k in range(len(numbers))] for first in (0, 1)
+    )
+
+
+def stated_rate(columns: Sequence[SampledColumn]) -> tuple[str, float] | None:
+    """Return the key and the value of the one rate beside the samples, such as ``emg.frequency``; None without one."""
+    stating = [c for c in columns if c.of_recording and c.is_numeric and _RATE.fullmatch(c.key.rpartition(".")[2])]
+    rates = {float(value) for c in stating for value in c.values}
+    return (stating[0].key, rates.pop()) if len(rates) == 1 and 1.0 <= min(rates) <= 10_000.0 else None

@@ -27,8 +27,10 @@ from plushsense.dataset.importing.columns import (
     MOST_CODES,
     SampledColumn,
     TableForm,
+    find_form,
     is_number,
     named_column,
+    stated_rate,
 )
 from plushsense.dataset.importing.counters import CLOCK, COUNTER, Floats, no_reading
 from plushsense.dataset.importing.intervals import interval_columns
@@ -66,7 +68,8 @@ _LABEL_NAMES = ("label", "gesture", "activity", *LABELS)
 _PERSON_NAMES = ("subject", "participant", "person", "user", "child", "who")
 # acc_x, x_acc, accX, aX, Accelerometer_x, and x, y, z alone; not accuracy.
 _ACCELERATION = re.compile(r"(?<![a-z])(acc(?!u)|accel|a_?[xyz](?![a-z]))|acc(el)?_?[xyz]?$|^[xyz](_\d+)?$")
-_NO_CHANNEL = re.compile(r"(index|row|frame|sample|no|nr|id|count_?er|unnamed.*|#)?", re.IGNORECASE)
+_AXES = ({"x", "y", "z"}, {"0", "1", "2"})
+_NO_CHANNEL = re.compile(r"index|row|frame|sample|no|nr|id|count_?er|unnamed.*|#", re.IGNORECASE)
 # The share of its rows that a recording of the GestureRecorder keeps when it is cut is above 1 / this.
 _MOST_CUT = 20
 _TAKE = re.compile(r"(^|_)(id|sample|take|trial|rep|repetition|recording|segment|window|block|session)", re.IGNORECASE)
@@ -249,14 +252,6 @@ def _json_text(path: Path, guess: _PatternDraft) -> str:
     return _text(path, guess, _MOST_JSON + 1)
 
 
-def _form(rows: list[list[str]], width: int) -> TableForm:
-    """Find the row of names, and the first row of data, of a table with rows of ``width`` cells."""
-    begin = next((k for k, row in enumerate(rows) if len(row) == width and any(map(is_number, row))), len(rows))
-    heads = [k for k in range(begin) if len(rows[k]) == width and any(cell.strip() for cell in rows[k])]
-    names = tuple(cell.strip() for cell in rows[heads[0]]) if heads else ("",) * width
-    return TableForm(names, heads[0] if heads else None, begin)
-
-
 def _same(names: Sequence[str], others: Sequence[str]) -> bool:
     return sorted(name.casefold() for name in names) == sorted(name.casefold() for name in others)
 
@@ -264,7 +259,7 @@ def _same(names: Sequence[str], others: Sequence[str]) -> bool:
 def _fits(lines: list[str], guess: _PatternDraft) -> bool:
     """Return whether a file begins with the columns that were found, and has a row of them."""
     rows = list(_cells(lines, guess.separator))
-    form = _form(rows, guess.width)
+    form = find_form(rows, guess.width)
     return guess.form is not None and form.begin < len(rows) and _same(form.names, guess.form.names)
 
 
@@ -294,7 +289,7 @@ def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[Sample
     width, separator = _separator(samples)
     guess.width, guess.separator = width, separator
     tables = [list(_cells(lines, separator)) for lines in samples]
-    forms = [_form(rows, width) for rows in tables]
+    forms = [find_form(rows, width) for rows in tables]
     data = [[row for row in rows[form.begin :] if len(row) == width] for rows, form in zip(tables, forms, strict=True)]
     most: Counter[tuple[str, ...]] = Counter()
     for form, rows in zip(forms, data, strict=True):
@@ -326,7 +321,8 @@ def _text_columns(samples: list[list[str]], guess: _PatternDraft) -> list[Sample
     _row_blocks([samples[k] for k in like], head, guess)
     for k, name in enumerate(names):
         seen[name.casefold()] += 1
-        key = f"{name}#{seen[name.casefold()]}" if counts[name.casefold()] > 1 else name or f"#{k + 1}"
+        # Columns without a name are counted among all columns.
+        key = f"{name}#{seen[name.casefold()]}" if name and counts[name.casefold()] > 1 else name or f"#{k + 1}"
         columns.append(
             SampledColumn(name, key, [[row[k] for row in rows] for rows in data], guess.keys.get("decimal", "."))
         )
@@ -446,6 +442,9 @@ def _roles(columns: list[SampledColumn], guess: _PatternDraft) -> None:
         take(INTERVAL, interval)
         guess.rate_hz = float(f"{1000.0 / float(np.median(interval.values)):.3g}")
     else:
+        if time is None and not guess.rate_hz and (stated := stated_rate(columns)) is not None:
+            guess.rate_hz = guess.keys["row_rate_hz"] = stated[1]
+            guess.doubts.append(f"the files have no clock: the rate is that of '{stated[0]}', {stated[1]:g}")
         _clock(take("time", time), guess)
     guess.times = time.moments if time is not None else []
     texts = [c for c in left if not c.is_numeric and c.words and not c.is_date]
@@ -455,6 +454,7 @@ def _roles(columns: list[SampledColumn], guess: _PatternDraft) -> None:
         take(role, next((c for c in left if c.name.casefold() in ROLES[role]), None))
     texts = [c for c in texts if c in left]
     take("label", _label(texts, left, guess))
+    _unused(left, guess)
     missing: Counter[str] = Counter()
     for column in [c for c in left if c.is_numeric and not c.of_recording]:
         kind = no_reading(_with_times(column, guess.times))
@@ -471,6 +471,15 @@ def _roles(columns: list[SampledColumn], guess: _PatternDraft) -> None:
         guess.keys["missing"] = sorted(missing)
         guess.doubts.append(f"the words {', '.join(sorted(missing))} are taken for missing values")
     _vectors(guess)
+
+
+def _unused(left: list[SampledColumn], guess: _PatternDraft) -> None:
+    """Add a doubt about columns that hold texts in place of numbers: a sensor that was off, or a description."""
+    texts = [c for c in left if not c.is_numeric and c.words and not c.of_recording]
+    if texts:
+        listed = ", ".join(f"'{c.key}' ('{next(iter(c.words))[:30]}')" for c in texts[:_FEW])
+        more = ", …" if len(texts) > _FEW else ""
+        guess.doubts.append(f"columns with texts are no channels: {listed}{more}")
 
 
 def _readable_clock(
@@ -524,6 +533,14 @@ def _label(texts: list[SampledColumn], left: list[SampledColumn], guess: _Patter
             if 1 < len(c.words) <= MOST_LABELS and INTERVAL not in guess.columns
             if len(c.words) < len(c.parts) or any(len(set(cells)) > 1 for cells in c.parts)
         ]
+        mixed = [c for c in few if c.alternates]
+        for column in mixed:
+            listed = ", ".join(repr(word) for word in list(column.words)[:2])
+            guess.doubts.append(
+                f"the column '{column.key}' changes from row to row ({listed}), so that it is not taken for the label: "
+                "if it names sensors, their rows are mixed; write a table with a column for each sensor"
+            )
+        few = [c for c in few if c not in mixed]
         label = next(iter([*(c for c in few if _ends(c.key.casefold(), "name")), *few]), None)
         if label is not None:
             listed = ", ".join(repr(word) for word in list(label.words)[:2])
@@ -551,7 +568,9 @@ def _codes(parts: PathParts, guess: _PatternDraft) -> None:
             guess.columns["recording"] = column.key
             guess.doubts.append(f"{seen} taken for the take: a recording ends where it changes")
         else:
-            guess.doubts.append(f"{seen} no channel: if it is a sensor, add it to channels")
+            guess.doubts.append(
+                f"{seen} no channel: if it is a sensor, add it to channels, and if it is the label, to columns"
+            )
     if not labelled:
         guess.doubts.append("the label of a recording was not found: put {label} into paths, or give its column")
 
@@ -627,6 +646,8 @@ def _exclude(without: list[Path], samples: list[Path], guess: _PatternDraft) -> 
 
 def _clock(time: SampledColumn | None, guess: _PatternDraft) -> None:
     """Find the unit of the times, and the rate."""
+    if time is None and "row_rate_hz" in guess.keys:
+        return
     if time is None:
         guess.doubts.append(
             f"the files have no clock; micro:bit CreateAI has {guess.rate_hz:g} rows a second with this key (40: ID, "
@@ -658,6 +679,8 @@ def _channel(name: str, kind: str, **more: Any) -> dict[str, Any]:
 def _measured(column: SampledColumn, guess: _PatternDraft) -> dict[str, Any]:
     """Return the channel of a column of numbers: its kind, and a step that keeps its decimals."""
     key = _AROUND.sub("", column.key) if guess.is_json else column.key
+    # A channel has no number for a name, since it would look like a reading at the head of a table.
+    key = f"c{key.lstrip('#')}" if not column.name or column.name.isdecimal() else key
     name = re.sub(r"\W+", "_", key.casefold()).strip("_") or f"channel{len(guess.channels) + 1}"
     if name != column.name.casefold() or column.key != column.name:
         guess.columns[name] = column.key
@@ -679,7 +702,7 @@ def _measured(column: SampledColumn, guess: _PatternDraft) -> dict[str, Any]:
 
 
 def _vectors(guess: _PatternDraft) -> None:
-    """Find triples of accelerations whose names differ only in x, y and z."""
+    """Find triples of accelerations whose names differ only in x, y and z, or that are a list of three in JSON."""
     by_stem: dict[str, dict[str, str]] = {}
     for channel in guess.channels:
         text = channel["name"].replace("_", " ")
@@ -687,7 +710,13 @@ def _vectors(guess: _PatternDraft) -> None:
         if channel["kind"] == "acceleration" and axis is not None and (at := axis.lastindex):
             stem = channel["name"][: axis.start(at)] + "?" + channel["name"][axis.end(at) :]
             by_stem.setdefault(stem, {})[axis[at]] = channel["name"]
-    guess.vectors = [[axes[a] for a in "xyz"] for axes in by_stem.values() if len(axes) == 3]
+        elif (
+            channel["kind"] == "acceleration"
+            and guess.is_json
+            and (item := re.fullmatch(r"(.+_)(\d+)", channel["name"]))
+        ):
+            by_stem.setdefault(item[1], {})[item[2]] = channel["name"]
+    guess.vectors = [[axes[a] for a in sorted(axes)] for axes in by_stem.values() if set(axes) in _AXES]
     _ranges(guess)
 
 

@@ -31,6 +31,9 @@ _GESTURES = re.compile(
 )
 
 
+_NUMBERED = re.compile(r"(.*[^\W\d_])(\d+)", re.DOTALL)
+
+
 @dataclass
 class PathParts:
     """Guessed parts of paths: their ``patterns``, the ``labels``, the parts that were ``found``, and ``doubts``."""
@@ -57,7 +60,13 @@ def guess_paths(
     depth = _usual_least([len(f.parts) for f in files])
     before = "**/" if any(len(f.parts) > depth for f in files) else ""
     rows, used = _pieces(files, ending, depth, dotted, doubts)
-    roles = _roles(rows, depth, taken, set(labels), dotted, doubts)
+    limits = {"label": ":[^.]+"} if dotted else {}
+    numbered = None if dotted or "label" in taken else _numbered(rows, depth, taken, set(labels), doubts)
+    if numbered is not None:
+        rows, roles = numbered
+        limits["label"] = r":.*\D"
+    else:
+        roles = _roles(rows, depth, taken, set(labels), dotted, doubts)
     doubts += _to_check(rows, used, roles, depth)
     if "subject" not in taken | set(roles):
         doubts.append(
@@ -66,7 +75,6 @@ def guess_paths(
         )
     # What is the same in all paths stands there as it is, but for the characters of patterns; a name of all files tells
     # nothing apart, and the next recording may have another.
-    limits = {"label": ":[^.]+"} if dotted else {}
     texts = [
         f"{{{role}{limits.get(role, '')}}}" if role in PARTS else role or re.sub("[{}*?]", "?", rows[0][k])
         for k, role in enumerate(roles)
@@ -137,6 +145,36 @@ def _pieces(
     if others := len(files) - len(rows):
         doubts.append(f"files whose paths are not like the others do not fit paths: {others}")
     return rows, used
+
+
+def _numbered(
+    rows: list[list[str]], depth: int, taken: set[str], labels: set[str], doubts: list[str]
+) -> tuple[list[list[str]], list[str]] | None:
+    """Split labels with a number behind them, such as ``tap1``; return pieces and roles, None without such labels.
+
+    Two words at least are needed, each with several numbers; words of people, takes, parts of a data set and devices
+    are no labels.
+    """
+    for k in range(depth - 1, len(rows[0])):
+        pairs = [match.groups() for row in rows if (match := _NUMBERED.fullmatch(row[k]))]
+        numbers = Counter(word for word, _ in set(pairs))
+        few = 2 <= len(numbers) <= MOST_LABELS and min(numbers.values()) > 1
+        known = all(any(p.fullmatch(row[k]) for p in (_PERSON, _TAKE, _SESSION)) for row in rows)
+        if len(pairs) < len(rows) or not few or known or _known(numbers, _SPLITS, _DEVICES):
+            continue
+        notes: list[str] = []
+        words = [[*row[:k], word, *row[k + 1 :]] for row, (word, _) in zip(rows, pairs, strict=True)]
+        roles = _roles(words, depth, taken, labels, False, notes)
+        if roles[k] == "label":
+            other = next(n for word, n in pairs if word == pairs[0][0] and n != pairs[0][1])
+            doubts += notes
+            doubts.append(
+                f"'{rows[0][k]}' and '{pairs[0][0]}{other}' in the path are taken for one label with a number behind "
+                "it: if they are two gestures, write {label} for both"
+            )
+            split = [[*row[:k], *pair, *row[k + 1 :]] for row, pair in zip(rows, pairs, strict=True)]
+            return split, [*roles[: k + 1], "*" if "recording" in taken | set(roles) else "recording", *roles[k + 1 :]]
+    return None
 
 
 def _usual_least(numbers: Sequence[int]) -> int:

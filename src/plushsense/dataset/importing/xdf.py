@@ -12,6 +12,7 @@ import io
 import logging
 import os
 import re
+import shlex
 import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -384,8 +385,9 @@ def _find_markers(
     hint = ""
     if events and not chosen:
         hint = f"; there are {listed}: a gesture set (--gestures FILE) says which are gestures"
-        if gestures is None and not all(s.is_text for s in events):
-            hint += ", or --column markers=NAME takes numbers as gestures"
+        if gestures is None and (numbers := [s for s in events if not s.is_text]):
+            name = numbers[0].name if len(numbers) == 1 and numbers[0].name else "NAME"
+            hint += f", or --column {shlex.quote(f'markers={name}')} takes numbers as gestures"
     return markers, others, hint
 
 
