@@ -397,10 +397,10 @@ def _valid_ranges(dataset: Dataset) -> Iterator[Proposal]:
     """Propose valid ranges without failed readings: the range of all others, and as much again on both sides."""
     failed = find_failed_readings(dataset)
     for proven in (True, False):
-        mine = [f for f in failed if f.certain == proven]
+        mine = [f for f in failed if proven == (not f.doubt)]
         reason = "; ".join(
             f"{f.n} of {f.of} readings of {f.channel} ({named(f.people)}) are far beyond all others, which are "
-            f"{f.low:g} to {f.high:g}" + ("" if proven else f", in up to {f.longest} rows in succession")
+            f"{f.low:g} to {f.high:g}" + (f.doubt and f", {f.doubt}")
             for f in mine
         )
         if mine:
