@@ -30,7 +30,7 @@ def toy_of_lines(lines: Iterable[bytes]) -> LineDevice:
     return LineDevice("tcp://lines", load_layout("accel-3"), LinesLink(lines), joining=False)
 
 
-DAMAGED = [b"%d 1 2 %s\n" % (10 * k, b"1F" if k % 3 == 2 else b"3") for k in range(300)]
+DAMAGED = [b"%d 1 2 %s\n" % (10 * k, b"1F" if k % 3 == 2 else b"3") for k in range(301)]
 """Lines of which every third cannot be read."""
 NAMED = [b"ms:%d,X:1,Y:2,Z:3\r\n" % (10 * k) for k in range(60)]
 """Lines as the plotter of the Arduino IDE reads them."""
