@@ -176,3 +176,7 @@ def test_every_list_in_a_sentence_has_words_for_an_empty_one() -> None:
         for line, text in unguarded(module.read_text(encoding="utf-8"))
     ]
     assert not found, "use plushsense.core.sentences.join_names, or add  or 'none':\n" + "\n".join(found)
+
+
+def test_of_many_names_the_first_are_listed() -> None:
+    assert [join_names("abc"[:n], most=2) for n in range(4)] == ["none", "a", "a, b", "a, b and 1 more"]

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from tests.support.sent_lines import NAMED, toy_of_lines
 
 from plushsense.core.errors import ConfigError, DeviceError, MissingExtraError
 from plushsense.core.layouts import Channel, CsvFormat, Layout, load_layout
@@ -300,6 +301,14 @@ def test_forward_wants_the_same_channels(name: str) -> None:
         pytest.raises(ConfigError, match="plush-15.*wide"),
     ):
         forward(device, outlet)
+
+
+@needs_lsl
+def test_forward_warns_of_lines_that_cannot_be_read(name: str) -> None:
+    warned: list[str] = []
+    with toy_of_lines(NAMED) as device, LslOutlet(device.layout, name) as outlet:
+        assert forward(device, outlet, warn=warned.append) == 0
+    assert len(warned) == 1 and "it has names before the numbers" in warned[0]
 
 
 @needs_lsl

@@ -9,8 +9,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
+from tests.support.sent_lines import DAMAGED, toy_of_lines
 
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import ConfigError, PlushSenseWarning
 from plushsense.core.recorder_csv import write_recording
 from plushsense.devices.base import Device, Frame
 from plushsense.devices.opening import open_device
@@ -177,10 +178,12 @@ def test_frames_after_the_messages_of_a_board_that_starts(bundle):
     assert live.summary().counters["malformed"] == 2
 
 
-def test_many_damaged_lines_among_frames_are_reported(bundle):
+def test_many_damaged_lines_among_frames_are_reported_once(bundle):
     warned: list[str] = []
-    lines = b"".join(b"%d 1 2 %s\n" % (10 * k, b"1F" if k % 3 == 0 else b"3") for k in range(120))
-    with talking(lines) as url, open_device(url) as device:
+    with toy_of_lines(DAMAGED) as device:
         live = run_live(device, StreamClassifier(bundle()), silence_s=5.0, warn=warned.append)
         assert "unreadable" not in {d.state for d in live}
     assert len(warned) == 1 and "lines of the toy cannot be read, such as" in warned[0] and "'1F' for z" in warned[0]
+    with toy_of_lines(DAMAGED) as device, pytest.warns(PlushSenseWarning) as issued:
+        assert sum(1 for _ in device) == 201
+    assert len(issued) == 1

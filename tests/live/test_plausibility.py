@@ -106,6 +106,17 @@ def test_another_unit_is_reported_for_a_network_without_gravity_too() -> None:
     assert len(told) == 1 and "it seems to send g" in told[0]
 
 
+@pytest.mark.parametrize("scaled", [True, False])
+def test_a_toy_that_is_held_the_other_way_round_is_not_reported(scaled: bool) -> None:
+    values = movement(1)
+    bundle = bundle_of(HAND, np.concatenate([values[:450], values[800:]]))  # lying, in two directions
+    if not scaled:
+        bundle = replace(bundle, scaler=Scaler.none(HAND.n_inputs))
+    held = movement(2)
+    held[:, 1:] *= -1
+    assert reported(bundle, held) == []
+
+
 def test_gravity_that_the_training_did_not_have_is_not_compared() -> None:
     values = movement(1, gravity=0.0)
     values[:, 1:] += np.rint(np.random.default_rng(5).normal(0, 3000, (len(values), 3))).astype(int)

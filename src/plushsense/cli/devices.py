@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from plushsense.cli.options import options
-from plushsense.cli.output import emit, say, table
+from plushsense.cli.output import emit, say, table, warn
 from plushsense.cli.settings import listed, report_stages
 from plushsense.cli.signals import interrupt_on_signals
 from plushsense.core.errors import ConfigError
@@ -47,7 +47,7 @@ def _publish(args: argparse.Namespace) -> int:
         emit(args, {"url": outlet.url, "device": device.url, "layout": device.layout.name}, outlet.url)
         say(f"publishing {device.url} ({device.layout.name}) as LSL stream '{outlet.name}'; Ctrl-C ends")
         try:
-            forward(device, outlet)
+            forward(device, outlet, warn=warn)
         except KeyboardInterrupt:
             say("stopped")
         finally:

@@ -27,7 +27,9 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import inspect
 import re
+import warnings
 from collections.abc import Iterable
 from types import ModuleType
 
@@ -72,6 +74,17 @@ class PlushSenseError(Exception):
 
 class PlushSenseWarning(UserWarning):
     """Something unusual that a function of the Python API reports by Python's `warnings`, as one sentence."""
+
+
+_PACKAGE = __name__.partition(".")[0]
+
+
+def python_warning(sentence: str) -> None:
+    """Issue a sentence by Python's `warnings`, as if by the line of the caller's program that called PlushSense."""
+    frame, level = inspect.currentframe(), 1
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == _PACKAGE:
+        frame, level = frame.f_back, level + 1
+    warnings.warn(printable(sentence), PlushSenseWarning, stacklevel=level)
 
 
 class BadInput(PlushSenseError):

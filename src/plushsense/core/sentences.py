@@ -45,9 +45,14 @@ class Sentence(str):
         return cls(table["message"], table["reason"], **table["values"])
 
 
-def join_names(names: Iterable[object], none: str = "none") -> str:
-    """Join names for a sentence, as in ``a, b``; ``none`` stands for no names, and '' for one that is blank."""
-    return ", ".join(text if (text := str(name)).strip() else "''" for name in names) or none
+def join_names(names: Iterable[object], none: str = "none", most: int | None = None) -> str:
+    """Join names for a sentence, as in ``a, b``; ``none`` stands for no names, and '' for one that is blank.
+
+    Of more than ``most`` names, the first are followed by the number of the others.
+    """
+    texts = [text if (text := str(name)).strip() else "''" for name in names]
+    more = f" and {len(texts) - most} more" if most is not None and len(texts) > most else ""
+    return (", ".join(texts[:most]) or none) + more
 
 
 def plural(n: int, noun: str) -> str:

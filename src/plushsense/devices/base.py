@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
-import warnings
 from abc import ABC, abstractmethod
 from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import NamedTuple, Self
 
-from plushsense.core.errors import PlushSenseWarning
+from plushsense.core.errors import python_warning
 from plushsense.core.layouts import Layout
 from plushsense.core.sentences import Sentence
 
@@ -206,15 +205,21 @@ class Device(ABC):
             self.closed = True
             self._shut()
 
-    def __iter__(self) -> Iterator[Frame]:
-        reported = ""
+    def batches(self, warn: Callable[[str], None] = python_warning) -> Iterator[list[Frame]]:
+        """Yield what `read` returns, until the device ends; call ``warn`` once with why lines cannot be read."""
+        reported = {""}
         while not self.closed:
             frames = self.read()
-            if not frames and self.mismatch != reported:
-                reported = self.mismatch
-                warnings.warn(str(reported), PlushSenseWarning, stacklevel=2)
+            mismatch = self.mismatch if not frames else Sentence()
+            if mismatch.reason not in reported:
+                reported.add(mismatch.reason)
+                warn(mismatch)
             if frames is None:
                 return
+            yield frames
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frames in self.batches():
             yield from frames
 
     def __enter__(self) -> Self:

@@ -269,7 +269,7 @@ class BleDevice(Device):
                 return await asyncio.wait_for(asyncio.shield(device_found), target.find_s)
         there = [f"{name} ({address})" for address, name in sorted(names.items(), key=lambda kv: kv[1]) if name]
         if there:
-            here = f"there are {', '.join(there[:8])}" + (f" and {len(there) - 8} more" if len(there) > 8 else "")
+            here = f"there are {join_names(there, most=8)}"
         else:
             here = f"there are {len(names)} without a name" if names else "nothing advertises here"
         if connected:

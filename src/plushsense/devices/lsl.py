@@ -8,13 +8,13 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 from urllib.parse import quote, unquote
 
-from plushsense.core.errors import ConfigError, DeviceError, need
+from plushsense.core.errors import ConfigError, DeviceError, need, python_warning
 from plushsense.core.layouts import DEVICE_MS, Layout
 from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Device, Frame, LossCounter, now_ms
@@ -362,8 +362,15 @@ class LslMarkers:
         self._outlet = None
 
 
-def forward(device: Device, outlet: LslOutlet, stop: threading.Event | None = None) -> int:
+def forward(
+    device: Device,
+    outlet: LslOutlet,
+    stop: threading.Event | None = None,
+    warn: Callable[[str], None] = python_warning,
+) -> int:
     """Publish the frames of a device until it ends or ``stop`` is set; return their number.
+
+    ``warn`` is called with a sentence on lines that cannot be read.
 
     Raises:
         ConfigError: if the channels of the device are not those of the outlet.
@@ -375,12 +382,11 @@ def forward(device: Device, outlet: LslOutlet, stop: threading.Event | None = No
             f"{outlet.layout.name}: make both with the same."
         )
     count = 0
-    while not device.closed and not (stop is not None and stop.is_set()):
-        frames = device.read()
-        if frames is None:
-            break
+    for frames in device.batches(warn):
         outlet.push(frames)
         count += len(frames)
+        if stop is not None and stop.is_set():
+            break
     return count
 
 

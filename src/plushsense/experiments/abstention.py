@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import BadInput, ConfigError, DatasetError
+from plushsense.core.errors import BadInput, ConfigError, DatasetError, python_warning
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
@@ -51,7 +51,6 @@ from plushsense.workflow.preparation import (
     choose_classes,
     network_inputs_of,
     outside_streams,
-    python_warning,
     windows_for,
 )
 from plushsense.workflow.reporting import check_folder, journal_of

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, nearest
+from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, nearest, python_warning
 from plushsense.core.files import temporary_folder
 from plushsense.dataset.files import CACHE
 from plushsense.dataset.importing.importers import import_recordings
@@ -39,7 +39,7 @@ from plushsense.scoring import metrics
 from plushsense.scoring.splits import Fold, parse_split, purge
 from plushsense.windows.cut import WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, python_warning, windows_for
+from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, windows_for
 from plushsense.workflow.reporting import keep_bundle
 
 Predictor = Callable[[WindowSet], NDArray[np.floating[Any]]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from plushsense.core.errors import ConfigError, PlushSenseWarning
+from plushsense.core.errors import ConfigError, python_warning
 from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Device, Frame
 from plushsense.live.plausibility import PlausibilityMonitor
@@ -64,10 +63,6 @@ class LiveSummary:
         return asdict(self) | rounded
 
 
-def _python_warning(sentence: str) -> None:
-    warnings.warn(str(sentence), PlushSenseWarning, stacklevel=2)
-
-
 class LiveRun(Iterator[Decision]):
     """A live run: iterate over it for decisions; call `summary` for its figures at any time.
 
@@ -88,7 +83,7 @@ class LiveRun(Iterator[Decision]):
         classifier: StreamReader,
         seconds: float | None,
         silence_s: float = SILENCE_S,
-        warn: Callable[[str], None] = _python_warning,
+        warn: Callable[[str], None] = python_warning,
     ) -> None:
         self.device = device
         self.classifier = classifier
@@ -129,7 +124,7 @@ class LiveRun(Iterator[Decision]):
         for sentence in self._monitor.push(frames):
             self._note(sentence)
         if self.device.counters.malformed > self._malformed:
-            self._note(self.device.mismatch)
+            self._note_unread(self.device.mismatch)
         self._malformed, self._mismatch = self.device.counters.malformed, Sentence()
         # Set after the computation, whose duration must not count as silence of the toy.
         self._last_frames_s, self._silent = time.perf_counter(), False
@@ -154,14 +149,18 @@ class LiveRun(Iterator[Decision]):
         decision = self.classifier.silence()
         if not self._mismatch:
             return self._noted(decision)
-        self._note(self._mismatch)
+        self._note_unread(self._mismatch)
         decision = replace(decision, state="unreadable")
         return decision if again else self._noted(decision)
 
     def _note(self, sentence: Sentence) -> None:
-        if sentence and sentence not in self.warnings:
-            self.warnings.append(sentence)
-            self._warn(sentence)
+        self.warnings.append(sentence)
+        self._warn(sentence)
+
+    def _note_unread(self, mismatch: Sentence) -> None:
+        # Once, although it may count the lines.
+        if mismatch and mismatch.reason not in {sentence.reason for sentence in self.warnings}:
+            self._note(mismatch)
 
     def _read(self, frames: list[Frame], arrived: float) -> list[Decision]:
         decided: list[Decision] = []
@@ -219,7 +218,7 @@ def run_live(
     *,
     seconds: float | None = None,
     silence_s: float = SILENCE_S,
-    warn: Callable[[str], None] = _python_warning,
+    warn: Callable[[str], None] = python_warning,
 ) -> LiveRun:
     """Run a model on an open device.
 

@@ -106,10 +106,13 @@ class PlausibilityMonitor:
         if bundle is not None:
             low, high = ranges_in_training(bundle)
             for axes in _accelerometers(layout):
+                # What an axis reads depends on how the toy is held: as much as any of them, in either direction.
+                zero = layout.zero_int[axes]
+                reach = np.maximum(high[axes] - zero, zero - low[axes]).max()
+                low[axes], high[axes] = zero - reach, zero + reach
                 expected = gravity_in_training(bundle, axes)
                 if expected is not None and not calibrated & set(axes):
                     self._rest.append((axes, *expected, []))
-                    # What an axis reads depends on how the toy is held.
                     calibrated |= set(axes) if expected[1] else set()
             free = [at for at in range(layout.n_channels) if at not in calibrated]
             # A sensor may stay at its end stop, which is one step beyond the limits.

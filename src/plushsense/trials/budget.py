@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from plushsense.core.errors import PlushSenseError
+from plushsense.core.errors import PlushSenseError, python_warning
 from plushsense.core.files import free_path, write_file
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
@@ -35,7 +35,6 @@ from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import (
     Warn,
     count_people,
-    python_warning,
     refits,
     refuse_hard_negatives,
     silent,

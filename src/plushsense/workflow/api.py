@@ -15,7 +15,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError, DatasetError
+from plushsense.core.errors import ConfigError, DatasetError, python_warning
 from plushsense.core.gestures import NOBODY
 from plushsense.core.sentences import Sentence
 from plushsense.core.version import __version__
@@ -56,7 +56,6 @@ from plushsense.workflow.preparation import (
     classes_for,
     network_inputs_of,
     prepare_training,
-    python_warning,
     refuse_hard_negatives,
     warn_of_files_twice,
     warn_of_single_people,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ArchError, BadInput, BundleError
+from plushsense.core.errors import ArchError, BadInput, BundleError, python_warning
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
 from plushsense.core.sentences import Sentence, plural
@@ -25,7 +25,7 @@ from plushsense.models.bundle import Bundle, is_training_content
 from plushsense.runtime.image import image_check, patch_bytes
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
-from plushsense.workflow.preparation import WHOLE_PEOPLE, Warn, python_warning, silent, windows_for
+from plushsense.workflow.preparation import WHOLE_PEOPLE, Warn, silent, windows_for
 
 _TRIED = 512  # maximum of windows on which a conversion is compared with the network
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-import warnings
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError, DatasetError, PlushSenseWarning, printable
+from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet, merge_names
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.proposals import median_gesture_s
@@ -36,19 +34,9 @@ from plushsense.workflow.config import ALL, SHARED, RunConfig
 
 Warn = Callable[[str], None]
 
-_PACKAGE = __name__.partition(".")[0]
-
 
 def silent(_: str) -> None:
     """Ignore a warning."""
-
-
-def python_warning(sentence: str) -> None:
-    """Issue a sentence by Python's `warnings`, as if by the line of the caller's program that called PlushSense."""
-    frame, level = inspect.currentframe(), 1
-    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == _PACKAGE:
-        frame, level = frame.f_back, level + 1
-    warnings.warn(printable(sentence), PlushSenseWarning, stacklevel=level)
 
 
 def network_inputs_of(dataset: Dataset, config: RunConfig) -> tuple[Dataset, RunConfig]:

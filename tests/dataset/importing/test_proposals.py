@@ -205,6 +205,26 @@ def test_what_may_be_real_is_not_taken_for_failed(
     assert {p["key"] for p in done.proposals} & {"valid_max"} == ({"valid_max"} if rows == 20 else set())
 
 
+@pytest.mark.parametrize("value", [30000, 32767], ids=["far", "end of the converter"])
+def test_single_rows_of_one_gesture_may_be_hits(tmp_path: Path, value: int) -> None:
+    # A piezo disc or an accelerometer at its end stop: nothing between rest and a hit, which lasts one row.
+    rng = np.random.default_rng(0)
+    lines = ["subject,time_ms,left,right,label"]
+    for take in range(24):
+        x = rng.integers(-12, 13, (100, 2))
+        x[50, 0] = value if take % 3 == 0 else 0
+        label = ("tap", "rest", "stroke")[take % 3]
+        lines += [
+            f"P{take % 2},{10**12 + 10000 * take + 20 * i},{a},{b},{label}" for i, (a, b) in enumerate(x.tolist())
+        ]
+    (tmp_path / "t.csv").write_text("\n".join(lines) + "\n")
+    layout = replace(FORCE, channels=tuple(replace(c, step=1.0) for c in FORCE.channels))
+    done = import_recordings(tmp_path / "t.csv", tmp_path / "DS", layout=layout)
+    assert done.dataset.layout == layout
+    proposed = {p["key"]: p for p in done.proposals}
+    assert "most of them in tap, so they may be hits" in proposed["valid_max"]["reason"]
+
+
 def test_rate_gap_and_window_are_measured(tmp_path: Path) -> None:
     source = analogue(tmp_path / "R", 0, 8000, period_ms=80)
     done = import_recordings(source, tmp_path / "DS", layout="accel-3", adopt_proposals=False)

@@ -16,7 +16,7 @@ from filelock import Timeout
 from plushsense.core.errors import DatasetError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import GestureSet
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, join_names
 from plushsense.dataset.files import CACHE, sha256_of, walk_files
 from plushsense.dataset.importing.build import (
     RECORDER,
@@ -184,7 +184,7 @@ def _returning_people_warning(dest: Path, come: list[str]) -> list[str]:
     if not come or not gone:
         return []
     days = ", ".join(dict.fromkeys(g.day for g in gone))
-    listed = f"{', '.join(come[:5])}{f' and {len(come) - 5} more' if len(come) > 5 else ''}"
+    listed = join_names(come, most=5)
     return [
         Sentence(
             f"people were removed from this data set ({len(gone)}; {days}), and {listed} were added now: remove a "

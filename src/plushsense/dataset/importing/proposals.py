@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import FileFormatError, LayoutError
 from plushsense.core.layouts import ACCELERATION, DEVICE_MS, MEASURED, Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import read_recording
+from plushsense.core.sentences import join_names
 from plushsense.dataset.quality.measurements import zeroing_limit
 from plushsense.dataset.quality.outliers import find_failed_readings
 from plushsense.dataset.store import Dataset, RecordingInfo
@@ -148,7 +149,7 @@ class Sensor:
         """The people, the first of many, and the number of sessions if it is another."""
         names = list(dict.fromkeys(s["subject"] for s in self.sessions))
         total = f" ({len(self.sessions)} sessions)" if len(self.sessions) > len(names) else ""
-        return named(names) + total
+        return join_names(names, most=_NAMED) + total
 
     @property
     def summary(self) -> str:
@@ -170,11 +171,6 @@ class Sensor:
         """Return plain values, ready for JSON."""
         kept = {key: value for key, value in vars(self).items() if key != "radius"}
         return {**kept, "axes": list(self.axes), "sessions": list(self.sessions), "summary": self.summary}
-
-
-def named(people: Sequence[str]) -> str:
-    """List people, the first of many."""
-    return ", ".join(people[:_NAMED]) + (f" and {len(people) - _NAMED} more" if len(people) > _NAMED else "")
 
 
 def _recognised(one_g: float) -> str:
@@ -401,10 +397,10 @@ def _valid_ranges(dataset: Dataset) -> Iterator[Proposal]:
     """Propose valid ranges without failed readings: the range of all others, and as much again on both sides."""
     failed = find_failed_readings(dataset)
     for proven in (True, False):
-        mine = [f for f in failed if f.certain == proven]
+        mine = [f for f in failed if proven == (not f.doubt)]
         reason = "; ".join(
-            f"{f.n} of {f.of} readings of {f.channel} ({named(f.people)}) are far beyond all others, which are "
-            f"{f.low:g} to {f.high:g}" + ("" if proven else f", in up to {f.longest} rows in succession")
+            f"{f.n} of {f.of} readings of {f.channel} ({join_names(f.people, most=_NAMED)}) are far beyond all others, "
+            f"which are {f.low:g} to {f.high:g}" + (f.doubt and f", {f.doubt}")
             for f in mine
         )
         if mine:

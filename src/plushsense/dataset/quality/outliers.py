@@ -2,13 +2,14 @@
 
 The distance of every reading from the median of its file and channel is counted by its number of bits, so that one pass
 over the files is enough and a channel of any unit and range is judged alike. Readings failed if no distance lies within
-`OCTAVES` below theirs, and they are few: no movement or touch jumps over three decades without a value between. Numbers
-that are the limit of a 16-, 24- or 32-bit integer need only `LIMIT_OCTAVES`.
+`OCTAVES` below theirs, and they are few: a movement seldom jumps over three decades without a value between. Numbers
+that are the limit of a 16-, 24- or 32-bit integer need only `LIMIT_OCTAVES`. A hit can do both, but not in any gesture.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.recorder_csv import Frames
+from plushsense.core.sentences import join_names
 from plushsense.dataset.store import Dataset
 
 OCTAVES = 10  # a factor of over 1000
@@ -25,6 +27,8 @@ SHARE = 0.01
 _LEAST_BITS = 4
 # A failed reading is followed by a good one; what lasts longer may be a touch or a disconnected sensor.
 _LONGEST = 3
+# A hit is a matter of the gesture: the gestures with most of the readings must be this share of the recordings.
+_MOST, _SPREAD = 0.9, 0.5
 _BITS = 64
 _LIMITS = [limit for bits in (16, 24, 32) for half in (1 << (bits - 1),) for limit in (-half, 1 - half, half - 1)]
 _LIMITS += [(1 << bits) - 1 for bits in (16, 24, 32)]
@@ -53,7 +57,7 @@ class FailedReadings:
     """The failed readings of a channel, in the values of the files.
 
     ``low`` and ``high`` are the least and the largest of the other readings; ``longest`` is the number of rows of the
-    longest run of failed ones.
+    longest run of failed ones. ``gestures`` are those with most of the failed readings, if they are few.
     """
 
     channel: str
@@ -63,18 +67,21 @@ class FailedReadings:
     low: float
     high: float
     longest: int
+    gestures: tuple[str, ...]
 
     @property
-    def certain(self) -> bool:
-        """Whether each is single, or nearly, as only failed readings are."""
-        return self.longest <= _LONGEST
+    def doubt(self) -> str:
+        """Why the readings may be real; "" if each is single, or nearly, and comes in any gesture."""
+        if self.longest > _LONGEST:
+            return f"in up to {self.longest} rows in succession"
+        return f"most of them in {join_names(self.gestures)}, so they may be hits" if self.gestures else ""
 
 
 def find_failed_readings(dataset: Dataset) -> list[FailedReadings]:
     """Return the failed readings of each channel but switches and counters; those outside its valid range are known."""
     layout = dataset.layout
     counts = np.zeros((layout.n_channels, _BITS), dtype=np.int64)
-    for _, frames in _files(dataset):
+    for _, frames, _ in _files(dataset):
         valid, bits = _measured(frames, dataset)
         for c, at in enumerate(valid.T):
             counts[c] += np.bincount(bits[at, c], minlength=_BITS)
@@ -85,13 +92,32 @@ def find_failed_readings(dataset: Dataset) -> list[FailedReadings]:
     return [failed for failed in described if failed is not None]
 
 
-def _files(dataset: Dataset) -> Iterator[tuple[str, Frames]]:
-    """Yield the person and the frames of every stream, and of every used recording that is in no stream."""
+def _files(dataset: Dataset) -> Iterator[tuple[str, Frames, list[tuple[int, int, str]]]]:
+    """Yield the person, the frames, and the first row, the end and the gesture of each recording in them.
+
+    These are of every stream, and of every used recording that is in no stream.
+    """
     for stream in dataset.streams:
-        yield stream.subject, dataset.read_stream(stream.id)
+        spans = [
+            (r.stream_row + r.start, r.stream_row + r.stop, r.gesture) for r in dataset.used if r.stream == stream.id
+        ]
+        yield stream.subject, dataset.read_stream(stream.id), spans
     for recording in dataset.used:
         if recording.stream_row < 0 and not dataset.layout.is_labelled:
-            yield recording.subject, dataset.read(recording)
+            frames = dataset.read(recording)
+            yield recording.subject, frames, [(0, len(frames), recording.gesture)]
+
+
+def _few_gestures(dataset: Dataset, found: Counter[str]) -> tuple[str, ...]:
+    """Return the gestures with most of the readings ``found``; none if these come in any gesture, or at idle."""
+    total = Counter(r.gesture for r in dataset.used)
+    most: list[str] = []
+    for gesture, _ in found.most_common():
+        most.append(gesture)
+        if sum(found[g] for g in most) >= _MOST * found.total():
+            break
+    spread = "" in most or sum(total[g] for g in most) >= _SPREAD * total.total()
+    return () if spread else tuple(most)
 
 
 def _measured(frames: Frames, dataset: Dataset) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
@@ -110,8 +136,8 @@ def _failed_of(dataset: Dataset, c: int, usual_bits: int, very_far: bool) -> Fai
     """
     step = dataset.layout.channels[c].step
     people: dict[str, None] = {}
-    failed, others, longest, rows = list[int](), list[int](), 0, 0
-    for subject, frames in _files(dataset):
+    failed, others, longest, rows, gestures = list[int](), list[int](), 0, 0, Counter[str]()
+    for subject, frames, spans in _files(dataset):
         valid, bits = _measured(frames, dataset)
         values, far = frames.values[:, c], valid[:, c] & (bits[:, c] > usual_bits)
         if (usual := values[valid[:, c] & ~far]).size:
@@ -120,12 +146,15 @@ def _failed_of(dataset: Dataset, c: int, usual_bits: int, very_far: bool) -> Fai
         if far.any():
             people[subject] = None
             failed += values[far].tolist()
+            for row in np.flatnonzero(far).tolist():
+                gestures[next((name for begin, end, name in spans if begin <= row < end), "")] += 1
             edges = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]])))
             longest = max(longest, int((edges[1::2] - edges[::2]).max()))
     if not very_far and not {round(value * step) for value in failed} <= {*_LIMITS}:
         return None
     low, high = (float(f"{edge * step:.12g}") for edge in (min(others), max(others)))
-    return FailedReadings(dataset.layout.names[c], len(failed), rows, tuple(people), low, high, longest)
+    few = _few_gestures(dataset, gestures)
+    return FailedReadings(dataset.layout.names[c], len(failed), rows, tuple(people), low, high, longest, few)
 
 
 def far_inputs(x: NDArray[np.integer]) -> dict[int, NDArray[np.bool_]]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ConfigError, check_known, nearest, need
+from plushsense.core.errors import ConfigError, check_known, nearest, need, python_warning
 from plushsense.core.files import write_file
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import Layout
@@ -43,7 +43,7 @@ from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import ANYWHERE, WindowSet
 from plushsense.windows.features import Scaler
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, python_warning, windows_for
+from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, windows_for
 from plushsense.workflow.reporting import check_results, journal_of, machine
 
 SPLITS = ("leave-one-subject-out", "windows:5")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from plushsense.core.errors import BadInput, BundleError, DatasetError, check_known, need
+from plushsense.core.errors import BadInput, BundleError, DatasetError, check_known, need, python_warning
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
 from plushsense.core.version import __version__
@@ -22,7 +22,7 @@ from plushsense.experiments.people.occlusion import BLOCK_S, Blocks, ExplainedGe
 from plushsense.jobs.journal import job_id
 from plushsense.models.bundle import Bundle, known_people, trained_people
 from plushsense.windows.cut import WindowSet, whole_gestures
-from plushsense.workflow.preparation import Warn, python_warning, windows_for
+from plushsense.workflow.preparation import Warn, windows_for
 from plushsense.workflow.reporting import check_results
 
 TABLE, PAGE = "explain.json", "explain.html"

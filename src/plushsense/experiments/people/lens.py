@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from plushsense.core.errors import ConfigError
+from plushsense.core.errors import ConfigError, python_warning
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
 from plushsense.core.version import __version__
@@ -31,7 +31,7 @@ from plushsense.scoring.metrics import class_scores, column_metrics, confusion, 
 from plushsense.scoring.splits import parse_split
 from plushsense.workflow.api import evaluate
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, python_warning, silent
+from plushsense.workflow.preparation import Warn, silent
 from plushsense.workflow.reporting import check_results
 
 SPLITS = ("windows:5", "by-recording:5", "by-subject:5", "leave-one-subject-out")

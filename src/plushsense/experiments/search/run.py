@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from plushsense.core.errors import BadInput, ConfigError
+from plushsense.core.errors import BadInput, ConfigError, python_warning
 from plushsense.core.files import write_file
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.index import as_dataset
@@ -59,7 +59,7 @@ from plushsense.trials.plan import (
 )
 from plushsense.trials.tables import SUMMARY as SWEEP
 from plushsense.trials.tables import Tables, summary_head
-from plushsense.workflow.preparation import Warn, python_warning, silent
+from plushsense.workflow.preparation import Warn, silent
 from plushsense.workflow.reporting import check_results
 
 SUMMARY, SETTINGS = "search.json", "train.toml"

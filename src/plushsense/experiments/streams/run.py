@@ -21,6 +21,7 @@ from plushsense.core.errors import (
     check_known,
     nearest,
     need,
+    python_warning,
 )
 from plushsense.core.files import temporary_folder, write_file
 from plushsense.core.gestures import NOBODY, GestureSet
@@ -71,7 +72,6 @@ from plushsense.workflow.preparation import (
     named_classes,
     network_inputs_of,
     outside_streams,
-    python_warning,
     silent,
     windows_for,
 )

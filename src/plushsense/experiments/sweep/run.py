@@ -17,7 +17,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from plushsense.core.errors import ForgottenError, need
+from plushsense.core.errors import ForgottenError, need, python_warning
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.jobs.journal import JOURNAL, Result, job_id
@@ -37,7 +37,7 @@ from plushsense.trials.tables import (
     networks_to_keep,
     summary_head,
 )
-from plushsense.workflow.preparation import Warn, python_warning
+from plushsense.workflow.preparation import Warn
 from plushsense.workflow.reporting import check_results, journal_of
 
 
