@@ -21,6 +21,7 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import plain_label
 from plushsense.core.recorder_csv import parse_name
+from plushsense.core.sentences import join_names
 from plushsense.core.toml import loads_json
 from plushsense.dataset.importing.columns import (
     CODE_NAMES,
@@ -535,7 +536,7 @@ def _label(texts: list[SampledColumn], left: list[SampledColumn], guess: _Patter
         ]
         mixed = [c for c in few if c.alternates]
         for column in mixed:
-            listed = ", ".join(repr(word) for word in list(column.words)[:2])
+            listed = join_names(repr(word) for word in list(column.words)[:2])
             guess.doubts.append(
                 f"the column '{column.key}' changes from row to row ({listed}), so that it is not taken for the label: "
                 "if it names sensors, their rows are mixed; write a table with a column for each sensor"
