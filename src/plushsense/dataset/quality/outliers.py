@@ -153,7 +153,9 @@ def _failed_of(dataset: Dataset, c: int, usual_bits: int, very_far: bool) -> Fai
     if not very_far and not {round(value * step) for value in failed} <= {*_LIMITS}:
         return None
     low, high = (float(f"{edge * step:.12g}") for edge in (min(others), max(others)))
-    few = _few_gestures(dataset, gestures)
+    # Always the same number, beyond the 16 bits of a converter at its end stop, is an error code and no hit.
+    code = very_far and len(failed) > 2 and len(set(failed)) == 1 and abs(failed[0]) > 0xFFFF
+    few = () if code else _few_gestures(dataset, gestures)
     return FailedReadings(dataset.layout.names[c], len(failed), rows, tuple(people), low, high, longest, few)
 
 
