@@ -205,8 +205,12 @@ def test_what_may_be_real_is_not_taken_for_failed(
     assert {p["key"] for p in done.proposals} & {"valid_max"} == ({"valid_max"} if rows == 20 else set())
 
 
-@pytest.mark.parametrize("value", [30000, 32767], ids=["far", "end of the converter"])
-def test_single_rows_of_one_gesture_may_be_hits(tmp_path: Path, value: int) -> None:
+@pytest.mark.parametrize(
+    ("value", "adopted"),
+    [(30_000, False), (32_767, False), (83_886_070, True)],
+    ids=["far", "end of the converter", "error code"],
+)
+def test_single_rows_of_one_gesture_may_be_hits(tmp_path: Path, value: int, adopted: bool) -> None:
     # A piezo disc or an accelerometer at its end stop: nothing between rest and a hit, which lasts one row.
     rng = np.random.default_rng(0)
     lines = ["subject,time_ms,left,right,label"]
@@ -218,11 +222,13 @@ def test_single_rows_of_one_gesture_may_be_hits(tmp_path: Path, value: int) -> N
             f"P{take % 2},{10**12 + 10000 * take + 20 * i},{a},{b},{label}" for i, (a, b) in enumerate(x.tolist())
         ]
     (tmp_path / "t.csv").write_text("\n".join(lines) + "\n")
-    layout = replace(FORCE, channels=tuple(replace(c, step=1.0) for c in FORCE.channels))
+    # A valid range that is left out depends on the step: that of FORCE would already exclude the error code.
+    whole = {"step": 1.0, "valid_min": -(2**31), "valid_max": 2**31 - 1}
+    layout = replace(FORCE, channels=tuple(replace(c, **whole) for c in FORCE.channels))
     done = import_recordings(tmp_path / "t.csv", tmp_path / "DS", layout=layout)
-    assert done.dataset.layout == layout
     proposed = {p["key"]: p for p in done.proposals}
-    assert "most of them in tap, so they may be hits" in proposed["valid_max"]["reason"]
+    assert (done.dataset.layout != layout) == proposed["valid_max"]["adopted"] == adopted
+    assert ("most of them in tap, so they may be hits" in proposed["valid_max"]["reason"]) != adopted
 
 
 def test_rate_gap_and_window_are_measured(tmp_path: Path) -> None:
