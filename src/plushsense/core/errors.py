@@ -153,7 +153,7 @@ class BuildError(ToolError):
 
 
 class ProgramError(ToolError):
-    """A program that was built and crashes, exits with a status other than 0, or does not end."""
+    """A program that was built and crashes, exits with a status other than 0, does not end, or prints nothing."""
 
 
 class MissingExtraError(PlushSenseError):

@@ -420,6 +420,17 @@ def test_c_that_warns_or_writes_past_its_memory(c_compiler: str, own: Path, caps
     assert "before the toy's memory" in (done.first or "") and done.mismatches >= 1
 
 
+def test_a_program_that_prints_nothing_ends_the_verification_at_once(
+    c_compiler: str, two_settings: None, own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = own / "plushsense.c"
+    early = "\n#include <unistd.h>\n__attribute__((constructor)) static void early(void)\n{\n    _exit(0);\n}\n"
+    path.write_text(path.read_text(encoding="utf-8") + early, encoding="utf-8")
+    code, report, err = run(capsys, str(own), "--target", "host", "--trust")
+    assert code == 2 and report == {} and "On host (gcc -O0), the program ended without an error" in err
+    assert err.count("\n") == 1
+
+
 # ---- Code from elsewhere -------------------------------------------------------------------------------------------
 
 PLANTED = """

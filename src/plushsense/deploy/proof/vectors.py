@@ -359,12 +359,16 @@ class Export:
 
 @dataclass(frozen=True)
 class RowComparison:
-    """Result of `compare`; ``first`` describes the first difference as part of a sentence."""
+    """Result of `compare`; ``first`` describes the first difference as part of a sentence.
+
+    ``is_empty``: the program printed nothing.
+    """
 
     vectors: int
     mismatches: int
     max_abs_diff: int
     first: str | None
+    is_empty: bool = False
 
 
 def compare(expected: NDArray[np.int32], got: bytes, labels: Sequence[str]) -> RowComparison:
@@ -392,7 +396,8 @@ def compare(expected: NDArray[np.int32], got: bytes, labels: Sequence[str]) -> R
     if message:
         first = f"{message.rstrip('.')}" if first is None else f"{message.rstrip('.')}; {first}"
         mismatches = max(mismatches, 1)
-    return RowComparison(len(expected), mismatches, int(differences.max()) if differences.size else 0, first)
+    largest = int(differences.max()) if differences.size else 0
+    return RowComparison(len(expected), mismatches, largest, first, is_empty=not got and len(expected) > 0)
 
 
 def _row(row: NDArray[Any]) -> str:

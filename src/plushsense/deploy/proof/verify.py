@@ -216,6 +216,7 @@ def verify(
     Raises:
         BadInput: if such files differ and ``trust`` is false.
         ConfigError: for an unknown target; ToolError: for a named one whose tools are missing.
+        ProgramError: if a program prints no result.
     """
     if not trust:
         export.require_unchanged()
@@ -349,12 +350,22 @@ class _Runner:
         return Path(tempfile.mkdtemp(dir=self.work))
 
     def run(self, setting: Setting, streams: Iterable[Cases]) -> SettingResult:
-        """Compile with one setting, run each stream and compare the results."""
+        """Compile with one setting, run each stream and compare the results.
+
+        Raises:
+            ProgramError: if the program prints nothing, because then every other setting would be compared in vain.
+        """
         began, out = time.monotonic(), self._new_folder()
         compared = []
         for cases in streams:
             try:
                 compared.append(self._attempt(self.code, setting, cases, out, both=True))
+                if compared[-1].is_empty:
+                    raise ProgramError(
+                        f"On {setting.target} ({setting.compiler} {setting.options}), the program ended without an "
+                        "error but printed no result: check that nothing in its code ends it early, and that this "
+                        "emulator shows what a program prints."
+                    )
             except BuildError as cause:
                 count = sum(len(v.answers) for v in cases[0])
                 compared.append(RowComparison(count, count, 0, f"On {setting.target} ({setting.options}): {cause}"))
