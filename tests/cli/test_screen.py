@@ -9,7 +9,7 @@ import pytest
 
 from plushsense.cli.terminal import KEYS, lines
 from plushsense.recording.plan import load_protocol
-from plushsense.recording.states import RecorderStatus
+from plushsense.recording.status import RecorderStatus
 from plushsense.recording.takes import SIGNAL
 
 STEPS = load_protocol("plush-17").steps()

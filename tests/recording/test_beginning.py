@@ -10,8 +10,8 @@ import pytest
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.layouts import load_layout
 from plushsense.devices.opening import open_device
-from plushsense.recording.recorder import (
-    Recorder,
+from plushsense.recording.recorder import AutoRecording, Recorder
+from plushsense.recording.request import (
     SessionRequest,
     check_speed,
     is_pseudo_terminal,
@@ -21,7 +21,6 @@ from plushsense.recording.recorder import (
     session_layout,
 )
 from plushsense.recording.session import list_sessions
-from plushsense.recording.states import AutoRecording
 
 LAYOUT = load_layout("plush-15")
 URL = "virtual://?speed=0&lost=0&garbled=0&glitch=0"

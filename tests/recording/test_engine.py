@@ -25,13 +25,13 @@ from plushsense.core.recorder_csv import STREAM_NAME, read_recording, read_strea
 from plushsense.devices.base import Device, Frame, now_ms
 from plushsense.devices.opening import open_device
 from plushsense.devices.reconnect import ReconnectingDevice
-from plushsense.recording import states as machine
+from plushsense.recording import recorder as machine
 from plushsense.recording import takes
 from plushsense.recording.plan import load_protocol
-from plushsense.recording.recorder import Recorder, prompt_virtual
+from plushsense.recording.recorder import AutoRecording, Recorder, prompt_virtual
 from plushsense.recording.session import OpenSession
 from plushsense.recording.session_files import SessionHead, discarded_recordings, read_events
-from plushsense.recording.states import AutoRecording, RecorderStatus
+from plushsense.recording.status import RecorderStatus
 from plushsense.recording.writer import StreamFile
 
 LAYOUT = load_layout("plush-15")
@@ -596,7 +596,7 @@ from pathlib import Path
 from plushsense.core.layouts import load_layout
 from plushsense.devices.opening import open_device
 from plushsense.recording.recorder import Recorder
-from plushsense.recording.states import AutoRecording
+from plushsense.recording.recorder import AutoRecording
 from plushsense.recording.plan import load_protocol
 from plushsense.recording.session_files import SessionHead
 

@@ -15,7 +15,7 @@ import pytest
 
 from plushsense.core.errors import ConfigError, DatasetError, DeviceError, PlushSenseError
 from plushsense.devices.virtual.stream import VirtualDevice
-from plushsense.recording.recorder import SessionRequest
+from plushsense.recording.request import SessionRequest
 from plushsense.recording.session import OpenSession
 from plushsense.recording.session_files import SessionEvent, SessionHead, read_events
 from plushsense.studio.app import toys

@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from plushsense.recording.plan import load_protocol
-from plushsense.recording.recorder import Recorder, open_toy, prompt_virtual
+from plushsense.recording.recorder import AutoRecording, Recorder, open_toy, prompt_virtual
 from plushsense.recording.session_files import SessionHead
-from plushsense.recording.states import AutoRecording
 from plushsense.studio.app.workspace import Workspace
 
 

@@ -15,7 +15,8 @@ from plushsense.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from plushsense.cli.terminal import KeySource, Screen
-    from plushsense.recording.recorder import Recorder, SessionRequest
+    from plushsense.recording.recorder import Recorder
+    from plushsense.recording.request import SessionRequest
     from plushsense.recording.session_files import SessionHead
 
 _DRAW_S = 0.1
@@ -25,17 +26,10 @@ _WAIT_S = 0.02
 def run(args: argparse.Namespace) -> int:
     from plushsense.cli.terminal import Screen, keys
     from plushsense.core.version import __version__
-    from plushsense.recording.recorder import (
-        Recorder,
-        open_toy,
-        prompt_virtual,
-        session_folder,
-        session_head,
-        session_layout,
-        with_speed,
-    )
+    from plushsense.devices.opening import with_speed
+    from plushsense.recording.recorder import AutoRecording, Recorder, open_toy, prompt_virtual
+    from plushsense.recording.request import session_folder, session_head, session_layout
     from plushsense.recording.session import OpenSession
-    from plushsense.recording.states import AutoRecording
 
     software = f"plushsense {__version__}"
     request = _request(args)
@@ -89,7 +83,8 @@ def _report(args: argparse.Namespace, recorder: Recorder) -> int:
 
 
 def _request(args: argparse.Namespace) -> SessionRequest:
-    from plushsense.recording.recorder import SessionRequest, check_speed, speed_of
+    from plushsense.devices.opening import speed_of
+    from plushsense.recording.request import SessionRequest, check_speed
 
     if args.auto is not None and not 0.5 <= args.auto <= 3600.0:
         raise ConfigError(f"--auto is {args.auto:g}; 0.5 to 3600 seconds are accepted.")
@@ -104,7 +99,7 @@ def _request(args: argparse.Namespace) -> SessionRequest:
 
 def _notices(request: SessionRequest, head: SessionHead, fresh: bool) -> list[str]:
     """Return the warnings to print before a session."""
-    from plushsense.recording.recorder import is_pseudo_terminal, lacks_consent
+    from plushsense.recording.request import is_pseudo_terminal, lacks_consent
 
     notices = []
     if is_pseudo_terminal(request, head):

@@ -19,7 +19,7 @@ from typing import Protocol
 
 from plushsense.core.errors import printable
 from plushsense.recording.recorder import Recorder
-from plushsense.recording.states import RecorderStatus
+from plushsense.recording.status import RecorderStatus
 
 END = "\x04"
 """The key that a source returns when it has ended."""

@@ -156,6 +156,25 @@ def check_address(address: DeviceAddress) -> None:
 _ENDING = ("replay", "virtual")
 
 
+def is_virtual(url: str) -> bool:
+    """Return whether a URL opens a virtual toy in this process."""
+    return parse_url(url).scheme == "virtual"
+
+
+def with_speed(url: str, speed: float) -> str:
+    """Return ``url`` with ``speed`` if it is of a virtual or replayed toy and has no speed, else unchanged."""
+    address = parse_url(url)
+    if address.scheme not in _ENDING or "speed" in address.query:
+        return url
+    return f"{url}{'&' if '?' in url else '?'}speed={speed:g}"
+
+
+def speed_of(url: str) -> float:
+    """Return the speed in the URL of a virtual or replayed toy; 1 for any other."""
+    address = parse_url(url)
+    return address.number("speed", 1.0) if address.scheme in _ENDING else 1.0
+
+
 def open_device(
     url: str | os.PathLike[str],
     layout: Layout | str | None = None,

@@ -1,31 +1,36 @@
-"""Recorder with the commands for the terminal and the studio, and preparation of a session from a request.
+"""Recorder of a session: a state machine that commands and the toy's frames drive.
 
-Commands do not wait for their effects, which `plushsense.recording.states` implements.
+Commands do not wait for their effects. One thread reads the toy's frames, those of the background writer write them; at
+real time the reader never waits for the disk. All durations of a session are measured by the toy's own clock, so that a
+virtual toy at twenty times the speed counts down in a twentieth of the time, and a toy that is unplugged during the
+countdown does not start an empty recording. A real toy's clock that stands or is much too slow counts as half as fast
+as the computer's, so that every recording ends.
 """
 
 from __future__ import annotations
 
-import secrets
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from plushsense.core.errors import ConfigError
-from plushsense.core.gestures import NOBODY
+from plushsense.core.errors import ConfigError, DatasetError, PlushSenseError
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import STREAM_NAME
-from plushsense.core.sentences import Sentence
-from plushsense.devices.base import Device, now_ms
-from plushsense.devices.opening import open_device, parse_url
+from plushsense.core.sentences import Sentence, plural
+from plushsense.devices.base import Counters, Device, Frame, now_ms
+from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.stream import VirtualDevice
-from plushsense.recording.plan import load_protocol
-from plushsense.recording.session import OpenSession, check_session, check_subject, new_session, next_session
-from plushsense.recording.session_files import SessionHead
-from plushsense.recording.states import RecorderState, RecorderStatus, RecordingMachine, StepResult, key_of, write_error
-from plushsense.recording.writer import BackgroundWriter, StreamFile
+from plushsense.recording.session import OpenSession
+from plushsense.recording.session_files import SessionEvent, SessionHead
+from plushsense.recording.status import PlanProgress, RecorderState, RecorderStatus, StepResult, key_of
+from plushsense.recording.takes import AWAY_S, Ended, FrameReceiver, RecordingTake, gap_entry, sidecar
+from plushsense.recording.writer import BackgroundWriter, StreamFile, lacks_descriptor, save_take, to_frames
 
 _NO_DESCRIPTOR = Sentence(
     "Too many files are open on this computer: saving waits until some are closed. Nothing is lost.", "saving_waits"
@@ -33,8 +38,18 @@ _NO_DESCRIPTOR = Sentence(
 _RECORDING = Sentence("Recording: space stops it, r discards it.", "recording_first")
 _CANCELLED = Sentence("The countdown was cancelled.", "cancelled")
 
+Listener = Callable[[str, RecorderStatus], None]
 
-class Recorder(RecordingMachine):
+
+@dataclass(frozen=True)
+class AutoRecording:
+    """Automatic recording: begin a countdown ``rest_s`` after the recorder is ready, and record for ``take_s``."""
+
+    take_s: float = 5.0
+    rest_s: float = 1.0
+
+
+class Recorder:
     """Recorder of one session. Use it as a context manager; its commands may be called from any thread.
 
     Args:
@@ -44,12 +59,87 @@ class Recorder(RecordingMachine):
             they have the start time plus the toy's time since then.
         auto: settings to start and stop recordings automatically; None to do it by commands.
         software: name and version of the program, for the log and the sidecars.
+
+    ``over`` is the reason why the toy sends no more data; "" while it may send some.
     """
+
+    def __init__(
+        self,
+        session: OpenSession,
+        device: Device,
+        *,
+        speed: float = 1.0,
+        auto: AutoRecording | None = None,
+        software: str = "",
+    ) -> None:
+        self.session = session
+        self.device = device
+        self.protocol = session.protocol
+        self._speed = speed
+        self._auto = auto
+        self._software = software
+        self._changed = threading.Condition(threading.RLock())
+        self._listeners: list[Listener] = []
+        self._changes: list[str] = []
+        progress = session.progress
+        self._plan = PlanProgress(self.protocol.steps(), progress)
+        self._receiver = FrameReceiver(device, session.layout, speed, progress.rows, progress.host_ms)
+        self._take: RecordingTake | None = None
+        self._since_ms = 0.0
+        self._since_s = time.monotonic()
+        self._state: RecorderState = "idle"
+        self._paused = False
+        self._message = self._mismatch = Sentence()
+        self.over = Sentence()
+        self._failed = Sentence()
+        self._closing = False
+        self._received: list[Frame] = []
+        self._writer: BackgroundWriter | None = None
+        self._reader = self._new_reader()
 
     @classmethod
     def open(cls, folder: Path, device: Device, head: SessionHead | None = None, **options: Any) -> Recorder:
         """Open the session in ``folder`` as `OpenSession` does, and return its recorder."""
         return cls(OpenSession(folder, head), device, **options)
+
+    def subscribe(self, listener: Listener) -> None:
+        """Call ``listener(change, status)`` at every change, in the thread that caused it; it must not block."""
+        self._listeners.append(listener)
+
+    def status(self) -> RecorderStatus:
+        """Return a snapshot of the session."""
+        with self._changed:
+            plan, receiver = self._plan, self._receiver
+            counters = self.device.counters
+            passed = self._passed_s()
+            counting, running = self._state == "countdown", self._state == "recording"
+            return RecorderStatus(
+                state=self._state,
+                step=plan.step,
+                steps=len(plan.steps),
+                repetitions=self.protocol.repetitions,
+                next_step=plan.next_step(),
+                done=len(plan.takes),
+                skipped=len(plan.skipped),
+                redone=plan.redone,
+                existing=plan.takes.get(key_of(plan.step), ""),
+                countdown_s=max(0.0, self.protocol.countdown_s - passed) if counting else 0.0,
+                elapsed_s=max(passed, self._wall_s()) if running else 0.0,
+                left_s=max(0.0, self.protocol.longest_s - passed) if running else 0.0,
+                **vars(receiver.quality()),
+                away=receiver.away,
+                lost=receiver.lost,
+                malformed=counters.malformed,
+                garbage=counters.garbage,
+                reconnects=counters.reconnects,
+                gaps=len(receiver.gaps),
+                rows=receiver.rows,
+                file=plan.last_file,
+                message=self._message,
+                failed=self._failed,
+                folder=str(self.session.folder),
+                frames=counters.frames,
+            )
 
     @property
     def toy_s(self) -> float:
@@ -315,32 +405,278 @@ class Recorder(RecordingMachine):
     ) -> None:
         self.close()
 
+    def _new_reader(self) -> threading.Thread:
+        return threading.Thread(target=self._read, name="plushsense-reader", daemon=True)
 
-_SIMULATED = "virtual"
+    @contextlib.contextmanager
+    def _notifying(self) -> Iterator[None]:
+        """Hold the lock, and notify the listeners after releasing it, so that they may give commands."""
+        with self._changed:
+            yield
+        with self._changed:
+            changes, self._changes = self._changes, []
+        for change in changes:
+            for listener in tuple(self._listeners):
+                # An error in a listener must not end a recording.
+                with contextlib.suppress(Exception):
+                    listener(change, self.status())
+
+    def _log(self, kind: str, **more: Any) -> None:
+        if self._writer is not None:
+            self._writer.submit(SessionEvent(kind, self._receiver.now_ms(), more))
+        self._changes.append(kind)
+
+    def _log_step(self, kind: str, **more: Any) -> None:
+        step = self._plan.step
+        self._log(kind, gesture=step.gesture, repetition=step.repetition, **more)
+
+    def _show_message(self, message: Sentence) -> None:
+        self._message = message
+        self._changes.append("message")
+        self._changed.notify_all()
+
+    def _enter(self, state: RecorderState, message: Sentence | None = None) -> None:
+        if self._failed:
+            # The stream may have failed while a recording was still being saved.
+            state, message = "stopped", self._failed
+        self._state = state
+        self._since_ms, self._since_s = self._receiver.toy_ms, time.monotonic()
+        self._message = message or Sentence()
+        self._changes.append(state)
+        self._changed.notify_all()
+
+    def _wall_s(self) -> float:
+        return time.monotonic() - self._take.from_s if self._take is not None else 0.0
+
+    def _passed_s(self) -> float:
+        """Return the seconds since the state was entered, by the toy's clock, see `FrameReceiver.passed_s`."""
+        return self._receiver.passed_s(self._since_ms, self._since_s)
+
+    def _advance(self, message: Sentence | None = None, from_start: bool = False) -> None:
+        """Go to the next step to record; finish the session if none is left."""
+        if self._plan.advance(from_start):
+            self._ready(message)
+        else:
+            self._log("finished", recordings=len(self._plan.takes), skipped=len(self._plan.skipped))
+            self._paused = False
+            self._enter("stopped" if self.over else "finished", message)
+
+    def _ready(self, message: Sentence | None = None) -> None:
+        if self.over:
+            self._enter("stopped", self.over)
+        else:
+            self._enter("paused" if self._paused else "idle", message)
+
+    def _begin(self) -> None:
+        now = self._receiver.last.device_ms if self._receiver.last else None
+        self._log_step("countdown", countdown_s=self.protocol.countdown_s, device_ms=now)
+        self._enter("countdown")
+
+    def _cancel(self, message: Sentence | None = None) -> None:
+        self._log_step("cancel")
+        self._enter("idle", message)
+
+    def _abandon(self, why: str, message: Sentence | None = None) -> None:
+        take = self._take
+        assert take is not None
+        self._take = None
+        self._log_step("abandon", why=why, rows=len(take.frames))
+        self._ready(message)
+
+    def _stop(self, ended: Ended) -> None:
+        take = self._take
+        assert take is not None
+        # If a frame ended the recording, the gap before it has been added already.
+        waiting = self._receiver.away or (self._speed == 1.0 and self._receiver.silent)
+        if waiting and ended in ("space", "toy"):
+            silent_ms = self._receiver.silent_ms
+            take.gaps.append(gap_entry(len(take.frames), take.frames[-1], None, silent_ms, "nothing came any more"))
+        self._take = None
+        counters = Counters(**self.device.counters.to_dict())
+        self._enter("saving")
+        self._flush()
+        if self._writer is not None:
+            self._writer.submit(lambda: self._save(take, ended, counters))
+
+    def _read(self) -> None:
+        """Process frames as they arrive, in the reader's thread, independently of the display."""
+        over = Sentence("The toy's data have ended.", "data_ended")
+        device = self.device
+        try:
+            while not self._closing:
+                device = self.device
+                frames = device.read()
+                if device is not self.device:
+                    continue
+                if frames is None:
+                    break
+                with self._notifying():
+                    if device is not self.device:
+                        continue
+                    for frame in frames:
+                        self._receive(frame)
+                    self._receiver.check_malformed()
+                    if not frames:
+                        self._show_unreadable()
+                    if frames:
+                        self._flush()
+                        self._receiver.end_reading()
+                if self._writer is not None:
+                    self._writer.wait_written()
+        except PlushSenseError as cause:
+            over = Sentence.of(cause)
+        except Exception as cause:  # noqa: BLE001, RUF100
+            sentence = f"Reading the toy failed ({type(cause).__name__}: {cause}): all frames until then are kept."
+            over = Sentence(sentence, "reading_broke_off", why=cause)
+        with self._notifying():
+            if self._closing:
+                return
+            if device is not self.device:
+                # The toy was exchanged when its data ended.
+                self._reader = self._new_reader()
+                self._reader.start()
+                return
+            self.over = over
+            if self._state == "recording":
+                self._stop("toy")
+            elif self._state not in ("saving", "stopped"):
+                self._enter("stopped", over)
+
+    def _receive(self, frame: Frame) -> None:
+        """Process one frame: detect gaps, begin and end recordings, and keep the frame for the writer."""
+        row = self._receiver.rows
+        frame, missing, gap = self._receiver.receive(frame)
+        if gap is not None:
+            self._gap(gap)
+        if self._state == "countdown" and self._passed_s() >= self.protocol.countdown_s:
+            counters = Counters(**self.device.counters.to_dict())
+            self._take = RecordingTake(self._plan.step, row, time.monotonic(), counters)
+            self._log_step("start", row=row, host_ms=frame.host_ms, device_ms=frame.device_ms)
+            self._enter("recording")
+        elif self._take is not None:
+            # Negative where frames that were counted before the recording came late.
+            self._take.lost = max(0, self._take.lost + missing)
+        self._received.append(frame)
+        if self._take is not None:
+            self._take.frames.append(frame)
+        if self._state == "recording":
+            if self._auto is not None and self._passed_s() >= self._auto.take_s:
+                self._stop("auto")
+            elif self._passed_s() >= self.protocol.longest_s:
+                self._stop("longest")
+        elif self._state == "idle" and self._auto is not None and self._passed_s() >= self._auto.rest_s:
+            self._begin()
+
+    def _show_unreadable(self) -> None:
+        """Show why no line of the toy can be read, once for each reason."""
+        unreadable = self._receiver.silent and self._receiver.quality().signal == "unreadable"
+        mismatch = self.device.mismatch if unreadable else Sentence()
+        if mismatch and mismatch != self._mismatch:
+            self._show_message(mismatch)
+        self._mismatch = mismatch
+
+    def _flush(self) -> None:
+        """Pass the received frames to the background writer; call this before anything to be written after them."""
+        if self._writer is not None and self._received:
+            self._writer.add_frames(self._received, self._receiver.toy_ms)
+        self._received = []
+
+    def _gap(self, gap: dict[str, Any]) -> None:
+        """Log a gap of the stream, add it to a running recording, and show a message if it is long."""
+        (self._log_step if self._take is not None else self._log)("gap", **gap)
+        if self._take is not None:
+            self._take.gaps.append(gap | {"after_row": len(self._take.frames)})
+        if gap["missing_ms"] >= 1000.0 * AWAY_S:
+            away_s = round(gap["missing_ms"] / 1000.0, 1)
+            sentence = f"The toy was disconnected for {away_s:.1f} s"
+            if self._state == "countdown":
+                self._cancel(Sentence(f"{sentence}: press space again.", "away_in_countdown", s=away_s))
+            elif self._state == "recording":
+                sentence += ": this recording has a gap; r records it again."
+                self._show_message(Sentence(sentence, "away_in_recording", s=away_s))
+            else:
+                self._show_message(Sentence(f"{sentence}.", "away", s=away_s))
+
+    def _save(self, take: RecordingTake, ended: Ended, counters: Counters) -> None:
+        """Save a recording and go to the next step; runs in a thread of the background writer."""
+        key = key_of(take.step)
+        with self._changed:
+            saved_ms = self._receiver.now_ms()
+            earlier = self._plan.takes.get(key, "")
+        more = {"device": self.device.url, "speed": self._speed, "software": self._software}
+        file, message = store_take(self.session, take, counters, ended, saved_ms, earlier, **more)
+        with self._notifying():
+            self._plan.record(key, file)
+            self._changes.append("take")
+            self._advance(message)
+
+    def _fail(self, cause: Exception) -> None:
+        with contextlib.suppress(OSError):
+            self.session.log.write([SessionEvent("failed", now_ms(), {"why": str(cause)})])
+        with self._notifying():
+            self._failed = Sentence.of(write_error(self.session, len(self._plan.takes), cause))
+            self._closing = True
+            self._take = None
+            self._enter("stopped", self._failed)
+
+
+def store_take(
+    session: OpenSession,
+    take: RecordingTake,
+    counters: Counters,
+    ended: Ended,
+    saved_ms: int,
+    earlier: str,
+    **more: Any,
+) -> tuple[str, Sentence]:
+    """Write a recording, its sidecar and its log entry; ``earlier`` is the file that it replaces, or "".
+
+    Returns:
+        The name of the file, and a message for the user, which may be empty.
+
+    Raises:
+        OSError: if the files cannot be written; no partial file is left.
+    """
+    layout, step = session.layout, take.step
+    frames = to_frames(take.frames, layout.n_channels)
+    metadata = sidecar(take, frames, layout, session.head, counters, ended, saved_ms=saved_ms, **more)
+    path = save_take(session.folder, frames, layout, step.gesture, saved_ms, metadata)
+    key = {"gesture": step.gesture, "repetition": step.repetition}
+    result = {"rows": len(frames), "lost": take.lost, "gaps": len(take.gaps), "ended": ended}
+    events = [SessionEvent("take", saved_ms, {"file": path.name} | key | result)]
+    if earlier:
+        events.append(SessionEvent("redo", saved_ms, {"file": earlier} | key))
+    session.log.write(events)
+    message = Sentence()
+    if ended == "longest":
+        longest_s = session.protocol.longest_s
+        sentence = f"Nobody stopped the recording: it ended after {longest_s:g} s; r records it again."
+        message = Sentence(sentence, "ended_by_itself", s=longest_s)
+    elif take.gaps:
+        longest = max(gap["missing_ms"] for gap in take.gaps) / 1000.0
+        fault = f"has a gap of {longest:.1f} s" if longest >= 0.05 else "has a jump in the toy's clock"
+        reason = "kept_with_gap" if longest >= 0.05 else "kept_with_jump"
+        message = Sentence(f"This recording {fault}; it is kept, r records it again.", reason, s=round(longest, 1))
+    return path.name, message
+
+
+def write_error(session: OpenSession, recordings: int, cause: Exception) -> DatasetError:
+    """Return the error for a session that stopped because its folder cannot be written any more."""
+    why = getattr(cause, "strerror", None) or cause
+    remedy = "close other programs" if lacks_descriptor(cause) else "free disk space"
+    return DatasetError(
+        f"'{session.folder}' cannot be written any more ({why}): the session has stopped, with "
+        f"{plural(recordings, 'recording')} saved; {remedy}, and continue the same session.",
+        reason="files_open" if lacks_descriptor(cause) else "disk_full",
+        folder=session.folder,
+        why=why,
+        n=recordings,
+    )
 
 
 def open_toy(url: str, layout: Layout | str | None = None) -> Device:
     """Open a toy by its URL with `open_device`; if it is disconnected later, wait for it and record the gap."""
     return open_device(url, layout, reconnect=True)
-
-
-def is_virtual(url: str) -> bool:
-    """Return whether a URL opens a virtual toy in this process."""
-    return parse_url(url).scheme == _SIMULATED
-
-
-def with_speed(url: str, speed: float) -> str:
-    """Return ``url`` with ``speed`` if it is of a virtual or replayed toy and has no speed, else unchanged."""
-    address = parse_url(url)
-    if address.scheme not in (_SIMULATED, "replay") or "speed" in address.query:
-        return url
-    return f"{url}{'&' if '?' in url else '?'}speed={speed:g}"
-
-
-def speed_of(url: str) -> float:
-    """Return the speed in the URL of a virtual or replayed toy; 1 for any other."""
-    address = parse_url(url)
-    return address.number("speed", 1.0) if address.scheme in (_SIMULATED, "replay") else 1.0
 
 
 def prompt_virtual(recorder: Recorder) -> None:
@@ -372,115 +708,3 @@ def send_markers(recorder: Recorder, push: Callable[[str], None]) -> None:
             push(status.step.gesture if change == "start" else "mark" if change == "mark" else "end")
 
     recorder.subscribe(on_change)
-
-
-PROTOCOL = "plush-17"
-"""The default protocol of a new session."""
-FASTEST = 1000.0
-
-
-@dataclass(frozen=True)
-class SessionRequest:
-    """Request of the terminal or the studio for a recording session.
-
-    ``device`` is the toy's URL, ``subject`` a code ("" for a protocol that is recorded without a person). Without
-    ``protocol``, ``words`` or ``layout``, a continued session keeps its own, and a new one has `PROTOCOL`, its default
-    wording, and the layout of the URL or plush-15. The toy runs at ``speed`` times real time. ``simulated`` marks a
-    virtual toy that cannot be recognised by its URL.
-    """
-
-    device: str
-    subject: str = ""
-    protocol: str = ""
-    words: str = ""
-    layout: str = ""
-    age_group: str = ""
-    gender: str = ""
-    consent: str = ""
-    speed: float = 1.0
-    simulated: bool = False
-
-
-def check_speed(speed: float) -> float:
-    """Return ``speed`` if it is valid, else raise ConfigError."""
-    if not 0.0 <= speed <= FASTEST:
-        message = f"--speed is {speed:g}; 0 (as fast as it can) to {FASTEST:g} is accepted."
-        raise ConfigError(message, reason="speed_bad", speed=speed, most=FASTEST)
-    return speed
-
-
-def session_folder(
-    out: Path, request: SessionRequest, session: str | None = None, new: bool = False
-) -> tuple[Path, SessionHead | None]:
-    """Return the folder of the requested session in ``out``, and its head if it exists.
-
-    Args:
-        session: its name; None for the person's last session if that is unfinished, else for a new number.
-        new: whether to begin a new session in any case.
-
-    Raises:
-        ConfigError: if there is no subject, or a new session was requested and one of this name exists.
-        DatasetError: for an invalid code or name.
-    """
-    subject = request.subject
-    if not subject and request.protocol and load_protocol(request.protocol).needs_nobody:
-        subject = NOBODY
-    if not subject:
-        message = "The session has no person: give --subject with the person's code, such as S01."
-        raise ConfigError(message, reason="no_person")
-    person = out / check_subject(subject)
-    if session is not None:
-        name = check_session(session)
-    else:
-        name = new_session(person) if new else next_session(person)
-    known = SessionHead.read(person / name)
-    if known is not None and new:
-        message = f"The session '{person / name}' exists: leave --new off, or give another --session."
-        raise ConfigError(message, reason="session_exists", name=f"{person.name}/{name}")
-    return person / name, known
-
-
-def session_layout(request: SessionRequest, folder: Path, known: SessionHead | None) -> Layout | str | None:
-    """Return the layout to open the toy with; None for that of the URL."""
-    if not request.layout and known is not None:
-        return Layout.from_dict(known.layout, f"layout in '{folder}'")
-    return request.layout or None
-
-
-def session_head(request: SessionRequest, folder: Path, fresh: bool, layout: Layout, software: str) -> SessionHead:
-    """Return the head of the requested session; for a continued session, settings not requested are empty.
-
-    Args:
-        fresh: whether the session is new.
-        layout: the layout of the open toy.
-        software: name and version of the recording program.
-    """
-    named = request.protocol or (PROTOCOL if fresh else "")
-    if not named and request.words:
-        raise ConfigError("--words goes with --protocol: a continued session keeps the wording it began with.")
-    protocol = load_protocol(named, request.words or None) if named else None
-    if protocol is not None and protocol.order == "random" and fresh and not protocol.seed:
-        protocol = replace(protocol, seed=1 + secrets.randbelow(2**31 - 1))
-    return SessionHead(
-        subject=folder.parent.name,
-        session=folder.name,
-        started_ms=now_ms(),
-        layout=layout.to_dict(),
-        protocol=protocol.to_dict() if protocol is not None else {},
-        age_group=request.age_group,
-        gender=request.gender,
-        consent=request.consent,
-        device=request.device,
-        software=software,
-        simulated=request.simulated or is_virtual(request.device) or request.speed != 1.0,
-    )
-
-
-def is_pseudo_terminal(request: SessionRequest, head: SessionHead) -> bool:
-    """Return whether the port is a pseudo terminal, possibly of a virtual toy that is not marked ``simulated``."""
-    return "/dev/pts/" in request.device and not head.simulated
-
-
-def lacks_consent(head: SessionHead) -> bool:
-    """Return whether a real session with a person has no reference to a signed consent form."""
-    return not (head.consent or head.subject == NOBODY or head.simulated)

@@ -22,12 +22,14 @@ from plushsense.devices.opening import (
     SCAN_S,
     DeviceListing,
     check_address,
+    is_virtual,
     list_devices,
     open_device,
     parse_url,
+    speed_of,
+    with_speed,
 )
 from plushsense.devices.reconnect import ConnectionGap
-from plushsense.recording.recorder import is_virtual, speed_of, with_speed
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
 
 KEPT_S = 60.0

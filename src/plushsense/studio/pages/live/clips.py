@@ -23,12 +23,12 @@ from plushsense.core.version import __version__
 from plushsense.dataset.importing.build import ImportSummary
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.devices.base import Counters, Frame, LossCounter, now_ms
+from plushsense.devices.opening import speed_of, with_speed
 from plushsense.models.bundle import Bundle
 from plushsense.recording.plan import Protocol, Step
-from plushsense.recording.recorder import speed_of, with_speed
+from plushsense.recording.recorder import store_take
 from plushsense.recording.session import OpenSession, check_subject, new_event, new_session
 from plushsense.recording.session_files import SIDECAR, SessionEvent, SessionHead, read_events
-from plushsense.recording.states import store_take
 from plushsense.recording.takes import FrameReceiver, RecordingTake, gap_entry
 from plushsense.recording.writer import BackgroundWriter, StreamFile
 from plushsense.studio.app.toys import TappedDevice

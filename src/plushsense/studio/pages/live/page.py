@@ -11,8 +11,8 @@ from typing import Any
 from nicegui import context, ui
 
 from plushsense.core.errors import BundleError, ConfigError, PlushSenseError
+from plushsense.devices.opening import is_virtual
 from plushsense.live.reactions import reaction_names
-from plushsense.recording.recorder import is_virtual
 from plushsense.studio.app.shell import Page, button, named, on_change, query, query_path, tag
 from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.workspace import VIRTUAL, Workspace

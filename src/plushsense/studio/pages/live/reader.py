@@ -14,13 +14,12 @@ from typing import Any
 from plushsense.core.errors import ArchError, BundleError, ConfigError, DatasetError, DeviceError, PlushSenseError
 from plushsense.dataset.importing.sources import is_simulation
 from plushsense.deploy.quantize import classifier_of
-from plushsense.devices.opening import open_device, parse_url
+from plushsense.devices.opening import is_virtual, open_device, parse_url, with_speed
 from plushsense.devices.virtual.stream import PerformedGesture, VirtualDevice
 from plushsense.live.loop import LiveRun
 from plushsense.live.loop import run_live as run_on
 from plushsense.live.reactions import Reactor, load_reactions
 from plushsense.models.bundle import Bundle
-from plushsense.recording.recorder import is_virtual, with_speed
 from plushsense.recording.session_files import SessionHead
 from plushsense.runtime.classifier import Decision, GestureEvent
 from plushsense.runtime.decisions import DecideSpec

@@ -9,7 +9,7 @@ from markupsafe import Markup
 from nicegui import ui
 from nicegui.element import Element
 
-from plushsense.recording.states import RecorderStatus
+from plushsense.recording.status import RecorderStatus
 from plushsense.studio.app.shell import Page, add_style, html, on_change, tag
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.widgets.elements import own_picture, picture

@@ -9,9 +9,8 @@ from nicegui import run, ui
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.gestures import load_gestures
-from plushsense.devices.opening import list_devices
+from plushsense.devices.opening import is_virtual, list_devices
 from plushsense.recording.plan import ORDERS
-from plushsense.recording.recorder import is_virtual
 from plushsense.studio.app.shell import Page, button, named, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import RecordController

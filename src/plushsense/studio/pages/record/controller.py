@@ -13,24 +13,18 @@ from plushsense.core.sentences import Sentence
 from plushsense.core.toml import builtin_names
 from plushsense.core.version import __version__
 from plushsense.devices.lsl import MARKERS, LslMarkers
-from plushsense.devices.opening import parse_url
+from plushsense.devices.opening import is_virtual, parse_url, speed_of, with_speed
 from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.recording.plan import save_protocol
-from plushsense.recording.recorder import (
-    Recorder,
+from plushsense.recording.recorder import Recorder, open_toy, prompt_virtual, send_markers
+from plushsense.recording.request import (
     SessionRequest,
     check_speed,
     is_pseudo_terminal,
-    is_virtual,
     lacks_consent,
-    open_toy,
-    prompt_virtual,
-    send_markers,
     session_folder,
     session_head,
     session_layout,
-    speed_of,
-    with_speed,
 )
 from plushsense.recording.session import (
     OpenSession,
@@ -85,7 +79,7 @@ class ActiveSession:
 
         Args:
             key: " ", "r", "s", "b" or "p" as in the terminal recorder, or ``go:<number of the step>``.
-            seen: `plushsense.recording.states.RecorderStatus.seen` of the status that the page displayed.
+            seen: `plushsense.recording.status.RecorderStatus.seen` of the status that the page displayed.
 
         Raises:
             ConfigError: for an unknown command.

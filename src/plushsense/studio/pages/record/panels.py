@@ -9,7 +9,7 @@ from typing import Any
 
 from nicegui import ui
 
-from plushsense.recording.states import RecorderStatus
+from plushsense.recording.status import RecorderStatus
 from plushsense.studio.app.shell import LINES, Page, button, named, on_click, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.pages.record.controller import ActiveSession

@@ -18,7 +18,7 @@ from plushsense.core.toml import loads_json
 from plushsense.dataset.quality.comparisons import usual_seconds
 from plushsense.dataset.quality.findings import CheckLimits
 from plushsense.recording.session_files import SIDECAR, discarded_recordings
-from plushsense.recording.states import RecorderStatus
+from plushsense.recording.status import RecorderStatus
 from plushsense.reports.quality_figures import line
 from plushsense.studio.app.shell import Page, html, tag
 from plushsense.studio.app.words import Words

@@ -12,7 +12,7 @@ from nicegui.events import GenericEventArguments
 
 from plushsense.core.errors import DatasetError, PlushSenseError
 from plushsense.recording.session_files import SessionHead
-from plushsense.recording.states import RecorderStatus
+from plushsense.recording.status import RecorderStatus
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import Keys, Page, address, button, focus, html, named, on_change, on_click, tag
 from plushsense.studio.app.words import Words
