@@ -62,7 +62,7 @@ def samples_of(layout: Layout, lines: list[bytes]) -> np.ndarray:
     """Return the samples (T, I) that a network reads from these lines."""
     parser, clock, inputs = LineParser(layout), SampleClock(layout), SampleInputs(layout)
     frames = [frame for line in lines for frame in parser.feed(line)]
-    return np.array([inputs(row) for frame in frames for row in clock.rows(frame.device_ms, frame.values)])
+    return np.array([inputs(row.tolist()) for frame in frames for row in clock.push(frame.device_ms, frame.values)])
 
 
 def made_up(layout: Layout, symbol: str = "14d1_19d2_19d4") -> Bundle:

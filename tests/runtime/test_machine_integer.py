@@ -58,6 +58,7 @@ def of_live(model: IntegerModel, frames: list[Frame]) -> np.ndarray:
     answers, events = [], []
     labels, period = model.gestures.labels, model.layout.period_us
     zero = frames[0].device_ms * 1000.0
+    seen, left_out = frames[0].device_ms, False
 
     def ms(t_s: float, zero: float) -> int:
         at = t_s * 1e6 + zero
@@ -66,9 +67,13 @@ def of_live(model: IntegerModel, frames: list[Frame]) -> np.ndarray:
 
     for row, frame in enumerate([*frames, None]):
         before = zero
-        # Over a clock reset a decision's time goes on where it was; the toy's own clock does not.
-        if row and frame and frame.device_ms < frames[row - 1].device_ms:
-            zero += (frame.device_ms - frames[row - 1].device_ms) * 1000 - period
+        if frame:
+            left_out = not left_out and not 0 <= frame.device_ms - seen <= model.layout.gap_ms
+        if frame and not left_out:
+            # Over a clock reset a decision's time goes on where it was; the toy's own clock does not.
+            if frame.device_ms < seen:
+                zero += (frame.device_ms - seen) * 1000 - period
+            seen = frame.device_ms
         for d in classifier.push(frame) if frame else [classifier.silence()]:
             row = min(row, len(frames) - 1)
             since = before if d.state == "no signal" else zero

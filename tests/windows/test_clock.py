@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from plushsense.core.layouts import Layout, load_layout
-from plushsense.core.recorder_csv import Frames
-from plushsense.windows.clock import SampleClock, resample
+from plushsense.core.recorder_csv import Frames, kept_rows
+from plushsense.windows.clock import SampleClock, resample, row_times_us
 
 ACCEL = load_layout("accel-3")
 
@@ -36,11 +36,57 @@ def test_linear_between_frames_rounded_half_up() -> None:
     assert out[0].row_of.tolist() == [0, 1, 1, 2]
 
 
-def test_gaps_and_resets_start_again() -> None:
-    given_frames = frames([0, 100, 201, 150, 160], [[i, 0, 0] for i in range(5)])
+def test_gaps_and_resets_start_again_at_the_second_frame() -> None:
+    given_frames = frames([0, 100, 201, 211, 150, 160], [[i, 0, 0] for i in range(6)])
     out = resample(given_frames, ACCEL)
-    assert [s.first_row for s in out] == [0, 2, 3], "100 ms are bridged, 101 ms are not, nor a step back"
-    assert [len(s) for s in out] == [11, 1, 2]
+    assert [s.first_row for s in out] == [0, 3, 5], "100 ms are bridged, 101 ms are not, nor two steps back"
+    assert [s.last_row for s in out] == [2, 4, 6]
+    assert [len(s) for s in out] == [11, 1, 1]
+
+
+@pytest.mark.parametrize("wrong", [[0], [20_000], [1_017, 0], [1_009]])
+def test_one_impossible_time_is_bridged(wrong: list[int]) -> None:
+    """As of the authors' recorder, which writes 0 for what it cannot read: alone, or with zeros for all values."""
+    times = [1000, 1010, *wrong, 1030, 1040]
+    rows = [[0, 0, 7], [10, 0, 7], *[[0, 0, 0]] * len(wrong), [30, 0, 7], [40, 0, 7]]
+    (segment,) = resample(frames(times, rows), ACCEL)
+    if len(wrong) == 1:
+        assert segment.data.tolist() == [[at, 0, 7] for at in (0, 10, 20, 30, 40)]
+        assert segment.row_of.tolist() == [0, 1, 3, 3, 4]
+    assert (segment.first_row, segment.last_row) == (0, len(times))
+    clock = SampleClock(ACCEL)
+    kept = [(len(clock.push(t, row)), clock.left_out)[1] for t, row in zip(times, rows, strict=True)]
+    assert kept.count(True) == 1 and clock.restarts == 0
+
+
+@pytest.mark.parametrize("wrong", [[0, 0], [0, 5], [0, 20_000], [20_000, 0]])
+def test_two_impossible_times_in_turn_are_taken_for_a_reset(wrong: list[int]) -> None:
+    times = [1000, 1010, *wrong, 1040, 1050, 1060]
+    out = resample(frames(times, [[at, 0, 0] for at in range(len(times))]), ACCEL)
+    assert [s.first_row for s in out] == [0, 3, 5]
+    clock = SampleClock(ACCEL)
+    for t in times:
+        clock.push(t, (0, 0, 0))
+    assert clock.restarts == 2
+
+
+def test_an_impossible_time_at_the_beginning_or_end() -> None:
+    out = resample(frames([0, 1000, 1010, 1020, 3], [[at, 0, 0] for at in range(5)]), ACCEL)
+    assert [(s.first_row, s.last_row) for s in out] == [(0, 1), (2, 4)]
+
+
+def test_times_of_rows_go_on_over_impossible_ones_and_resets() -> None:
+    times = row_times_us(frames([1000, 1010, 0, 1030, 5000, 5010, 3, 13, 23, 9], [[0, 0, 0]] * 10), ACCEL)
+    assert times.tolist() == [t * 1000 for t in (0, 10, 30, 30, 4010, 4010, 4020, 4020, 4030, 4030)]
+    assert len(row_times_us(frames([], []), ACCEL)) == 0
+
+
+def test_the_authors_recordings_give_their_windows_in_spite_of_one_wrong_time() -> None:
+    """Row 100 of 502 has the clock 0, as after a token that their recorder could not read."""
+    times = [40_000 + 10 * at for at in range(502)]
+    times[100] = 0
+    (segment,) = resample(frames(times, [[at, 0, 0] for at in range(502)]), ACCEL)
+    assert len(segment) == 502 and segment.data[:, 0].tolist() == list(range(502)), "row 100 is half-way between"
 
 
 def test_equal_stamps_first_closes_last_opens() -> None:
@@ -72,15 +118,30 @@ def test_a_causal_rule_does_not_wait_longer_than_one_frame() -> None:
 
 steps = st.lists(st.one_of(st.integers(0, 40), st.integers(90, 130), st.integers(-50, -1)), min_size=1, max_size=60)
 value = st.one_of(st.integers(-40_000, 40_000), st.sampled_from([-32768, 32767, 32768, -32769]))
+strays = st.lists(st.tuples(st.integers(0, 60), st.sampled_from([0, 0, 1, 9_000, 1 << 31])), max_size=12)
+
+
+def in_turn(clock: list[int], gap_ms: int) -> list[int]:
+    """Return the rows that rule 1 keeps, one after the other, as it is worded."""
+    kept, left_out = [0], False
+    for at in range(1, len(clock)):
+        odd = not 0 <= clock[at] - clock[kept[-1]] <= gap_ms
+        left_out = odd and not left_out
+        if not left_out:
+            kept.append(at)
+    return kept
 
 
 @settings(max_examples=200)
-@given(st.data(), steps)
-def test_stream_equals_batch_in_every_bit(data: st.DataObject, moves: list[int]) -> None:
-    clock = np.cumsum([0, *moves]).tolist()
+@given(st.data(), steps, strays)
+def test_stream_equals_batch_in_every_bit(data: st.DataObject, moves: list[int], wrong: list[tuple[int, int]]) -> None:
+    clock = np.cumsum([1000, *moves]).tolist()
+    for at, time in wrong:  # single ones, some in turn, some beside gaps
+        clock[at % len(clock)] = time
     rows = data.draw(st.lists(st.lists(value, min_size=3, max_size=3), min_size=len(clock), max_size=len(clock)))
     given_frames = frames(clock, rows)
     layout = replace(ACCEL, rate_hz=data.draw(st.sampled_from([100.0, 60.0])))
+    assert kept_rows(given_frames.device_ms, layout.gap_ms).tolist() == in_turn(clock, layout.gap_ms)
     batch = resample(given_frames, layout)
     live = streamed(given_frames, layout)
     assert len(batch) == len(live)

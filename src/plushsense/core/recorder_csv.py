@@ -179,6 +179,32 @@ class Frames:
             None if self.labels is None else self.labels[part],
         )
 
+    def take(self, rows: NDArray[np.int64]) -> Frames:
+        """Return the rows with the indices ``rows``."""
+        host, labels = self.host_ms, self.labels
+        return Frames(
+            self.values[rows],
+            self.device_ms[rows],
+            None if host is None else host[rows],
+            None if labels is None else labels[rows],
+        )
+
+
+def kept_rows(device_ms: NDArray[np.int64], gap_ms: float) -> NDArray[np.int64]:
+    """Return the rows that rule 1 of `plushsense.windows.clock` keeps, in order.
+
+    A row is left out if its clock is earlier than in the row before, or more than ``gap_ms`` later, unless that row is
+    left out, too. Between two kept rows such a step is a gap or a reset of the clock.
+    """
+    step = np.diff(device_ms)
+    odd = np.flatnonzero((step < 0) | (step > gap_ms)) + 1
+    if not len(odd):
+        return np.arange(len(device_ms), dtype=np.int64)
+    # Of odd rows in turn, every other one is left out, from the first.
+    turn = np.arange(len(odd))
+    first = np.maximum.accumulate(np.where(np.diff(odd, prepend=-1) > 1, turn, 0))
+    return np.delete(np.arange(len(device_ms), dtype=np.int64), odd[(turn - first) % 2 == 0])
+
 
 @dataclass(frozen=True)
 class RecordingName:

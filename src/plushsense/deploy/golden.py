@@ -41,8 +41,8 @@ def golden_frames(
     """Generate frames (n, 1 + C) that cover the edge cases; the first column is the toy's clock in ms.
 
     The parts are touches and blows with clock jitter and lost frames; values out of range (also before the first valid
-    one); gaps that are just short enough and just too long; equal time stamps; a clock that is reset; channels at the
-    ends of their ranges and jumping between them; sensors that fail and recover by the ``health`` settings; the clock's
+    one); gaps that are just short enough and just too long; equal time stamps; impossible times; a clock that is reset;
+    channels at the ends of their ranges and jumping between them; sensors that fail and recover by the ``health`` settings; the clock's
     wrap at 2^32. If ``inputs`` is given, also interpolated samples half-way between two values with different 8-bit
     codes, where a rounding error has effect. Each part is longer than ``span``, so that answers follow every restart.
     """
@@ -51,6 +51,8 @@ def golden_frames(
     generator.touches(6, garbage_channel=0)
     generator.touches(part + 300, lost=0.03, blows=0.02)
     generator.touches(part, garbage=0.05)
+    generator.strays()
+    generator.touches(part)
     generator.wait(layout.gap_ms)
     generator.touches(60)
     generator.wait(layout.gap_ms + 1)
@@ -137,6 +139,26 @@ class FrameGenerator:
                 self.put(values)
             if rng.random() >= equal:
                 self.now += max(0, self.pace() + int(rng.integers(-2, 3)))
+
+    def stray(self, ms: int, *, zeros: bool = False) -> None:
+        """Add a frame with the impossible time ``ms``, of a touch or of ``zeros``; then time goes on as before it."""
+        following = self.now
+        self.now = ms
+        self.touches(1)
+        if zeros:
+            self.rows[-1][1:] = [0] * len(self.mean)
+        self.now = following + self.pace()
+
+    def strays(self) -> None:
+        """Add three single frames with impossible times, which are bridged, and two in turn, which restart the stream."""
+        for zeros in (False, True):
+            self.touches(20)
+            self.stray(0, zeros=zeros)
+        self.touches(20)
+        self.stray(self.now + 40_000)
+        self.touches(20)
+        self.stray(0)
+        self.stray(self.now + 80_000)
 
     def frozen(self, n: int) -> None:
         """Repeat the last frame ``n`` times."""

@@ -128,7 +128,7 @@ def cut_correction(
         message = f"The event was reported as '{right}' already: choose what it really was."
         raise BadInput(message, reason="mark_same", gesture=right)
     begun_s = min(begun_s, ended_s - 2 * bundle.arch.step * bundle.layout.period_us / 1e6)
-    passed_s = row_times_us(frames, bundle.layout.period_us) / 1e6
+    passed_s = row_times_us(frames, bundle.layout) / 1e6
     first, last = np.searchsorted(passed_s, (begun_s - LEAD_S, ended_s + 1e-6)).tolist()
     if first == last:
         message = f"The rows of the event '{gesture}' are not kept any more: mark an event soon after it."

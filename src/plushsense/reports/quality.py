@@ -38,7 +38,9 @@ PLOTS = 12
 PICTURE_BYTES = 10_000_000
 """Maximum size in bytes of all pictures of a page; base64 makes them a third larger."""
 _NAMED_CHECKS = ("never-stopped", "too-short", "duration", "no-onset", "several-gestures", "stuck", "flat")
-_CLOCK_CHECKS = ("clock-still", "clock-reset", "out-of-order", "gaps", "lost-frames", "jitter", "resumed", "rate")
+_CLOCK_CHECKS = (
+    *("clock-still", "clock-reset", "clock-value", "out-of-order", "gaps", "lost-frames", "jitter", "resumed", "rate"),
+)
 _SIGNAL_CHECKS = (
     *("never-stopped", "duration", "no-onset", "several-gestures", "overlap", "clock-reset", "gaps"),
     *("garbage", "blank-rows", "spikes", "flat", "stuck", "saturated"),

@@ -106,8 +106,8 @@ class StreamReader:
     """Reads the frames of one toy and returns decisions.
 
     There is a decision every ``step`` samples, and also when the gate fires, the signal was lost or sensors fail. The
-    first frame after a gap beyond the layout's ``gap_ms`` or a reset of the device clock gives ``no signal``, at the
-    time of the last frame before. During a sensor fault there are no decisions.
+    second frame after a gap beyond the layout's ``gap_ms`` or a reset of the device clock gives ``no signal``, at the
+    time of the last frame before; the first one is left out. During a sensor fault there are no decisions.
 
     The arguments are those of `ToyMachine`.
 
@@ -147,7 +147,7 @@ class StreamReader:
 
     @property
     def time_s(self) -> float:
-        """Device time of the newest frame, in seconds since the first frame of the stream."""
+        """Device time of the newest frame that was not left out, in seconds since the first frame of the stream."""
         return self._machine.frames.time_us / 1e6
 
     def reset(self) -> None:
@@ -171,12 +171,14 @@ class StreamReader:
                 them, and whole milliseconds.
         """
         frame = whole_frame(frame, self.layout)
-        silent, self._silent = self._silent, False
         decisions = [
             self._decision(moment)
             for moment in self._machine.push(frame.device_ms, frame.values)
-            if not (silent and moment.cause == "no signal")  # `silence` has reported it already
+            if not (self._silent and moment.cause == "no signal")  # `silence` has reported it already
         ]
+        if self._machine.frames.clock.left_out:
+            return []
+        silent, self._silent = self._silent, False
         if silent and not decisions and self._machine.frames.health.fault:
             decisions.append(Decision(self.time_s, None, None, None, "cnn", "sensor fault", None))
         return decisions

@@ -1,8 +1,9 @@
 """The computation of a toy, from frames to events. All readers of frames use this module.
 
-1. `FrameReader` resamples frames to evenly spaced samples: it detects gaps and resets of the device clock, which break
-   the stream, checks sensor health, applies the clock rule and the self-calibration, and computes the inputs of the
-   network. Only the self-calibration survives a break: the sensor is still the same.
+1. `FrameReader` resamples frames to evenly spaced samples: it leaves out a single frame out of order, detects gaps and
+   resets of the device clock, which break the stream, checks sensor health, applies the clock rule and the
+   self-calibration, and computes the inputs of the network. Only the self-calibration survives a break: the sensor is
+   still the same.
 2. `SampleReader` passes each sample to the gate, and every ``step`` samples computes the network, the decision and the
    events. The steps are aligned so that the first answer is at the sample that completes the span. A break ends the
    open event and restarts everything.
@@ -92,8 +93,8 @@ class FrameReader:
 
     Attributes:
         zero_us: device time at which the stream's time is 0; it changes if the device clock is reset.
-        time_us: time of the newest frame.
-        clock: counts restarts and invalid values.
+        time_us: time of the newest frame that was not left out.
+        clock: leaves out single frames out of order; counts restarts and invalid values.
         health: detects and counts sensor faults.
     """
 
@@ -101,7 +102,7 @@ class FrameReader:
         self.layout = layout
         self._calibration = SelfCalibration(layout)
         self._inputs = SampleInputs(layout)
-        self._gap_us, self._period_us = layout.gap_ms * 1000, layout.period_us
+        self._period_us = layout.period_us
         self.health = Health(health, layout)
         self.reset()
 
@@ -120,16 +121,22 @@ class FrameReader:
         self.clock.restarts, self.clock.invalid = other.clock.restarts, other.clock.invalid
 
     def push(self, device_ms: int, values: Sequence[int]) -> Iterator[Sample | Break]:
-        """Process one frame; yield samples and breaks. When one is yielded, counts and ``zero_us`` are valid for it."""
+        """Process one frame; yield samples and breaks. When one is yielded, counts and ``zero_us`` are valid for it.
+
+        A frame that rule 1 of `plushsense.windows.clock` leaves out has no effect, as if it had been lost.
+        """
         clock, health = self.clock, self.health
         device_us = int(device_ms) * 1000
         if not self._begun:
             self._begun, self.zero_us = True, device_us
-        gap_us = device_us - self.zero_us - self.time_us
-        if gap_us < 0 or gap_us > self._gap_us:
+        if not clock.keeps(device_ms):
+            return
+        if clock.restarted:
             if not health.fault:
                 yield Break(self.time_us, "no signal")
             health.clear()
+            self._inputs.reset()
+        gap_us = device_us - self.zero_us - self.time_us
         if gap_us < 0:
             self.zero_us += gap_us - self._period_us
         self.time_us = device_us - self.zero_us
@@ -141,9 +148,7 @@ class FrameReader:
             yield Break(self.time_us, "sensor fault")
         if health.fault:
             return
-        samples = clock.rows(device_ms, values)
-        if clock.restarted:
-            self._inputs.reset()
+        samples = clock.samples(values)
         if samples:
             suspect, period = health.suspect, self._period_us
             time_us = (clock.now_us or 0) - (len(samples) - 1) * period - self.zero_us

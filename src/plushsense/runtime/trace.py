@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import Layout
-from plushsense.core.recorder_csv import Frames
+from plushsense.core.recorder_csv import Frames, kept_rows
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.decisions import DecideSpec, Rules
@@ -103,8 +103,10 @@ def trace_of(frames: Frames, model: Bundle | IntegerModel, health: HealthSetting
     else:
         network, own = FloatLogits(model), DecideSpec.from_dict(model.decision).health
     layout = model.layout
+    times = row_times_us(frames, layout)
+    kept = kept_rows(frames.device_ms, layout.gap_ms)
+    frames, times = frames.take(kept), times[kept]
     suspect, fault, faults = _health_of(frames, layout, own if health is None else health)
-    times = row_times_us(frames, layout.period_us)
     step_ms = np.diff(frames.device_ms, prepend=frames.device_ms[:1])
     begins = (step_ms < 0) | (step_ms > layout.gap_ms)
     begins[1:] |= fault[1:] != fault[:-1]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import GestureSet
-from plushsense.core.recorder_csv import Frames
+from plushsense.core.recorder_csv import Frames, kept_rows
 from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.decisions import DecideSpec
@@ -64,7 +64,8 @@ def fit_health(dataset: Dataset, subjects: Iterable[str], settings: HealthSettin
     """
     settings = settings or HealthSettings()
     layout = dataset.layout
-    parts = [f for f in dataset.read_people(sorted(set(subjects))) if len(f)]
+    everything = (f for f in dataset.read_people(sorted(set(subjects))) if len(f))
+    parts = [f.take(kept_rows(f.device_ms, layout.gap_ms)) for f in everything]
     if not parts:
         return HealthFit(settings, 0, 0.0, (), 0)
     values = np.concatenate([f.values for f in parts])
@@ -313,17 +314,17 @@ def marked_streams(
         frames = dataset.read_stream(stream.id)
         frames = frames.slice(0, min(len(frames), left[stream.subject]))
         left[stream.subject] -= len(frames)
-        truths = truths_of(frames, marked[stream.id], gestures or bundle.gestures, dataset.layout.period_us)
+        truths = truths_of(frames, marked[stream.id], gestures or bundle.gestures, dataset.layout)
         if any(t.gesture != OTHER for t in truths):
             out.append(MarkedStream(stream.subject, trace_of(frames, bundle, spec.health), truths))
     return out
 
 
 def truths_of(
-    frames: Frames, recordings: Sequence[RecordingInfo], gestures: GestureSet, period_us: int
+    frames: Frames, recordings: Sequence[RecordingInfo], gestures: GestureSet, layout: Layout
 ) -> tuple[Truth, ...]:
     """Return the marked stretches of a stream in order of time; excluded recordings and other gestures are `OTHER`."""
-    times = row_times_us(frames, period_us)
+    times = row_times_us(frames, layout)
     out = []
     for r in recordings:
         first, last = r.stream_row + r.start, r.stream_row + r.stop

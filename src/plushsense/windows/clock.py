@@ -2,8 +2,10 @@
 
 A whole recording, a live stream and a toy's chip get identical samples, since all computations are in integers:
 
-1. A frame starts a new segment if its device clock is earlier than that of the previous frame, or more than
-   ``layout.gap_ms`` later. All state of later computations is then reset.
+1. A frame is out of order if its device clock is earlier than that of the frame before, or more than
+   ``layout.gap_ms`` later. It is left out, as if it had been lost, and the next frame is compared with the last one
+   that was not left out. If that is out of order, too, it starts a new segment: all state of later computations is
+   then reset. So a single impossible clock value is bridged, and a gap or a reset of the clock costs one frame.
 2. A value outside the valid range of its channel is replaced by the channel's last valid value in the segment. Frames
    are skipped until every channel has had a valid value.
 3. The first frame that is not skipped sets the time of sample 0; sample k is due ``k * period_us`` later. It is
@@ -22,13 +24,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.layouts import Layout
-from plushsense.core.recorder_csv import Frames
+from plushsense.core.recorder_csv import Frames, kept_rows
 
 
-def row_times_us(frames: Frames, period_us: int) -> NDArray[np.int64]:
-    """Return the time (T,) of every row since the first one; a clock reset counts as a step of ``period_us``."""
-    step = np.diff(frames.device_ms.astype(np.int64), prepend=frames.device_ms[:1]) * 1000
-    return np.cumsum(np.where(step < 0, period_us, step))
+def row_times_us(frames: Frames, layout: Layout) -> NDArray[np.int64]:
+    """Return the time (T,) of every row since the first one.
+
+    A clock reset counts as one sample. A row that rule 1 leaves out has the time of the next row that it keeps, or else
+    of the last one.
+    """
+    kept = kept_rows(frames.device_ms, layout.gap_ms)
+    clock = frames.device_ms[kept].astype(np.int64)
+    step = np.diff(clock, prepend=clock[:1]) * 1000
+    times = np.cumsum(np.where(step < 0, layout.period_us, step))
+    return times[np.minimum(np.searchsorted(kept, np.arange(len(frames))), len(kept) - 1)]
 
 
 @dataclass(frozen=True)
@@ -53,7 +62,14 @@ class Segment:
 
 
 class SampleClock:
-    """The clock rule for a live stream, one frame at a time."""
+    """The clock rule for a live stream, one frame at a time.
+
+    Attributes:
+        restarts: number of segments that a gap or a clock reset began.
+        invalid: number of values outside their valid range.
+        left_out: whether rule 1 left the newest frame out.
+        restarted: whether the newest frame started a new segment because of a gap or a clock reset.
+    """
 
     def __init__(self, layout: Layout) -> None:
         self._low = [int(v) for v in layout.valid_min_int]
@@ -62,16 +78,13 @@ class SampleClock:
         self._gap = layout.gap_ms * 1000
         self.restarts = 0
         self.invalid = 0
-        self.restarted = False
+        self.left_out = self.restarted = False
         self._seen_us: int | None = None
-        self._forget()
+        self.forget()
 
     def forget(self) -> None:
         """Start a new segment with the next frame."""
-        self._seen_us = None
-        self._forget()
-
-    def _forget(self) -> None:
+        self._empty = True
         self._held: list[int | None] = [None] * len(self._low)
         self._last: tuple[int, list[int]] | None = None
         self._start = 0
@@ -87,16 +100,31 @@ class SampleClock:
 
         If ``restarted`` is then true, the frame started a new segment: reset later computations before these samples.
         """
-        return [np.array(row, dtype=np.int64) for row in self.rows(device_ms, values)]
+        rows = self.samples(values) if self.keeps(device_ms) else []
+        return [np.array(row, dtype=np.int64) for row in rows]
 
-    def rows(self, device_ms: int, values: Sequence[int]) -> list[list[int]]:
-        """Do the same as `push`, but return plain integers, which is faster for a live stream."""
+    def keeps(self, device_ms: int) -> bool:
+        """Apply rule 1 to the time of the next frame; return False if the frame is left out."""
         time = int(device_ms) * 1000
-        seen, self._seen_us = self._seen_us, time
-        self.restarted = seen is not None and (time < seen or time - seen > self._gap)
-        if self.restarted:
+        seen = self._seen_us
+        odd = seen is not None and (time < seen or time - seen > self._gap)
+        self.left_out = odd and not self.left_out
+        self.restarted = odd and not self.left_out
+        if not self.left_out:
+            self._seen_us = time
+        return not self.left_out
+
+    def samples(self, values: Sequence[int]) -> list[list[int]]:
+        """Add the values of the frame that `keeps` has just kept; return the samples that it completes.
+
+        They are plain integers, which are faster for a live stream than the arrays of `push`.
+        """
+        time = self._seen_us
+        assert time is not None
+        if self.restarted and not self._empty:
             self.restarts += 1
-            self._forget()
+            self.forget()
+        self._empty = False
         held = self._held
         for i, (value, low, high) in enumerate(zip(values, self._low, self._high, strict=True)):
             if low <= value <= high:
@@ -129,15 +157,17 @@ class SampleClock:
 
 def resample(frames: Frames, layout: Layout) -> list[Segment]:
     """Resample a whole recording; the segments have the same samples as those of a `SampleClock`."""
-    time = frames.device_ms.astype(np.int64) * 1000
+    rows = kept_rows(frames.device_ms, layout.gap_ms)
+    time = frames.device_ms[rows].astype(np.int64) * 1000
     if len(time) == 0:
         return []
+    values = frames.values[rows]
     step = np.diff(time)
     breaks = np.flatnonzero((step < 0) | (step > layout.gap_ms * 1000)) + 1
     edges = [0, *breaks.tolist(), len(time)]
     segments = []
     for first, last in itertools.pairwise(edges):
-        segment = _segment(time[first:last], frames.values[first:last], layout, first)
+        segment = _segment(time[first:last], values[first:last], layout, rows[first:last])
         if segment is not None:
             segments.append(segment)
     return segments
@@ -169,11 +199,11 @@ def hold_valid(values: NDArray[np.int64], layout: Layout) -> tuple[NDArray[np.in
     return valid_values, first, int((~good).sum())
 
 
-def _segment(time: NDArray[np.int64], values: NDArray[np.int64], layout: Layout, offset: int) -> Segment | None:
+def _segment(time: NDArray[np.int64], values: NDArray[np.int64], layout: Layout, rows: NDArray[np.int64]) -> Segment | None:
     valid_values, first, invalid = hold_valid(values, layout)
     if first >= len(time):
         return None
-    time, valid_values = time[first:], valid_values[first:]
+    time, valid_values, rows = time[first:], valid_values[first:], rows[first:]
     period = layout.period_us
     # Of rows with equal times, the first ends an interval and the last starts the next one.
     opens = np.flatnonzero(np.append(np.diff(time) > 0, True))
@@ -192,8 +222,8 @@ def _segment(time: NDArray[np.int64], values: NDArray[np.int64], layout: Layout,
         data,
         int(time[0]),
         period,
-        offset + first,
-        offset + first + len(time),
-        offset + first + closes[right],
+        int(rows[0]),
+        int(rows[-1]) + 1,
+        rows[closes[right]],
         invalid,
     )

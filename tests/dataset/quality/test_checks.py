@@ -364,6 +364,14 @@ def leap(folder: Path) -> str:
     return change(folder / "streams" / "P2" / "fulldatastream.csv", lambda f: later(f, 5000, 900_000, 0))
 
 
+def unread_clock(folder: Path) -> str:
+    def how(frames: Frames) -> Frames:
+        frames.device_ms[100] = 0
+        return frames
+
+    return change(recording(folder), how)
+
+
 def overtaken(folder: Path) -> str:
     def how(frames: Frames) -> Frames:
         order = np.arange(len(frames))
@@ -440,6 +448,7 @@ PLANTS: list[tuple[str, Callable[[Path], str]]] = [
     ("clock-still", stalling),
     ("clock-reset", reset),
     ("clock-reset", leap),
+    ("clock-value", unread_clock),
     ("out-of-order", overtaken),
     ("gaps", gap),
     ("lost-frames", loss),
@@ -463,6 +472,29 @@ def test_a_planted_fault_is_found_where_it_is(name: str, plant: Callable[[Path],
         assert f.message.reason and english != f.message and latvian not in (english, f.message)
         # Numbers have a decimal comma; ids of files may have points.
         assert not re.search(r"(?<![\w./])\d+\.\d", latvian), latvian
+
+
+@pytest.mark.parametrize("host", [True, False])
+def test_one_impossible_clock_value_is_one_finding(host: bool) -> None:
+    times = 40_000 + 10 * np.arange(300)
+    clock = times.copy()
+    clock[[100, 200]] = 0, 90_000
+    frames = Frames(np.random.default_rng(1).integers(0, 900, (300, 13)), clock, times + START if host else None)
+    found = {
+        name: [issue.message for issue in check.run(Examination(frames, PLUSH))]
+        for name, check in CHECKS.items()
+        if name.startswith("clock-") or name in ("out-of-order", "gaps", "lost-frames", "jitter", "rate")
+    }
+    message = "2 rows with an impossible clock value between possible ones (first row 101)"
+    assert {name: messages for name, messages in found.items() if messages} == {"clock-value": [message]}
+
+
+@pytest.mark.parametrize("wrong", [{100: 0, 101: 0}, {100: 0, 101: 90_000}])
+def test_two_impossible_clock_values_in_turn_are_resets(wrong: dict[int, int]) -> None:
+    clock = 40_000 + 10 * np.arange(300)
+    clock[[*wrong]] = [*wrong.values()]
+    examined = Examination(Frames(np.zeros((300, 13), dtype=np.int64), clock), PLUSH)
+    assert examined.stray.tolist() == [] and [int(at) for at in examined.back[0]]
 
 
 def test_rows_that_came_late_are_no_reset_of_the_clock(copy: Path) -> None:

@@ -46,7 +46,7 @@ def test_a_virtual_sitting_is_the_same_each_time_and_another_for_each_person_and
 def test_a_blow_is_there_to_feel_at_its_onset_and_not_before():
     """On the quiet table: in its first 0.1 s the accelerometer moves far more than in all the waiting before."""
     one = sitting()
-    times = row_times_us(one.frames, PLUSH.period_us) / 1e6
+    times = row_times_us(one.frames, PLUSH) / 1e6
     acc = one.frames.values[:, [PLUSH.index(n) for n in ("acc_x", "acc_y", "acc_z")]]
     jerk = np.concatenate(([0], np.abs(np.diff(acc, axis=0)).sum(axis=1)))
     for trial in one.trials:
@@ -94,7 +94,7 @@ def test_rows_have_the_times_that_a_live_reader_counts_over_gaps_and_clock_reset
     for now, values in zip(frames.device_ms, frames.values, strict=True):
         list(reader.push(int(now), values.tolist()))
         live.append(reader.time_us / 1e6)
-    np.testing.assert_allclose(row_times_us(frames, layout.period_us) / 1e6, live, atol=1e-9)
+    np.testing.assert_allclose(row_times_us(frames, layout) / 1e6, live, atol=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def test_recorded_trials_lie_where_the_recordings_are_in_the_stream(recorded):
     assert [(t.label, t.repetition) for t in one.trials] == [
         ("Back stroke 1", 1), ("Back stroke 1", 2), ("Tail hit 1", 1), ("Tail hit 1", 2),
     ]  # fmt: skip
-    times = row_times_us(one.frames, PLUSH.period_us) / 1e6
+    times = row_times_us(one.frames, PLUSH) / 1e6
     for trial, info in zip(
         one.trials, sorted((r for r in recorded.used if r.subject == "P01"), key=lambda r: r.start_ms), strict=True
     ):

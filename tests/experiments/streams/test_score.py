@@ -154,7 +154,7 @@ def bundle(seed: int = 3, people: tuple[str, ...] = ()) -> Bundle:
 
 def test_rows_have_the_time_of_the_trace() -> None:
     frames = troubled()
-    times = row_times_us(frames, 10_000) / 1e6
+    times = row_times_us(frames, ACCEL) / 1e6
     trace = trace_of(frames, bundle())
     assert [p.start_us / 1e6 for p in trace.parts] == pytest.approx([times[0], times[300], times[600]], abs=0.011)
     assert [p.ends_us / 1e6 for p in trace.parts] == pytest.approx([times[299], times[599], times[-1]])

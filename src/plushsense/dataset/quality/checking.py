@@ -47,6 +47,7 @@ _LOOK = "look at its plot; trim or exclude it, or accept"
 _TO_ONE = "trim it to one gesture, or exclude it"
 _SENSOR = "check the sensor; exclude it if the gesture is hit"
 _RADIO = "check cable and radio; exclude it if the gesture is hit"
+_OVERTAKEN = "check the radio; readers leave out a single such row, and restart at several"
 _RESTART = "nothing: readers restart there"
 _DIGITS = "import it again, with all digits of its times or with row_rate_hz in a pattern"
 _LEFT_OUT = "nothing: that line is left out"
@@ -61,7 +62,10 @@ CHECKS: dict[str, Check] = {
     "clock-reset": Check(
         recordings.clock_reset, (_R, _S), "error", "trim it to one side, or exclude it", True, _RESTART
     ),
-    "out-of-order": Check(recordings.out_of_order, (_R, _S), "warning", "check the radio; readers restart there", True),
+    "clock-value": Check(
+        recordings.clock_value, (_R, _S), "warning", "check the cable; readers leave out each such row", True
+    ),
+    "out-of-order": Check(recordings.out_of_order, (_R, _S), "warning", _OVERTAKEN, True),
     "gaps": Check(recordings.gaps, (_R, _S), "warning", "exclude it if the gesture is hit, or accept", True, _RESTART),
     "lost-frames": Check(recordings.lost_frames, (_R, _S), "warning", _RADIO),
     "rate": Check(recordings.rate, (_R, _S), "warning", "check firmware and layout; training resamples it", True),

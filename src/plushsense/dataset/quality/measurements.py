@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.layouts import ACCELERATION, Layout
-from plushsense.core.recorder_csv import Frames
+from plushsense.core.recorder_csv import Frames, kept_rows
 from plushsense.dataset.quality.copies import HashedRows
 from plushsense.dataset.quality.findings import CheckLimits
 from plushsense.dataset.store import Dataset, RecordingInfo, StreamInfo
@@ -111,20 +111,38 @@ class Examination:
     stream: bool = False
 
     @cached_property
+    def stray(self) -> NDArray[np.int64]:
+        """Rows with an impossible time between two rows that follow each other; readers leave them out.
+
+        Rows that came late are not among them.
+        """
+        clock = self.frames.device_ms
+        left_out = np.setdiff1d(np.arange(len(clock) - 1), kept_rows(clock, self.layout.gap_ms))
+        ahead = clock[left_out + 1] - clock[left_out - 1]
+        bridged = left_out[(ahead >= 0) & (ahead <= self.layout.gap_ms)]
+        return np.setdiff1d(bridged, backward_steps(clock)[1] + 1) if len(bridged) else bridged
+
+    @cached_property
+    def times(self) -> NDArray[np.int64]:
+        """Device time of each row in ms, (T,); `stray` rows have the middle between the times around them."""
+        times = self.frames.device_ms.copy()
+        times[self.stray] = (times[self.stray - 1] + times[self.stray + 1]) // 2
+        return times
+
+    @cached_property
     def steps(self) -> NDArray[np.int64]:
         """Device time from each row to the next in ms, (T − 1,)."""
-        return np.diff(self.frames.device_ms)
+        return np.diff(self.times)
 
     @cached_property
     def back(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows after which the device clock was reset, and rows after which a row came late, see `backward_steps`."""
-        return backward_steps(self.frames.device_ms)
+        return backward_steps(self.times)
 
     @cached_property
     def ordered_steps(self) -> NDArray[np.int64]:
         """Like `steps`, after rows that came late are put in order, so that they leave no gaps."""
-        times = self.frames.device_ms
-        return np.diff(times[in_order(times)]) if len(self.back[1]) else self.steps
+        return np.diff(self.times[in_order(self.times)]) if len(self.back[1]) else self.steps
 
     @cached_property
     def period_ms(self) -> float:
@@ -179,8 +197,8 @@ class Examination:
             return gaps
         # With uneven stamps, a delay that later frames catch up is no gap: compare the duration of the rows around it
         # with their number.
-        rate = measured_rate_hz(self.frames.device_ms)
-        time, reach = self.frames.device_ms, 15
+        rate = measured_rate_hz(self.times)
+        time, reach = self.times, 15
         low, high = np.maximum(gaps - reach, 0), np.minimum(gaps + 1 + reach, len(time) - 1)
         late = (time[high] - time[low]) - (high - low) * 1000.0 / rate
         return gaps[late > self.gap_ms]

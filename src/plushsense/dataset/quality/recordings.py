@@ -191,6 +191,18 @@ def clock_reset(s: Examination) -> Iterator[Issue]:
         )
 
 
+def clock_value(s: Examination) -> Iterator[Issue]:
+    """Find single rows with an impossible time, as where the recorder could not read the clock and wrote 0."""
+    if len(s.stray):
+        n, row = len(s.stray), s.row(int(s.stray[0]))
+        message = f"{_plural(n, 'row')} with an impossible clock value between possible ones (first row {row})"
+        yield Issue(
+            Sentence(message, "clock_value", n=n, row=row),
+            _ranges(s.stray, s),
+            severity=_weight(n / len(s.frames), s.limits),
+        )
+
+
 def out_of_order(s: Examination) -> Iterator[Issue]:
     """Find rows that came after later ones, as packets of a radio do that overtake each other."""
     _, late = s.back
@@ -228,7 +240,7 @@ def lost_frames(s: Examination) -> Iterator[Issue]:
     if lost >= _FEW_LOST and share > s.limits.lost and not s.in_bursts:
         # Frames that a single delay kept back, and that came at once after it, are not lost.
         counter = LossCounter()
-        counted = sum(map(counter.push, s.frames.device_ms[in_order(s.frames.device_ms)].tolist()))
+        counted = sum(map(counter.push, s.times[in_order(s.times)].tolist()))
         if 2 * counted < lost:
             lost, share = counted, counted / (counted + len(s.frames))
     if lost >= _FEW_LOST and share > s.limits.lost:

@@ -2581,6 +2581,7 @@ void plush_restart(plush_toy *toy)
     lose(toy, toy->seen_ms);
     forget_health(toy);
     forget(toy);
+    toy->follows = 0;
 }
 
 PLUSH_SMALL plush_status plush_begin(plush_toy *toy, const uint8_t *model, uint32_t model_bytes, void *memory,
@@ -2675,6 +2676,11 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
     if (toy->memory == NULL) /* plush_begin() has not said PLUSH_OK */
         return 0;
     if (ms < toy->seen_ms || ms - toy->seen_ms > toy->gap / toy->units_per_ms) {
+        if (toy->follows) { /* only if the next one is out of order, too, the clock is right */
+            toy->follows = 0;
+            toy->reading = PLUSH_READING_LEFT_OUT;
+            return 0;
+        }
         lose(toy, toy->seen_ms);
         forget_health(toy);
         if (toy->heard) { /* not in a fault, nor with the very first frame */
@@ -2682,6 +2688,7 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values)
             forget(toy);
         }
     }
+    toy->follows = 1;
     toy->seen_ms = ms;
     if (examine(toy, ms, values)) {
         if (toy->faulty)

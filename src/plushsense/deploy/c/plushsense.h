@@ -18,9 +18,10 @@
  *
  * Missed ticks. Readings carry the time at which they were taken, and only that time counts: reading late, or several
  * at once, changes no answer. Readings that are missing for up to the model's gap (100 ms as a rule) are bridged by
- * interpolation, and every answer that fell due meanwhile is given, in order. After a longer gap, or when the clock
- * runs backwards (also when it wraps after 2^32 ms), everything remembered is dropped: the toy is warming again. What
- * was going on ends then, with the next reading; if none may ever come, call plush_silence() when you miss it.
+ * interpolation, and every answer that fell due meanwhile is given, in order. A reading after a longer gap, or whose clock
+ * runs backwards (also when it wraps after 2^32 ms), is left out, so that a single wrong time does no harm. If the next one
+ * does not follow on the last one that was used either, everything remembered is dropped: the toy is warming again. What
+ * was going on ends then, with that reading; if none may ever come, call plush_silence() when you miss it.
  *
  * Time has steps of 1 ms. A reading is taken to be up to 1 ms older than it is; of readings every 10 ms with stamps that are
  * cut to whole ms, a movement of 3 Hz differs by 0.5 % of its size (rms), one of 10 Hz by 1.6 %, and stamps of a timer that
@@ -80,14 +81,15 @@ typedef enum {
     PLUSH_AFFECT_NEGATIVE = 3
 } plush_affect;
 
-/* What became of the newest reading: why plush_push() returned what it did. Below PLUSH_READING_FIRST it was not used, and
- * no answer fell due. */
+/* What became of the newest reading: why plush_push() returned what it did. Only PLUSH_READING_FIRST and PLUSH_READING_USED
+ * were used; else no answer fell due. */
 typedef enum {
     PLUSH_READING_NONE = 0,     /* there was none yet; or no model is running, because plush_begin() has not said PLUSH_OK */
     PLUSH_READING_WAITING = 1,  /* some channel has had no valid value yet since the start or the last restart */
     PLUSH_READING_FAULT = 2,    /* passed over: the sensors cannot be believed */
     PLUSH_READING_FIRST = 3,    /* used as the first of a stream: after the start, a gap, a clock that ran backwards, a fault */
-    PLUSH_READING_USED = 4      /* used to go on; 0 answers fell due unless it completed a step */
+    PLUSH_READING_USED = 4,     /* used to go on; 0 answers fell due unless it completed a step */
+    PLUSH_READING_LEFT_OUT = 5  /* left out: its time is before that of the one before, or further after it than the gap */
 } plush_reading;
 
 /* What an answer is worth. */
@@ -228,6 +230,7 @@ typedef struct plush_toy {
 
     /* Clock: all in the model's own units of time, reckoned from the newest frame, so that nothing grows. */
     uint8_t heard, running;  /* a frame has come; samples are being made */
+    uint8_t follows;         /* the frame before was not left out */
     uint32_t seen_ms, last_ms;
     uint32_t due;            /* from the last usable frame to the next sample */
     uint8_t *valid;          /* of each channel: whether it has had a valid value */

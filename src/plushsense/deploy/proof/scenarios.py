@@ -306,6 +306,7 @@ def _troubled(
         generator.touches(int(rng.integers(20, 60)), blows=0.05)
         silences.append(len(generator.rows) - 1)
     generator.touches(200, lost=0.03, blows=0.02)
+    generator.strays()
     for n in range(40):
         generator.touches(7)
         generator.frozen(4)

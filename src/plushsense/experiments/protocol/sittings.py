@@ -189,7 +189,7 @@ def recorded_sittings(
             if not mine:
                 continue
             frames = dataset.read_stream(stream.id)
-            times = row_times_us(frames, dataset.layout.period_us) / 1e6
+            times = row_times_us(frames, dataset.layout) / 1e6
             made: dict[str, int] = {}
             trials = []
             for r in mine:

@@ -74,7 +74,7 @@ class StreamTruth:
 def truth_of(dataset: Dataset, stream: StreamInfo, frames: Frames, gestures: GestureSet) -> StreamTruth:
     """Return the true intervals of ``stream``, whose rows are ``frames``; ``gestures`` are the classes."""
     in_time = {r.id for r in recordings_in_time(dataset.used)}
-    times = row_times_us(frames, dataset.layout.period_us) / 1e6
+    times = row_times_us(frames, dataset.layout) / 1e6
     truths: list[Interval] = []
     rest: list[Stretch] = []
     other: list[Stretch] = []

@@ -292,7 +292,7 @@ class Validation:
         """Label the parts of the clip, score the trials and write the result; return its folder."""
         clip = self._clips.get(run.clip)
         frames = self._clips.rows(clip)
-        times_s = row_times_us(frames, clip.layout.period_us) / 1e6
+        times_s = row_times_us(frames, clip.layout) / 1e6
         self._clips.label_parts(run.clip, list(_parts(run.trials, times_s.tolist())))
         home = self._workspace
         out = home.new(FOLDER, home.free_name(FOLDER, run.subject))
