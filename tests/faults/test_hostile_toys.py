@@ -52,6 +52,10 @@ TOYS: dict[str, tuple[list[int], dict[int, bytes]]] = {
     "hangs up every second": (clock(400), {100: HANG_UP, 200: HANG_UP, 300: HANG_UP}),
     "jumps an hour ahead": (clock(300) + clock(300, 3_604_000), {}),
     "jumps back to its start": (clock(300) + clock(300, 0), {}),
+    "has single frames with impossible times": (
+        [{200: 0, 400: 3_604_000}.get(n, t) for n, t in enumerate(clock(600))],
+        {},
+    ),
     "passes 2^32 ms after 49.7 days": ([ms % WRAP for ms in clock(600, WRAP - 3000)], {}),
     "stands still for a second": (clock(300) + [3990] * 100 + clock(300, 4000), {}),
 }

@@ -123,7 +123,7 @@ def test_a_click_moves_the_mark_to_within_a_sample(
     assert set(standing) == set(wanted)
     infos = {r.id: r for r in dataset.recordings}
     for identity, (begin_s, end_s) in wanted.items():
-        seconds = row_times_s(dataset.read(infos[identity]))
+        seconds = row_times_s(dataset.read(infos[identity]), dataset.layout.gap_ms)
         begin = next(r for r in suggest_trims(dataset, [infos[identity]])).current_rows()
         at = (read_marks(waves)[identity].start, read_marks(waves)[identity].stop)
         assert at == begin

@@ -6,22 +6,25 @@ import threading
 
 import numpy as np
 
+from plushsense.core.layouts import load_layout
 from plushsense.devices.base import Frame
 from plushsense.devices.opening import open_device
 from plushsense.studio.app.toys import SampleBuffer, TappedDevice
 
+ACCEL = load_layout("accel-3")
+
 
 def frames(*device_ms: int) -> list[Frame]:
-    return [Frame(0, ms, (ms, -ms)) for ms in device_ms]
+    return [Frame(0, ms, (ms, -ms, 0)) for ms in device_ms]
 
 
 def test_pieces_join_without_a_hole_and_without_twice() -> None:
-    buffer = SampleBuffer(2, 100)
+    buffer = SampleBuffer(ACCEL, 100)
     assert len(buffer.since(0).seconds) == 0
     buffer.add(frames(1000, 1010, 1020))
     first = buffer.since(0)
     assert first.seconds.tolist() == [0.0, 0.01, 0.02]
-    assert first.values.tolist() == [[1000, -1000], [1010, -1010], [1020, -1020]]
+    assert first.values.tolist() == [[ms, -ms, 0] for ms in (1000, 1010, 1020)]
     buffer.add(frames(1030))
     second = buffer.since(first.end)
     assert second.values[:, 0].tolist() == [1030]
@@ -29,7 +32,7 @@ def test_pieces_join_without_a_hole_and_without_twice() -> None:
 
 
 def test_a_slow_reader_gets_the_newest_in_order() -> None:
-    buffer = SampleBuffer(2, 10)
+    buffer = SampleBuffer(ACCEL, 10)
     buffer.add(frames(*range(0, 250, 10)))
     piece = buffer.since(0)
     assert piece.values[:, 0].tolist() == list(range(150, 250, 10))
@@ -38,16 +41,22 @@ def test_a_slow_reader_gets_the_newest_in_order() -> None:
 
 
 def test_time_goes_on_over_a_reset_of_the_clock() -> None:
-    buffer = SampleBuffer(2, 100)
+    buffer = SampleBuffer(ACCEL, 100)
     buffer.add(frames(5000, 5010))
     buffer.add(frames(0, 10))
     seconds = buffer.since(0).seconds
     assert np.all(np.diff(seconds) >= 0)
-    assert seconds.tolist() == [0.0, 0.01, 0.01, 0.02]
+    assert seconds.tolist() == [0.0, 0.01, 0.01, 0.01]
+
+
+def test_a_single_impossible_time_moves_nothing() -> None:
+    buffer = SampleBuffer(ACCEL, 100)
+    buffer.add(frames(40_000, 40_010, 0, 40_030, 90_000, 40_050))
+    assert buffer.since(0).seconds.tolist() == [0.0, 0.01, 0.01, 0.03, 0.03, 0.05]
 
 
 def test_readers_beside_the_writer_see_whole_samples() -> None:
-    buffer = SampleBuffer(2, 64)
+    buffer = SampleBuffer(ACCEL, 64)
     done = threading.Event()
     torn: list[object] = []
 

@@ -226,8 +226,9 @@ def models(draw: st.DrawFn, longest: int = 700, window: bool = False, calibrated
 
 
 def any_frames(model: IntegerModel, seed: int, n: int | None = None, start: int | None = None) -> Ints:
-    """Frames (n, 1 + C): a jittering clock that at times stands still, jumps, starts again or wraps; values that
-    wander, jump between the ends of their range, and leave it. Never so unruly that nothing is ever answered."""
+    """Frames (n, 1 + C): a jittering clock that at times stands still, jumps, starts again or wraps, or has a single
+    impossible time; values that wander, jump between the ends of their range, and leave it. Never so unruly that
+    nothing is ever answered."""
     layout, rng = model.layout, np.random.default_rng(seed)
     low, high = layout.valid_min_int, layout.valid_max_int
     n = 2 * model.network.arch.span + 150 if n is None else n
@@ -253,6 +254,9 @@ def any_frames(model: IntegerModel, seed: int, n: int | None = None, start: int 
             values[i] = int(rng.choice([INT32[0], INT32[1], max(low[i] - 1, INT32[0]), min(high[i] + 1, INT32[1]), 0]))
         now = max(now, 0.0)
         rows.append([int(now) & 0xFFFFFFFF, *values.tolist()])
+    strays = np.random.default_rng([seed, 1])
+    for row in np.flatnonzero(strays.random(n) < unruly):
+        rows[row][0] = int(strays.choice([0, 1, 2**31, 2**32 - 1]))
     return np.array(rows, dtype=np.int64)
 
 

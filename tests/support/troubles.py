@@ -40,7 +40,7 @@ def make_bundle(padding: str = "stream", layout: str = "accel-3", **decision) ->
 
 BAD = 40_000  # beyond the valid range of accel-3
 STUCK = 3_000  # inside it, beyond what people reach
-TROUBLES = ("gap", "back", "equal", "garbage", "stuck", "still", "slow", "blow")
+TROUBLES = ("gap", "back", "equal", "garbage", "stuck", "still", "slow", "blow", "stray")
 
 
 def stream(seed: int, length: int, troubles: list[tuple[str, float, int]]) -> Frames:
@@ -69,6 +69,8 @@ def stream(seed: int, length: int, troubles: list[tuple[str, float, int]]) -> Fr
             time[at:] += 50 + 5 * long
         if kind == "back" and at < length:
             time[at:] -= time[at] - long
+        if kind == "stray":  # single frames with an impossible time, or a few in turn
+            time[at : at + 1 + long // 40] = long % 2 * 10**9
     time -= min(0, int(time.min()))  # several steps back: no clock of a toy is below 0
     return Frames(values.astype(np.int64), time.astype(np.int64), None)
 

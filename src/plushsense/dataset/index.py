@@ -18,7 +18,16 @@ from numpy.typing import NDArray
 from plushsense.core.errors import DatasetError, FileFormatError, ForgottenError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, Gesture, GestureSet, plain_label
-from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_bytes, read_recording, read_stream
+from plushsense.core.recorder_csv import (
+    Frames,
+    ReadResult,
+    bridged_ms,
+    parse_name,
+    read_bytes,
+    read_recording,
+    read_stream,
+    stray_rows,
+)
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.files import (
     RECORDINGS_INDEX,
@@ -332,7 +341,7 @@ def _stream_id(folder: Path, read: _RawFile) -> str:
 
 def _stream_info(folder: Path, head: DatasetHead, read: _RawFile) -> StreamInfo:
     frames = read.result.frames
-    steps = np.diff(frames.device_ms)
+    steps = np.diff(bridged_ms(frames.device_ms, stray_rows(frames.device_ms, head.layout.gap_ms)))
     broken = (steps < 0) | (steps > head.layout.gap_ms)
     flags = import_flags(Examination(frames, head.layout, stream=True))
     return StreamInfo(

@@ -118,7 +118,7 @@ def timed_stretches(dataset: Dataset, streams: Iterable[StreamInfo]) -> list[Tim
     out = []
     for stream in streams:
         if mine := [s for s in dataset.stretches if s.stream == stream.id]:
-            seconds = row_times_s(dataset.read_stream(stream.id)).round(3)
+            seconds = row_times_s(dataset.read_stream(stream.id), dataset.layout.gap_ms).round(3)
             out += [TimedStretch(s.stream, float(seconds[s.start]), float(seconds[s.stop]), s.label) for s in mine]
     return out
 
@@ -223,7 +223,7 @@ def read_stretches(dataset: Dataset, path: str | os.PathLike[str]) -> list[Label
             if others:
                 raise DatasetError(f"'{cells['stream']}' names {1 + len(others)} streams: give one.")
             if stream.id not in times:
-                times[stream.id] = row_times_s(dataset.read_stream(stream.id))
+                times[stream.id] = row_times_s(dataset.read_stream(stream.id), dataset.layout.gap_ms)
             between = _seconds(cells["start_s"]), _seconds(cells["stop_s"])
             start, stop = rows_between(stream, times[stream.id], *between)
             out.append(LabelledStretch(stream.id, start, stop, check_label(dataset, cells["label"])))
@@ -307,7 +307,7 @@ def decide_labels(
     if file is not None:
         labelled = len(label_stretches(dataset, read_stretches(dataset, file), who, why))
     elif label is not None or timed:
-        seconds = row_times_s(dataset.read_stream(streams[0].id))
+        seconds = row_times_s(dataset.read_stream(streams[0].id), dataset.layout.gap_ms)
         first = 0.0 if start_s is None else start_s
         last = float(seconds[-1]) if stop_s is None else stop_s
         start, stop = rows_between(streams[0], seconds, first, last)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
-from plushsense.core.recorder_csv import Frames
+from plushsense.core.recorder_csv import Frames, bridged_ms, stray_rows
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.marks import BY_HAND, SUGGESTED, Mark, MarkState, match_ids, read_marks
 from plushsense.dataset.onset import CONTEXT_S, Suggestion, suggest
@@ -121,7 +121,9 @@ def suggest_trims(
             suggestion = Suggestion(0, info.rows, False, False, 0.0, 0.0, 1.0, "rest: all of it is the gesture")
         else:
             suggestion = suggest(frames, dataset.layout, _before(dataset, info))
-        trims[info.id] = Trim(info, suggestion, marks.get(info.id, MarkState()), row_times_s(frames))
+        trims[info.id] = Trim(
+            info, suggestion, marks.get(info.id, MarkState()), row_times_s(frames, dataset.layout.gap_ms)
+        )
         if progress is not None:
             progress(done, len(chosen))
     return [trims[info.id] for info in chosen]
@@ -135,9 +137,13 @@ def _before(dataset: Dataset, info: RecordingInfo) -> Frames | None:
     return dataset.read_stream(info.stream).slice(max(0, first), info.stream_row)
 
 
-def row_times_s(frames: Frames) -> NDArray[np.float64]:
-    """Return the device time in s since the first row, of each row and of the end, (T + 1,); clock resets are 0 s."""
-    steps = np.maximum(np.diff(frames.device_ms), 0)
+def row_times_s(frames: Frames, gap_ms: float) -> NDArray[np.float64]:
+    """Return the device time in s since the first row, of each row and of the end, (T + 1,).
+
+    Clock resets are 0 s. The time of a row in `stray_rows` is half-way between those around it.
+    """
+    clock = bridged_ms(frames.device_ms, stray_rows(frames.device_ms, gap_ms))
+    steps = np.maximum(np.diff(clock), 0)
     usual = float(np.median(steps)) if len(steps) else 0.0
     return np.concatenate([[0.0], np.cumsum(steps), [float(steps.sum()) + usual]]) / 1000.0
 

@@ -42,9 +42,10 @@ def golden_frames(
 
     The parts are touches and blows with clock jitter and lost frames; values out of range (also before the first valid
     one); gaps that are just short enough and just too long; equal time stamps; impossible times; a clock that is reset;
-    channels at the ends of their ranges and jumping between them; sensors that fail and recover by the ``health`` settings; the clock's
-    wrap at 2^32. If ``inputs`` is given, also interpolated samples half-way between two values with different 8-bit
-    codes, where a rounding error has effect. Each part is longer than ``span``, so that answers follow every restart.
+    channels at the ends of their ranges and jumping between them; sensors that fail and recover by the ``health``
+    settings; the clock's wrap at 2^32. If ``inputs`` is given, also interpolated samples half-way between two values
+    with different 8-bit codes, where a rounding error has effect. Each part is longer than ``span``, so that answers
+    follow every restart.
     """
     generator = FrameGenerator(layout, scaler, np.random.default_rng(seed))
     part = span + 150
@@ -150,7 +151,7 @@ class FrameGenerator:
         self.now = following + self.pace()
 
     def strays(self) -> None:
-        """Add three single frames with impossible times, which are bridged, and two in turn, which restart the stream."""
+        """Add three single frames with impossible times, which are bridged, and two in turn, which restart."""
         for zeros in (False, True):
             self.touches(20)
             self.stray(0, zeros=zeros)

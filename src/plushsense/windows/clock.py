@@ -199,7 +199,9 @@ def hold_valid(values: NDArray[np.int64], layout: Layout) -> tuple[NDArray[np.in
     return valid_values, first, int((~good).sum())
 
 
-def _segment(time: NDArray[np.int64], values: NDArray[np.int64], layout: Layout, rows: NDArray[np.int64]) -> Segment | None:
+def _segment(
+    time: NDArray[np.int64], values: NDArray[np.int64], layout: Layout, rows: NDArray[np.int64]
+) -> Segment | None:
     valid_values, first, invalid = hold_valid(values, layout)
     if first >= len(time):
         return None

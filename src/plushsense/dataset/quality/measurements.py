@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.layouts import ACCELERATION, Layout
-from plushsense.core.recorder_csv import Frames, kept_rows
+from plushsense.core.recorder_csv import Frames, bridged_ms, stray_rows
 from plushsense.dataset.quality.copies import HashedRows
 from plushsense.dataset.quality.findings import CheckLimits
 from plushsense.dataset.store import Dataset, RecordingInfo, StreamInfo
@@ -112,22 +112,15 @@ class Examination:
 
     @cached_property
     def stray(self) -> NDArray[np.int64]:
-        """Rows with an impossible time between two rows that follow each other; readers leave them out.
-
-        Rows that came late are not among them.
-        """
+        """Rows with an impossible time between two rows that follow each other, without those that came late."""
         clock = self.frames.device_ms
-        left_out = np.setdiff1d(np.arange(len(clock) - 1), kept_rows(clock, self.layout.gap_ms))
-        ahead = clock[left_out + 1] - clock[left_out - 1]
-        bridged = left_out[(ahead >= 0) & (ahead <= self.layout.gap_ms)]
-        return np.setdiff1d(bridged, backward_steps(clock)[1] + 1) if len(bridged) else bridged
+        stray = stray_rows(clock, self.layout.gap_ms)
+        return np.setdiff1d(stray, backward_steps(clock)[1] + 1) if len(stray) else stray
 
     @cached_property
     def times(self) -> NDArray[np.int64]:
-        """Device time of each row in ms, (T,); `stray` rows have the middle between the times around them."""
-        times = self.frames.device_ms.copy()
-        times[self.stray] = (times[self.stray - 1] + times[self.stray + 1]) // 2
-        return times
+        """Device time of each row in ms, (T,), that of `stray` rows half-way between the times around them."""
+        return bridged_ms(self.frames.device_ms, self.stray)
 
     @cached_property
     def steps(self) -> NDArray[np.int64]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DeviceError, PlushSenseError
-from plushsense.core.layouts import layout_names
+from plushsense.core.layouts import Layout, layout_names
 from plushsense.core.recorder_csv import Frames
 from plushsense.core.sentences import Sentence
 from plushsense.devices.base import Device, Frame
@@ -31,6 +31,7 @@ from plushsense.devices.opening import (
 )
 from plushsense.devices.reconnect import ConnectionGap
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
+from plushsense.windows.clock import SampleClock
 
 KEPT_S = 60.0
 
@@ -46,33 +47,37 @@ class Samples(NamedTuple):
 
 
 class SampleBuffer:
-    """Ring buffer of the newest ``size`` samples of ``channels`` values; one thread writes, any thread reads.
+    """Ring buffer of the newest ``size`` samples of a layout's channels; one thread writes, any thread reads.
 
     ``count`` is the number of samples received so far, which is the position after the newest sample.
     """
 
-    def __init__(self, channels: int, size: int) -> None:
+    def __init__(self, layout: Layout, size: int) -> None:
         self._seconds = np.zeros(size)
-        self._values = np.zeros((size, channels))
+        self._values = np.zeros((size, layout.n_channels))
         self._clocks = np.zeros((size, 2), dtype=np.int64)
         self._lock = threading.Lock()
         self.count = 0
+        self._clock = SampleClock(layout)
         self._first_ms: int | None = None
         self._seen_ms = 0
         self._offset_ms = 0
 
     def add(self, frames: list[Frame]) -> None:
-        """Append frames; if the device clock is reset, the time continues from its last value."""
+        """Append frames; if the device clock is reset, the time continues from its last value.
+
+        A frame that the clock rule leaves out has the time of the frame before.
+        """
         with self._lock:
             size = len(self._seconds)
             for frame in frames:
                 if self._first_ms is None:
                     self._first_ms = self._seen_ms = frame.device_ms
-                if frame.device_ms < self._seen_ms:
-                    self._offset_ms += self._seen_ms - frame.device_ms
-                self._seen_ms = frame.device_ms
+                if self._clock.keeps(frame.device_ms):
+                    self._offset_ms += max(0, self._seen_ms - frame.device_ms)
+                    self._seen_ms = frame.device_ms
                 at = self.count % size
-                self._seconds[at] = (frame.device_ms - self._first_ms + self._offset_ms) / 1000.0
+                self._seconds[at] = (self._seen_ms - self._first_ms + self._offset_ms) / 1000.0
                 self._values[at] = frame.values
                 self._clocks[at] = frame.host_ms, frame.device_ms
                 self.count += 1
@@ -115,7 +120,7 @@ class TappedDevice(Device):
         self.device = device
         self.counters = device.counters
         self.wait_s = device.wait_s
-        self.buffer = SampleBuffer(len(device.layout.channels), int(KEPT_S * device.layout.rate_hz))
+        self.buffer = SampleBuffer(device.layout, int(KEPT_S * device.layout.rate_hz))
         self.changed = ChangeSignal()
         self.taps: list[Callable[[list[Frame]], None]] = []
         self._tried: list[Frame] = []

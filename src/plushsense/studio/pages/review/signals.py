@@ -119,7 +119,7 @@ def read_signals(dataset: Dataset, info: RecordingInfo, scale: NDArray[np.float6
     whole = info.id == info.stream
     frames = dataset.read_stream(info.stream) if whole else dataset.read(replace(info, start=0, stop=info.rows))
     before, before_at = _before(dataset, info, frames)
-    seconds = row_times_s(frames)
+    seconds = row_times_s(frames, layout.gap_ms)
     raw = np.concatenate([before, frames.values])
     bad = (raw < layout.valid_min_int) | (raw > layout.valid_max_int)
     steps = np.array([c.step for c in layout.channels])
@@ -396,7 +396,7 @@ def shape_of(dataset: Dataset, info: RecordingInfo, scale: NDArray[np.float64]) 
     frames = dataset.read(replace(info, start=0, stop=info.rows))
     if not len(frames):
         return DeviationShape(0.0, ())
-    curve = line(frames, dataset.layout, scale, float(row_times_s(frames)[-1]))
+    curve = line(frames, dataset.layout, scale, float(row_times_s(frames, dataset.layout.gap_ms)[-1]))
     size = np.minimum(np.rint(curve.size * FULL), 1e6).astype(int)
     return DeviationShape(round(curve.lasts, 3), tuple(size.tolist()))
 
