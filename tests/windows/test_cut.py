@@ -165,12 +165,12 @@ def test_a_recording_with_a_gap_keeps_the_full_windows_before_it(dataset: Datase
     from plushsense.core.recorder_csv import read_stream
 
     stream = read_stream(dataset.path / dataset.streams[0].file, ACCEL).frames
-    part = stream.slice(1150, 1800)
-    write_recording(tmp_path / "src" / "ana" / "Shake_77_650.csv", part, ACCEL)
+    part = stream.slice(1150, 1801)  # row 1500, the first after the gap, is left out
+    write_recording(tmp_path / "src" / "ana" / "Shake_77_651.csv", part, ACCEL)
     again = import_recordings(tmp_path / "src", tmp_path / "DS2", layout=ACCEL).dataset
     w = cut_windows(again, WindowSpec(longest_factor=0), again.gestures.subset(["Shake"]))
-    mine = w.take(np.flatnonzero(w.recording == w.recording_ids.index("ana/Shake_77_650")))
-    assert mine.x[:, 0, 0].tolist() == [1150, 1200, 1250, 1500, 1550]
+    mine = w.take(np.flatnonzero(w.recording == w.recording_ids.index("ana/Shake_77_651")))
+    assert mine.x[:, 0, 0].tolist() == [1150, 1200, 1250, 1501, 1551]
     assert set(mine.context) == {"inside"}
 
 
