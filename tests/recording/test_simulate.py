@@ -180,7 +180,10 @@ def test_the_truth_of_a_scenario_is_imported_person_by_person(played: Path, tmp_
     found = Counter((r.subject, r.gesture) for r in dataset.recordings)
     assert found == Counter((f"P{made['person']:02d}", made["label"]) for made in truth)
     starts = {r.start_ms for r in dataset.recordings}
-    assert all(any(0 <= start - made["start_ms"] < 100 for start in starts) for made in truth), "but for lost frames"
+    # Two begin while the toy is disconnected or silent, before a restart: of them, only the rest was received.
+    received = [made for made in truth if not (38.0 <= made["start_s"] < 41.0 or 55.0 <= made["start_s"] < 57.0)]
+    assert len(received) == len(truth) - 2
+    assert all(any(0 <= start - made["start_ms"] < 100 for start in starts) for made in received), "but for lost frames"
     assert all(r.stream_row >= 0 for r in dataset.recordings), "each lies in the stream of its person"
     assert len(dataset.streams) == 3
 
