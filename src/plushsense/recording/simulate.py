@@ -176,7 +176,8 @@ def simulate(
             of a gesture on, a few are missing (`repetitions_made`).
         seed: the same seed writes the same files.
         progress: called with (sessions done, number of sessions, folder just written).
-        at_rest: number of recordings without a person; by default gestures × repetitions, as in the paper.
+        at_rest: number of recordings without a person; by default the share of the paper, gestures × repetitions for 25
+            people, but at least 3.
         gestures: a subset of the 17, in class order.
         layout: the layout of the files: plush-15, plush-14 or accel-3.
 
@@ -192,7 +193,7 @@ def simulate(
     for name, value, low, high in sizes:
         if not low <= value <= high:
             raise ConfigError(f"{name} is {value}; a whole number from {low} to {high} is accepted.")
-    resting = len(labels) * repetitions if at_rest is None else at_rest
+    resting = max(3, round(len(labels) * repetitions * people / 25)) if at_rest is None else at_rest
     folder = Path(out)
     resolved = layout if isinstance(layout, Layout) else load_layout(layout)
     width = max(2, len(str(people)))
