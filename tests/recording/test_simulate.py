@@ -236,7 +236,8 @@ def test_the_default_data_set_has_the_windows_of_the_authors_archive() -> None:
 
 
 def test_missing_recordings_are_gestures_that_nobody_made(tmp_path: Path) -> None:
-    summary = simulate(tmp_path / "many", people=2, repetitions=20, at_rest=0, gestures=["Tail hit 1", "Tail pull"])
-    names = [parse_name(p.name) for p in (tmp_path / "many").glob("P*/*_*.csv")]
-    assert Counter(n.label for n in names if n) == {"Tail hit 1": 39, "Tail pull": 39}
-    assert summary.recordings == 78
+    summary = simulate(tmp_path / "many", people=4, repetitions=10, gestures=["Tail hit 1", "Tail pull"])
+    names = [parse_name(p.name) for p in (tmp_path / "many").glob("*/*_*.csv")]
+    made = {"Tail hit 1": 39, "Tail pull": 39, "At rest": 3}  # at rest is 2 × 10 × 4 / 25, rounded
+    assert Counter(n.label for n in names if n) == made
+    assert summary.recordings == 81
