@@ -553,9 +553,9 @@ def test_the_example_configuration_resolves() -> None:
 def test_simulate_makes_a_data_set_in_one_command(cli: Cli, tmp_path: Path) -> None:
     words = ("simulate", tmp_path / "R", "--people", "1", "--repetitions", "1", "--dataset", tmp_path / "DS")
     found = cli(*words, "--json").json
-    assert found["recordings"] == 34
+    assert found["recordings"] == 17 + 3
     info = cli("info", found["dataset"], "--json").json
-    assert (info["recordings"], info["subjects"], info["simulated"]) == (34, 1, True)
+    assert (info["recordings"], info["subjects"], info["simulated"]) == (20, 1, True)
     refused = cli(*words)
     assert refused.status == 2
     assert "already holds something" in refused.err

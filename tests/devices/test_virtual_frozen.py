@@ -1,6 +1,6 @@
 """The virtual toy's difficulty is frozen: its numbers, and the integers that come out of them.
 
-It was set so that the paper's network, schedule and leave-one-subject-out come out between 0.60 and 0.78 macro-F1
+It was set so that the paper's network and schedule come out between 0.60 and 0.78 macro-F1 on people left out,
 with the paper's confusions; what was measured for that is in CALIBRATION. Scores on the virtual toy can only be
 compared while this holds. Whoever changes it on purpose measures again, writes the new figures here, then the hashes.
 """
@@ -15,24 +15,25 @@ import numpy as np
 from plushsense.devices.virtual.session import VirtualSession
 from plushsense.devices.virtual.world import WORLD, World, draw_person
 
-WORLD_SHA256 = "4321e4783f45c3191fc51a766c201c6f720ad8b35f6af2464566e63aec7f504e"
-SAMPLE_SHA256 = "6aa24fc9e9062cc7dd2ecb103c79ea329d3e1f3e062ead6aed3081d2c96a175c"
+WORLD_SHA256 = "6bd80c4570e8dcda399b0e1bf50dc519b6b601778bf82ecbb2f9faaa341880c0"
+SAMPLE_SHA256 = "4c7d67b95dc45e6af3c4769f8cbbcb556366b31fb57b194e9d41299731955ab6"
 
-# The whole protocol, through files, import, clock and windows:  plushsense simulate R; import R V --layout plush-15;
-# evaluate V --preset paper --arch 14d1_39d2_41d4 --filters 8,12,16  (mirror padding, batch normalisation, looped
-# windows, leave one person out, early stopping; 25 people, 1326 recordings, seed 1 of the toy and 0 of the training).
-# One run on 2026-11-21. Layer normalisation was tried on one fold of an earlier trial only: 0.520 over its 5 people.
+# The whole protocol, through files, import and windows:  plushsense simulate R --dataset V; evaluate V --preset paper
+# --arch 14d1_39d2_41d4 --filters 8,12,16 --split by-subject:5  (mirror padding, batch normalisation, rows as they are,
+# looped, early stopping; 25 people, 1301 recordings, seed 1 of the toy and 0 of the training). One run on 2026-11-27.
+# Five people are left out at a time, and not one, because of the time it takes: networks see 20 people instead of 24.
 CALIBRATION = {
-    "macro_f1_mean_over_people": 0.729,
-    "macro_f1_sd_over_people": 0.083,
-    "macro_f1_all_18_classes_mean": 0.744,
-    "accuracy_mean_over_people": 0.771,
-    "pooled_macro_f1": 0.775,
-    "at_rest_f1": 1.000,
-    "tail_tap_f1": (0.597, 0.606),
-    "tail_scratch_f1": (0.612, 0.610),
-    "head_stroke_f1": (0.928, 0.915),
-    "windows_with_the_wrong_affect": 40 / 5640,
+    "macro_f1_mean_over_people": 0.705,
+    "macro_f1_sd_over_people": 0.104,
+    "macro_f1_all_18_classes_mean": 0.741,
+    "accuracy_mean_over_people": 0.752,
+    "pooled_accuracy": 0.765,
+    "pooled_macro_f1": 0.747,
+    "at_rest_f1": 0.989,
+    "tail_tap_f1": (0.591, 0.606),
+    "tail_scratch_f1": (0.610, 0.572),
+    "head_stroke_f1": (0.937, 0.927),
+    "windows_with_the_wrong_affect": 203 / 5672,
 }
 
 

@@ -29,7 +29,7 @@ def test_from_nothing_to_a_data_set_by_one_click(studio: Fixture, look: Fixture,
     sentence = marked(page, "next-sentence")
     sentence.get_by_text("train a network").wait_for()
     row = marked(page, "dataset")
-    assert "people: 6" in row.inner_text() and "recordings: 238" in row.inner_text()
+    assert "people: 6" in row.inner_text() and "recordings: 212" in row.inner_text()
     assert "Simulation" in row.inner_text()
     assert "virtual://?person=7" in marked(page, "chosen").inner_text()
     row.get_by_role("button", name="Check").click()

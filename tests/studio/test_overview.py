@@ -96,7 +96,7 @@ def test_what_cannot_be_read_is_listed_with_its_sentence(furniture: Path, tmp_pa
     seen = Overview(Workspace(home)).look()
     assert {d.path.name for d in seen.datasets if d.refused} == {"head", "empty", "index", "bytes"}
     assert all(d.refused.endswith((".", ")")) for d in seen.datasets if d.refused)
-    assert [d.recordings for d in seen.datasets if not d.refused] == [119]
+    assert [d.recordings for d in seen.datasets if not d.refused] == [106]
     assert [b.name for b in seen.bundles if b.refused] == ["bad"]
     assert seen.sessions[0].refused
     assert seen.batches() == []

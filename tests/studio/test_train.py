@@ -79,7 +79,7 @@ def test_a_training_is_stopped_and_killed_and_ends_in_the_commands_bundle(
     here = studio(home=home)
     browser = look()
     page = browser.open(f"{here.url}/train")
-    marked(page, "facts").get_by_text("6 people, 119 recordings, 18 gestures").wait_for()
+    marked(page, "facts").get_by_text("6 people, 106 recordings, 18 gestures").wait_for()
     assert marked(page, "facts").get_by_text("simulation", exact=True).is_visible()
     kind(page, "Train one network")
     fill(page, "name", "by page")

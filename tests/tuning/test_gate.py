@@ -127,7 +127,7 @@ def test_it_finds_the_blows_it_was_fitted_on(fitted: GateFit) -> None:
 def test_strangers_blows_are_answered_at_once_and_caresses_are_not_called_blows(fitted: GateFit) -> None:
     quick, gentle, elsewhere = on_strangers(fitted.settings, WORLD)
     assert quick >= 0.93
-    assert gentle <= 0.02
+    assert gentle <= 0.03
     assert elsewhere <= 2
 
 

@@ -43,7 +43,7 @@ def script() -> ModuleType:
 
 def test_the_archive_has_the_form_of_the_papers(made: Path) -> None:
     files = list((made / "archive").rglob("*.csv"))
-    assert len(files) == 24
+    assert len(files) == 21
     assert {p.parent.name for p in files} == {"At rest", "Back stroke 1", "Tail pull", "Tail tap 2"}
     for path in files:
         name = parse_name(path.name)
@@ -61,7 +61,7 @@ def test_it_imports_whole(tmp_path: Path, top: str, underscores: bool, mapped: b
     archive = make_archive(tmp_path, top=top, underscores=underscores)
     subjects = {"subjects": tmp_path / "map.csv"} if mapped else {}
     done = ps.import_recordings(archive, tmp_path / "DS", layout="plush-15", **subjects)  # type: ignore[arg-type]
-    assert (done.recordings, done.rejected) == (24, [])
+    assert (done.recordings, done.rejected) == (21, [])
     assert done.gestures == ["At rest", "Back stroke 1", "Tail pull", "Tail tap 2"]
     assert done.subjects == (3 if mapped else 0)
     assert {r.subject for r in done.dataset.recordings if r.gesture == "At rest"} == {"none"}
@@ -92,7 +92,7 @@ def test_the_table_is_made_and_goes_on_where_it_stood(
         rows = list(csv.DictReader(file))
     assert {(row["simulated"], row["quick"]) for row in rows} == {("yes", "yes")}
     by_what = {row["what"]: row for row in rows}
-    assert (by_what["recordings"]["paper"], by_what["recordings"]["ours"]) == ("1326", "24")
+    assert (by_what["recordings"]["paper"], by_what["recordings"]["ours"]) == ("1326", "21")
     mean = by_what["macro-F1, mean over the people, with recordings at rest"]
     without = by_what["macro-F1, mean over the people, without recordings at rest"]
     assert mean["paper"] == without["paper"] and mean["ours"] != without["ours"]

@@ -42,6 +42,9 @@ START_MS = 1_760_000_000_000
 HANDLED = 6
 """Number of times a person handles the toy after the recordings; this is no gesture, and only in the stream."""
 
+MISSING = dict(zip(GESTURES, (3, 2, 2, 0, 1, 1, 2, 1, 2, 0, 3, 3, 2, 1, 1, 1, 0), strict=True))
+"""Recordings that the authors' archive lacks of each gesture, of 3 by each of 25 people, by the counts they printed."""
+
 Progress = Callable[[int, int, str], None]
 
 
@@ -67,14 +70,27 @@ class _Take:
     lost: int
 
 
-def _session(
-    who: int | None, seed: int, gestures: Sequence[str], repetitions: int, layout: Layout, world: World
-) -> _Take:
-    """Simulate a session, with lost frames and the host's time; ``who`` is None for the toy at rest."""
+def repetitions_made(label: str, people: int, repetitions: int, seed: int) -> list[int]:
+    """Return how often each person makes a gesture: ``repetitions``, less the recordings that are missing.
+
+    Missing is the same share as in the authors' archive, rounded down, so that no recording of a small data set is;
+    which ones are depends on the seed.
+    """
+    takes = people * repetitions
+    rng = np.random.default_rng([seed, GESTURES.index(label), 0x1301])
+    missing = rng.choice(takes, MISSING[label] * takes // 75, replace=False)
+    return [repetitions - int(n) for n in np.bincount(missing % people, minlength=people)]
+
+
+def _session(who: int | None, seed: int, parts: Sequence[tuple[str, int]], layout: Layout, world: World) -> _Take:
+    """Simulate a session, with lost frames and the host's time; ``who`` is None for the toy at rest.
+
+    ``parts`` are labels and the number of recordings of each.
+    """
     person = None if who is None else draw_person(who, seed, world)
     session = VirtualSession(person, seed, 0, world)
     episodes = [session.idle(2.0)]
-    episodes += [session.perform(label, repetitions) for label in gestures]
+    episodes += [session.perform(label, times) for label, times in parts if times]
     episodes.append(session.idle(2.0))
     number = 0 if who is None else who + 1
     order = 40 if who is None else who
@@ -150,14 +166,18 @@ def simulate(
     layout: Layout | str = "plush-15",
     world: World = WORLD,
 ) -> SimulationSummary:
-    """Write a simulated data set, by default as the paper's: 25 people × 17 gestures × 3, and 51 at rest (1326).
+    """Write a simulated data set, by default of the size of the authors' archive.
+
+    These are 25 people × 17 gestures × 3, of which 25 recordings are missing, and 51 at rest: 1301.
 
     Args:
         out: a new or empty folder; the folders of people are ``P01`` …, that of the toy at rest ``none``.
-        people, repetitions: the number of people, and of recordings of each gesture by each of them.
+        people, repetitions: the number of people, and of recordings of each gesture by each of them. From 25 recordings
+            of a gesture on, a few are missing (`repetitions_made`).
         seed: the same seed writes the same files.
         progress: called with (sessions done, number of sessions, folder just written).
-        at_rest: number of recordings without a person; by default gestures × repetitions, as in the paper.
+        at_rest: number of recordings without a person; by default the share of the paper, gestures × repetitions for 25
+            people, but at least 3.
         gestures: a subset of the 17, in class order.
         layout: the layout of the files: plush-15, plush-14 or accel-3.
 
@@ -173,13 +193,14 @@ def simulate(
     for name, value, low, high in sizes:
         if not low <= value <= high:
             raise ConfigError(f"{name} is {value}; a whole number from {low} to {high} is accepted.")
-    resting = len(labels) * repetitions if at_rest is None else at_rest
+    resting = max(3, round(len(labels) * repetitions * people / 25)) if at_rest is None else at_rest
     folder = Path(out)
     resolved = layout if isinstance(layout, Layout) else load_layout(layout)
     width = max(2, len(str(people)))
     sessions: list[tuple[str, int | None]] = [(f"P{who:0{width}d}", who) for who in range(1, people + 1)]
     if resting > 0:
         sessions.append((NOBODY, None))
+    made = {label: repetitions_made(label, people, repetitions, seed) for label in labels}
     recordings = rows = stream_rows = lost = 0
     # Write the folder completely or not at all: an incomplete one would look like a small data set.
     with new_folder(folder, DatasetError) as work:
@@ -187,8 +208,8 @@ def simulate(
             f"Recordings of the virtual toy, seed {seed}. Nobody touched anything.\n", "utf-8"
         )
         for done, (name, who) in enumerate(sessions, 1):
-            chosen, times = ((AT_REST,), resting) if who is None else (labels, repetitions)
-            take = _session(who, seed, chosen, times, resolved, world)
+            parts = [(AT_REST, resting)] if who is None else [(label, made[label][who - 1]) for label in labels]
+            take = _session(who, seed, parts, resolved, world)
             rows += _write(work / name, take, resolved)
             recordings += len(take.cuts)
             stream_rows += len(take.frames)

@@ -452,7 +452,7 @@ def simulate(
     dataset: str | os.PathLike[str] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Write recordings of virtual people in the format of the paper's recorder, by default as many as in the paper.
+    """Write recordings of virtual people in the format of the paper's recorder, by default as many as the authors have.
 
     Args:
         out: a new or empty folder.

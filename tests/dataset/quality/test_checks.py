@@ -650,7 +650,7 @@ def test_simulated_sessions_raise_no_alarm(tmp_path: Path) -> None:
     assert result.ok
     # The virtual people's tempo varies, and their toy sends a garbled value now and then.
     assert {f.check for f in result.findings if f.severity == "warning"} <= {"duration"}
-    assert len(result.findings_of("duration")) <= 5
+    assert len(result.findings_of("duration")) <= 8
     assert {f.check for f in result.findings if f.severity == "info"} <= {"duration", "garbage"}
 
 
