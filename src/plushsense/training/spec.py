@@ -122,7 +122,9 @@ class TrainSpec:
 
     def key(self) -> dict[str, Any]:
         """Return everything that the result depends on: all settings, and the version of the code."""
-        return {"version": TRAINING_VERSION} | self.to_dict()
+        # Earlier versions read integers where nothing was scaled.
+        reads = {"reads": "units of the layout"} if self.scaling == "none" else {}
+        return {"version": TRAINING_VERSION} | self.to_dict() | reads
 
 
 # "search": paper, section 3.6.1; "loso": paper, section 4.4; "paper" is the same schedule, with the network and windows
