@@ -245,7 +245,7 @@ def to_integers(x: NDArray[Any], layout: Layout) -> NDArray[np.int32]:
             step = layout.channels[layout.index(name)].step
             raise ArrayError(
                 f"X has {float(x[:, at][apart][0]):g} in '{name}', which the layout '{layout.name}' counts in steps of "
-                f"{step:g}: give values as those of cut_windows, scaled by nothing, or leave layout out."
+                f"{step:g}: give x of cut_windows, and leave scaling to the classifier, or leave layout out."
             )
     return whole.astype(np.int32)
 
