@@ -216,7 +216,7 @@ def test_a_vector_layer_without_scaling_reads_the_unit_of_the_sensor(accel: Data
 
 def test_programs_without_scaling_read_these_values(force: Dataset) -> None:
     windows, sent = first_of_each(force)
-    x = np.stack([sent[:, 0], sent[:, 1], windows.x[:, 2]], axis=1)
+    x = np.stack([sent[:, 0] - 512.0, sent[:, 1] - 0.5, windows.x[:, 2]], axis=1)
     samples = x.shape[2]
     assert np.allclose(FEATURES["paper-statistics"](windows, samples), statistics(x, 100.0), rtol=1e-4, atol=1e-4)
     assert np.allclose(FEATURES["flattened"](windows, samples), x.reshape(8, -1), rtol=1e-6)
