@@ -81,7 +81,7 @@ BASELINES: dict[str, Baseline] = {
 
 
 def _last(windows: WindowSet, samples: int) -> Floats:
-    """Return the last samples of windows in the units of the layout, less its offsets: energies are those around zero."""
+    """Return the last samples of windows in units, less the offsets: energies are those around zero."""
     return np.asarray(windows.integers[:, :, -samples:] / windows.units.steps[:, None])
 
 
