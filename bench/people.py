@@ -113,10 +113,10 @@ class FoldTask:
 
     @cached_property
     def scaler(self) -> Scaler:
-        return Scaler.fit(self.train.x, self.train.vectors)
+        return Scaler.fit(self.train.integers, self.train.vectors)
 
     def scaled(self, windows: WindowSet) -> NDArray[np.float32]:
-        return self.scaler.apply(windows.x[:, :, -self.arch.span :])
+        return self.scaler.apply(windows.integers[:, :, -self.arch.span :])
 
     def weights(self, seed: int | None = None, averaged: bool = False) -> Weights:
         """Return the last weights, or all averaged over the last third of the epochs; train if there are none."""
@@ -225,8 +225,8 @@ def by_person(windows: WindowSet) -> list[NDArray[np.int64]]:
 
 def movement(windows: WindowSet) -> tuple[Floats, Floats]:
     """Return acceleration without gravity, and gravity, (N, 3, T)."""
-    gravity = windows.x[:, 3:6] / (1 << layouts.GRAVITY_FRACTION_BITS)
-    return windows.x[:, :3] - gravity, gravity
+    gravity = windows.integers[:, 3:6] / (1 << layouts.GRAVITY_FRACTION_BITS)
+    return windows.integers[:, :3] - gravity, gravity
 
 
 def rms(values: Floats) -> float:
@@ -235,11 +235,11 @@ def rms(values: Floats) -> float:
 
 def with_strength(windows: WindowSet, strength: float) -> WindowSet:
     """Multiply the movement of each person by one factor, so that its root mean square is ``strength``."""
-    x = windows.x.copy()
+    x = windows.integers.copy()
     for theirs in by_person(windows):
         moved, gravity = movement(windows.take(theirs))
         x[theirs, :3] = np.rint(gravity + moved * (strength / rms(moved)))
-    return replace(windows, x=x)
+    return replace(windows, integers=x)
 
 
 def rocket(task: FoldTask) -> Floats:
@@ -256,9 +256,9 @@ def rocket(task: FoldTask) -> Floats:
         flat = moved - vertical[:, None] * up
         turn = (np.cross(np.roll(flat, 5, axis=2), flat, axis=1) * up).sum(axis=1)
         turn[:, :5] = 0.0
-        channels = [vertical, np.linalg.norm(flat, axis=1), np.linalg.norm(windows.x[:, :3], axis=1)]
+        channels = [vertical, np.linalg.norm(flat, axis=1), np.linalg.norm(windows.integers[:, :3], axis=1)]
         values = np.stack([*channels, np.sign(turn) * np.sqrt(np.abs(turn))], axis=1)
-        return replace(windows, x=np.rint(16 * values).astype(np.int32), vectors=())
+        return replace(windows, integers=np.rint(16 * values).astype(np.int32), vectors=())
 
     fitted = RocketFit("multirocket-hydra", task.arch.span, task.spec.seed)
     return fitted(invariant(task.train), task.train.take(np.arange(0)))(invariant(task.test))

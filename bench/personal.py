@@ -91,11 +91,11 @@ class Cases:
             _, first, place = np.unique(own.recording, return_index=True, return_inverse=True)
             y = shuffle.permutation(y[first])[place]
         try:
-            done = personalise(bundle, own.x, y, own.recording, subject="?")
+            done = personalise(bundle, own.integers, y, own.recording, subject="?")
         except BadInput:
             return
         before, after = (
-            judge(b.network().probabilities(b.scaler.apply(test.x)), test.y, test.recording).scores.right
+            judge(b.network().probabilities(b.scaler.apply(test.integers)), test.y, test.recording).scores.right
             for b in (bundle, done.bundle)
         )
         self.rows.setdefault(name, []).append((done.accepted, after - before))

@@ -257,7 +257,7 @@ def trained(
     windows.
     """
     spec, arch, scaler = recipe.training, bundle.arch, bundle.scaler
-    x = Windows(scaler.apply(windows.x[:, :, windows.x.shape[2] - arch.span :]), arch, CPU)
+    x = Windows(scaler.apply(windows.integers[:, :, windows.integers.shape[2] - arch.span :]), arch, CPU)
     y = torch.from_numpy(windows.y.astype(np.int64))
     augment = augmentations(spec.augment, Channels(windows.vectors, scaler, CPU, arch.vector is not None))
     torch.manual_seed(spec.seed)
@@ -307,7 +307,7 @@ def max_pooling(dataset: Dataset, recipe: Recipe, fold: PeopleFold, bundle: Bund
 def refined(dataset: Dataset, recipe: Recipe, fold: PeopleFold, bundle: Bundle) -> Bundle:
     k = len(recipe.gestures) - 1
     windows = training_windows(dataset, recipe, fold)
-    moved = windows.x[:, :3, -round(windows.rate_hz) :].std(axis=2).max(axis=1) > MOVED
+    moved = windows.integers[:, :3, -round(windows.rate_hz) :].std(axis=2).max(axis=1) > MOVED
     more = (Gesture("Moved", "none"), Gesture("Like a gesture", "none"))
     gestures = GestureSet(recipe.gestures.name, (*recipe.gestures.gestures[:k], *more), recipe.gestures.inferred)
     idle = windows.y == k

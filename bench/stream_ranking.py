@@ -103,7 +103,7 @@ def fit_forest(train: WindowSet, watch: WindowSet, seed: int) -> Reader:
         return statistics(with_magnitude(x), RATE_HZ)
 
     model = RandomForestClassifier(200, min_samples_leaf=5, class_weight="balanced_subsample", random_state=seed)
-    model.fit(features(train.x), train.y)
+    model.fit(features(train.integers), train.y)
     nodes = sum(tree.tree_.node_count for tree in model.estimators_)
     return by_windows(lambda x: np.log(np.maximum(model.predict_proba(features(x)), 1e-3)), f"{nodes} nodes")
 
@@ -115,15 +115,15 @@ def fit_rocket(train: WindowSet, watch: WindowSet, seed: int) -> Reader:
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
 
-    scaler = Scaler.fit(with_magnitude(train.x))
+    scaler = Scaler.fit(with_magnitude(train.integers))
     ridge = RidgeClassifierCV(np.logspace(-3, 3, 10))
     model = make_pipeline(MiniRocket(random_state=seed, n_jobs=1), StandardScaler(with_mean=False), ridge)
 
     def scaled(x: Values) -> Values:
         return np.ascontiguousarray(scaler.apply(with_magnitude(x)))
 
-    model.fit(scaled(train.x), train.y)
-    factor = 5.0 / fit_temperature(np.exp(5.0 * model.decision_function(scaled(watch.x))), watch.y)
+    model.fit(scaled(train.integers), train.y)
+    factor = 5.0 / fit_temperature(np.exp(5.0 * model.decision_function(scaled(watch.integers))), watch.y)
     return by_windows(lambda x: factor * model.decision_function(scaled(x)), f"{ridge.coef_.size} weights")
 
 
@@ -137,13 +137,13 @@ def fit_continual(train: WindowSet, watch: WindowSet, seed: int) -> Reader:
     from plushsense.training.engine import Adam
 
     torch.manual_seed(seed)
-    scaler, layers, macs, channels = Scaler.fit(train.x), [], 0, len(AXES)
+    scaler, layers, macs, channels = Scaler.fit(train.integers), [], 0, len(AXES)
     for filters in FILTERS:
         layers += [co.Conv1d(channels, filters, KERNELS), torch.nn.ReLU(), torch.nn.BatchNorm1d(filters)]
         macs, channels = macs + channels * filters * KERNELS, filters
     net = co.Sequential(*layers, co.AvgPool1d(POOL, stride=1), co.Conv1d(channels, len(train.labels), 1))
     span = net.receptive_field
-    x, y = torch.from_numpy(scaler.apply(train.x)[:, :, -span:]), torch.from_numpy(train.y)
+    x, y = torch.from_numpy(scaler.apply(train.integers)[:, :, -span:]), torch.from_numpy(train.y)
     turn = augmentations(("random-rotation:45",), Channels(((0, 1, 2),), scaler, torch.device("cpu")))
     adam, order = Adam(net.parameters()), torch.Generator().manual_seed(seed)
     for epoch in range(30):
@@ -160,7 +160,7 @@ def fit_continual(train: WindowSet, watch: WindowSet, seed: int) -> Reader:
         return np.asarray(net(samples)[0].T[::STEP].numpy())
 
     with torch.no_grad():  # one sample at a time gives the same logits
-        some = torch.from_numpy(scaler.apply(train.x[:1].repeat(2, axis=2)))
+        some = torch.from_numpy(scaler.apply(train.integers[:1].repeat(2, axis=2)))
         net.clean_state()
         steps = [net.forward_step(some[:, :, at]) for at in range(some.shape[2])][span - 1 :]
         torch.testing.assert_close(torch.stack(steps, dim=2), net(some))

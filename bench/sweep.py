@@ -354,7 +354,7 @@ def data(path: str) -> tuple[Tensor, Tensor, Any]:
     from plushsense.windows.features import Scaler
 
     windows = ps.cut_windows(ps.open_dataset(Path(path)), WindowSpec(context="loop"))
-    scaled = Scaler.fit(windows.x).apply(windows.x)
+    scaled = Scaler.fit(windows.integers).apply(windows.integers)
     return torch.from_numpy(scaled), torch.from_numpy(windows.y.astype(np.int64)), windows
 
 

@@ -114,7 +114,7 @@ def test_finished_folds_are_not_trained_again_and_changed_ones_are(tmp_path: Pat
     next(journal.folder.iterdir()).write_bytes(b"damaged")
     evaluate(windows, windows, "by-subject:3", oracle, **ask)
     assert sum(trainings(tmp_path).values()) == 4
-    changed = replace(windows, x=windows.x + 1)
+    changed = replace(windows, integers=windows.integers + 1)
     for other, key, seed in ((windows, {"arch": "b"}, 0), (changed, ask["key"], 0), (windows, ask["key"], 5)):
         before = sum(trainings(tmp_path).values())
         evaluate(other, other, "by-subject:3", oracle, journal=journal, key=key, seed=seed)

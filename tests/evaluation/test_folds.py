@@ -63,7 +63,7 @@ def test_whole_people_lose_no_window() -> None:
 
 def test_windows_can_be_divided_only_among_themselves() -> None:
     stream, loop = study(), study(context="loop")
-    assert len(fold_windows(stream, replace(stream, x=stream.x.copy()), parse_split("windows:3"))) == 3
+    assert len(fold_windows(stream, replace(stream, integers=stream.integers.copy()), parse_split("windows:3"))) == 3
     other = study(context="loop", windows=3)
     with pytest.raises(ConfigError, match="by-recording:5"):
         fold_windows(other, loop, parse_split("windows:3"))

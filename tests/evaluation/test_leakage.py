@@ -21,7 +21,7 @@ def moving(people: int = 4, samples: int = 100) -> WindowSet:
     windows = study(people=people, nobody=2)
     noise = np.random.default_rng(0).normal(size=(len(windows), 2, samples + 9))
     smooth = np.stack([noise[:, :, i : i + samples] for i in range(10)]).sum(axis=0)
-    return replace(windows, x=np.round(1000 * smooth).astype(np.int32))
+    return replace(windows, integers=np.round(1000 * smooth).astype(np.int32))
 
 
 def audited(windows: WindowSet, split: str) -> dict[str, int]:
@@ -66,9 +66,9 @@ def test_overlap_is_found_in_the_stream() -> None:
 def test_a_copy_of_another_person_is_found(change: object, copies: int, near: int) -> None:
     windows = moving()
     mine, theirs = (int(np.flatnonzero(windows.subject == who)[0]) for who in ("P01", "P03"))
-    x = windows.x.copy()
+    x = windows.integers.copy()
     x[theirs] = change(x[mine])  # type: ignore[operator]
-    planted = replace(windows, x=x)
+    planted = replace(windows, integers=x)
     fold = Fold("P01", ("P01",), np.flatnonzero(windows.subject != "P01"), np.empty(0, np.int64), np.array([mine]))
     found = audit_leakage(planted, planted, [fold])
     assert (found["copies"], found["near_duplicates"]) == (copies, near)
@@ -80,20 +80,20 @@ def test_a_copy_of_another_person_is_found(change: object, copies: int, near: in
 def test_neighbours_in_a_stream_are_no_copies() -> None:
     windows = moving()
     mine, theirs = (np.flatnonzero(windows.subject == "P01")[at] for at in (0, -1))
-    x, rows, stream = windows.x.copy(), windows.window_rows.copy(), windows.stream.copy()
+    x, rows, stream = windows.integers.copy(), windows.window_rows.copy(), windows.stream.copy()
     x[theirs], stream[theirs] = x[mine], stream[mine]
     fold = Fold("f", ("P01",), np.array([theirs]), np.empty(0, np.int64), np.array([mine]))
     for first, near in ((rows[mine, 0] + 20, 0), (rows[mine, 1], 1)):
         rows[theirs] = (first, first + np.diff(rows[mine])[0])
-        planted = replace(windows, x=x, stream=stream, window_rows=rows)
+        planted = replace(windows, integers=x, stream=stream, window_rows=rows)
         assert audit_leakage(planted, planted, [fold])["near_duplicates"] == near
 
 
 def test_recordings_that_rarely_change_are_no_copies() -> None:
     windows = moving()
-    pressed = (np.arange(windows.x.shape[2]) > 60).astype(np.int32)
-    for x in (np.zeros_like(windows.x), windows.x * 0 + pressed):
-        assert audited(replace(windows, x=x), "by-subject:4")["near_duplicates"] == 0
+    pressed = (np.arange(windows.integers.shape[2]) > 60).astype(np.int32)
+    for x in (np.zeros_like(windows.integers), windows.integers * 0 + pressed):
+        assert audited(replace(windows, integers=x), "by-subject:4")["near_duplicates"] == 0
 
 
 def test_recordings_with_rows_of_one_trained_on_are_counted() -> None:
@@ -115,11 +115,11 @@ def test_recordings_with_rows_of_one_trained_on_are_counted() -> None:
 
 def test_windows_that_only_share_a_failed_reading_are_no_copies() -> None:
     windows = moving()
-    x = windows.x.copy()
+    x = windows.integers.copy()
     at = np.flatnonzero(windows.subject != "none")[::3]
     x[at, 0, 40] = 2**31 - 1
-    failed = replace(windows, x=x)
-    assert far_inputs(windows.x) == {} and far_inputs(x)[0].sum() == len(at)
+    failed = replace(windows, integers=x)
+    assert far_inputs(windows.integers) == {} and far_inputs(x)[0].sum() == len(at)
     assert audited(failed, "by-subject:4")["near_duplicates"] == 0
     said: list[str] = []
     warn_of_far_readings(failed, said.append)

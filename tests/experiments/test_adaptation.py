@@ -8,6 +8,7 @@ import pytest
 from plushsense.core.errors import BadInput
 from plushsense.experiments.adaptation import HeldOutPerson, Predictors, score_adaptation
 from plushsense.windows.cut import WindowSet
+from support.fakes import plain_units
 
 LABELS = ("hold", "tap", "hit")
 
@@ -27,7 +28,8 @@ def made(each: int = 4, people: tuple[str, ...] = ("A", "B"), rows: int = 100) -
     n = len(ids)
     place = np.array([(b, b + rows) for b in begin])
     windows = WindowSet(
-        x=np.repeat(np.array(y, dtype=np.int32)[:, None, None], 5, axis=2),
+        integers=np.repeat(np.array(y, dtype=np.int32)[:, None, None], 5, axis=2),
+        units=plain_units(1),
         y=np.array(y, dtype=np.int64),
         labels=LABELS,
         affects=("none",) * 3,
@@ -54,7 +56,7 @@ def always_hold(windows: WindowSet) -> np.ndarray:
 
 
 def truth(windows: WindowSet) -> np.ndarray:
-    return says(windows.x[:, 0, 0])
+    return says(windows.integers[:, 0, 0])
 
 
 class Recorder:

@@ -22,7 +22,7 @@ from plushsense.models.reference import random_weights
 from plushsense.runtime.classifier import StreamClassifier
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.runtime.health import HealthSettings
-from plushsense.windows.features import Scaler, network_inputs
+from plushsense.windows.features import InputUnits, Scaler, network_inputs
 
 RATE_HZ = 50.0
 HAND = Layout.from_dict(
@@ -111,7 +111,7 @@ def test_a_toy_that_is_held_the_other_way_round_is_not_reported(scaled: bool) ->
     values = movement(1)
     bundle = bundle_of(HAND, np.concatenate([values[:450], values[800:]]))  # lying, in two directions
     if not scaled:
-        bundle = replace(bundle, scaler=Scaler.none(HAND.n_inputs))
+        bundle = replace(bundle, scaler=Scaler.none(InputUnits.of(HAND), HAND.input_vectors))
     held = movement(2)
     held[:, 1:] *= -1
     assert reported(bundle, held) == []

@@ -12,10 +12,16 @@ import numpy as np
 from plushsense.core.errors import TrainingError
 from plushsense.evaluation.crossval import FoldOutput
 from plushsense.windows.cut import WindowSet
+from plushsense.windows.features import InputUnits
 
 LABELS = ("At rest", "Back stroke", "Tail hit")
 AFFECTS = ("neutral", "positive", "negative")
 ROWS = 100
+
+
+def plain_units(inputs: int) -> InputUnits:
+    """Units of inputs whose values are integers."""
+    return InputUnits(np.ones(inputs), np.zeros(inputs), ("count",) * inputs)
 
 
 def study(
@@ -54,7 +60,8 @@ def study(
     x[:, 0, :] = y[:, None]
     x[:, 1, :] = np.array([row[3] for row in rows])[:, None]
     return WindowSet(
-        x=x,
+        integers=x,
+        units=plain_units(2),
         y=y,
         labels=LABELS,
         affects=AFFECTS,
@@ -90,7 +97,7 @@ class Oracle:
             row = {"epoch": epoch, "train_loss": 1.0 / epoch}
             history.append(row)
             progress(epoch, self.epochs, row)
-        read = (test.x[:, 0, 0] + np.isin(test.subject, self.confused)) % len(LABELS)
+        read = (test.integers[:, 0, 0] + np.isin(test.subject, self.confused)) % len(LABELS)
         probabilities = np.full((len(test), len(LABELS)), 0.1, dtype=np.float32)
         probabilities[np.arange(len(test)), read] = 0.8
         return FoldOutput(probabilities, history, 0.25, self.epochs)
@@ -114,7 +121,7 @@ class Memory:
     """Knows a recording only if it was trained on: a leak shows as a high score."""
 
     def __call__(self, train: WindowSet, validation: WindowSet, test: WindowSet, progress: Any, /) -> FoldOutput:
-        seen = np.isin(test.x[:, 1, 0], np.concatenate([train.x[:, 1, 0], validation.x[:, 1, 0]]))
+        seen = np.isin(test.integers[:, 1, 0], np.concatenate([train.integers[:, 1, 0], validation.integers[:, 1, 0]]))
         read = np.where(seen, test.y, (test.y + 1) % len(LABELS))
         return FoldOutput(np.eye(len(LABELS), dtype=np.float32)[read])
 
@@ -137,7 +144,8 @@ def rhythms(n: int = 60, seed: int = 0, classes: int = 3, samples: int = 50) -> 
     none = np.full((n, 2), -1, dtype=np.int64)
     labels = tuple(f"gesture {k}" for k in range(classes))
     return WindowSet(
-        x=x.astype(np.int32), y=y.astype(np.int64), labels=labels, affects=("none",) * classes, families=labels,
+        integers=x.astype(np.int32), units=plain_units(2), y=y.astype(np.int64), labels=labels,
+        affects=("none",) * classes, families=labels,
         recording=np.arange(n, dtype=np.int64), recording_ids=tuple(f"P/{i:03d}" for i in range(n)),
         subject=np.array([f"P{i % 5}" for i in range(n)]), context=np.full(n, "inside"), stream=np.full(n, ""),
         window_rows=none, recording_rows=none, rate_hz=100.0, inputs=("a", "b"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from plushsense.windows.cut import WindowSet
+from support.fakes import plain_units
 
 SAMPLES = 60
 
@@ -20,7 +21,8 @@ def make(windows: int, seed: int = 0, channels: int = 2, classes: int = 3, perso
     x = wave[:, None, :] + rng.normal(0, 40, (windows, channels, SAMPLES)) + 5000
     nothing = np.full((windows, 2), -1, dtype=np.int64)
     return WindowSet(
-        x=x.astype(np.int32),
+        integers=x.astype(np.int32),
+        units=plain_units(channels),
         y=y.astype(np.int64),
         labels=tuple(f"gesture {k}" for k in range(classes)),
         affects=("none",) * classes,

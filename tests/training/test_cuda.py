@@ -40,7 +40,7 @@ def test_it_learns_and_the_reference_reads_the_same(made: Make, padding: str, no
     out = fit(made(150), made(60, seed=1, person="P02"), net, replace(SPEC, epochs=25))
     found = predict(net, out.weights, out.scaler, test, device="cuda")
     assert (found.argmax(axis=1) == test.y).mean() > 0.9
-    assert np.abs(found - Network(net, out.weights).probabilities(out.scaler.apply(test.x))).max() < 1e-5
+    assert np.abs(found - Network(net, out.weights).probabilities(out.scaler.apply(test.integers))).max() < 1e-5
     assert np.abs(found - predict(net, out.weights, out.scaler, test, device="cpu")).max() < 1e-5
 
 

@@ -39,7 +39,7 @@ def test_it_learns_and_the_reference_reads_the_same(made: Make, padding: str, no
     assert found.dtype == np.float32 and found.sum(axis=1) == pytest.approx(np.ones(90), abs=1e-5)
     assert (found.argmax(axis=1) == test.y).mean() > 0.9
     network = Network(net, out.weights)
-    assert np.abs(found - network.probabilities(out.scaler.apply(test.x))).max() < 1e-5
+    assert np.abs(found - network.probabilities(out.scaler.apply(test.integers))).max() < 1e-5
 
 
 def test_the_same_seed_gives_the_same_weights_and_leaves_the_global_seed_alone(made: Make) -> None:
@@ -157,10 +157,10 @@ def test_without_patience_or_validation_every_epoch_is_trained(made: Make) -> No
 
 def test_scaling_is_of_the_training_windows_and_survives_a_constant_channel(made: Make) -> None:
     train, validation = made(40), made(20, seed=1)
-    train.x[:, 1] = 77
-    out = fit(train, replace(validation, x=validation.x * 3), arch(), replace(SPEC, epochs=2))
-    assert out.scaler.offset == pytest.approx(train.x.mean(axis=(0, 2)))
-    assert 1 / out.scaler.scale[0] == pytest.approx(train.x[:, 0].std())
+    train.integers[:, 1] = 77
+    out = fit(train, replace(validation, integers=validation.integers * 3), arch(), replace(SPEC, epochs=2))
+    assert out.scaler.offset == pytest.approx(train.integers.mean(axis=(0, 2)))
+    assert 1 / out.scaler.scale[0] == pytest.approx(train.integers[:, 0].std())
     assert np.isfinite(out.scaler.scale).all()
     assert all(np.isfinite(w).all() for w in out.weights.values())
 
@@ -173,7 +173,7 @@ def test_a_last_tiny_batch_does_no_harm(made: Make, windows: int) -> None:
 
 def test_longer_windows_are_read_at_their_end(made: Make) -> None:
     test = made(20)
-    longer = replace(test, x=np.concatenate([np.full((20, 2, 13), 9999, np.int32), test.x], axis=2))
+    longer = replace(test, integers=np.concatenate([np.full((20, 2, 13), 9999, np.int32), test.integers], axis=2))
     out = fit(made(60), None, arch(), replace(SPEC, epochs=2))
     one, other = (predict(arch(), out.weights, out.scaler, w, device="cpu") for w in (test, longer))
     assert np.array_equal(one, other)
@@ -271,16 +271,18 @@ def test_hard_negatives_are_the_idle_windows_that_look_like_a_gesture(made: Make
     hard = hard.take(np.flatnonzero(hard.y == 0))
     hard = replace(hard, y=np.full_like(hard.y, idle))
     candidates = easy.joined(hard)
-    assert len(candidates) == len(easy) + len(hard) and candidates.x.shape[1:] == easy.x.shape[1:]
+    assert len(candidates) == len(easy) + len(hard) and candidates.integers.shape[1:] == easy.integers.shape[1:]
     names = [candidates.recording_ids[r] for r in candidates.recording]
     assert names == [w.recording_ids[r] for w in (easy, hard) for r in w.recording]
     spec = replace(SPEC, epochs=25)
     more = with_hard_negatives(train, candidates, idle, (0, 1), arch(), spec, share=0.1)
     added = more.take(np.arange(len(train), len(more)))
-    assert 0 < len(added) <= 6 and np.array_equal(more.x[: len(train)], train.x) and set(added.y) == {idle}
-    assert all(any(np.array_equal(x, other) for other in hard.x) for x in added.x)
+    assert (
+        0 < len(added) <= 6 and np.array_equal(more.integers[: len(train)], train.integers) and set(added.y) == {idle}
+    )
+    assert all(any(np.array_equal(x, other) for other in hard.integers) for x in added.integers)
     # What is no reaction may be reported.
-    assert with_hard_negatives(train, hard, idle, (1,), arch(), spec, share=0.1).x.shape == train.x.shape
+    assert with_hard_negatives(train, hard, idle, (1,), arch(), spec, share=0.1).integers.shape == train.integers.shape
     # Gestures among the candidates are ignored, and with no share nothing is trained.
     assert (
         with_hard_negatives(train, made(30, seed=6).take(np.arange(0)), idle, (0, 1), arch(), spec, share=0.1) is train

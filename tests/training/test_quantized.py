@@ -43,7 +43,7 @@ def spoilt(network: Arch) -> Weights:
 
 def alike(windows: WindowSet) -> WindowSet:
     """The second channel nearly the first."""
-    windows.x[:, 1] = windows.x[:, 0] + (windows.x[:, 1] - 5000) // 50
+    windows.integers[:, 1] = windows.integers[:, 0] + (windows.integers[:, 1] - 5000) // 50
     return windows
 
 
@@ -51,11 +51,11 @@ def alike(windows: WindowSet) -> WindowSet:
 @pytest.mark.parametrize(("padding", "share"), [("stream", 0.25), ("mirror", 0.5)])
 def test_it_computes_what_the_toy_computes(padding: str, share: float, made: Make) -> None:
     network, windows = arch(padding=padding), made(64)
-    scaler, weights = Scaler.fit(windows.x), random_weights(network, 3)
+    scaler, weights = Scaler.fit(windows.integers), random_weights(network, 3)
     weights["norm0.gain"][1] *= -1.0
     weights["norm0.gain"][2] = 0.0
-    kept = calibration(network, weights, scaler, windows.x)
-    x = windows.x[:, :, windows.x.shape[2] - network.span :]
+    kept = calibration(network, weights, scaler, windows.integers)
+    x = windows.integers[:, :, windows.integers.shape[2] - network.span :]
     found = Rounded(network, weights, kept).logits(torch.from_numpy(scaler.apply(x))).numpy()
     wanted = deployed(network, weights, scaler, kept).forward(x) / 256
     floats = Network(network, weights).forward(scaler.apply(x))
@@ -65,17 +65,17 @@ def test_it_computes_what_the_toy_computes(padding: str, share: float, made: Mak
 
 def test_it_saves_a_network_that_plain_rounding_spoils(made: Make) -> None:
     network, windows, strangers = arch(), alike(made(240)), alike(made(150, seed=9))
-    scaler, weights = Scaler.fit(windows.x), spoilt(arch())
-    kept = calibration(network, weights, scaler, windows.x)
+    scaler, weights = Scaler.fit(windows.integers), spoilt(arch())
+    kept = calibration(network, weights, scaler, windows.integers)
     before = {name: w.copy() for name, w in weights.items()}
     tuned = fine_tune(windows, network, weights, scaler, kept, SPEC, 15)
     assert all(np.array_equal(weights[name], before[name]) for name in before), "what was given stays"
     assert [row["epoch"] for row in tuned.history] == list(range(1, 16))
     assert tuned.history[-1]["train_loss"] < 0.5 * tuned.history[0]["train_loss"]
-    teacher = Network(network, weights).forward(scaler.apply(strangers.x))
+    teacher = Network(network, weights).forward(scaler.apply(strangers.integers))
 
     def off(after: Weights) -> tuple[float, float]:
-        read = deployed(network, after, scaler, kept).forward(strangers.x) / 256
+        read = deployed(network, after, scaler, kept).forward(strangers.integers) / 256
         apart = (read - read.mean(axis=1, keepdims=True)) - (teacher - teacher.mean(axis=1, keepdims=True))
         return float((read.argmax(axis=1) == teacher.argmax(axis=1)).mean()), float(np.sqrt((apart**2).mean()))
 
@@ -88,8 +88,8 @@ def test_it_saves_a_network_that_plain_rounding_spoils(made: Make) -> None:
 
 def test_the_same_seed_gives_the_same_weights_and_leaves_the_global_seed_alone(made: Make) -> None:
     network, windows = arch(), made(40)
-    scaler, weights = Scaler.fit(windows.x), random_weights(arch(), 3)
-    kept = calibration(network, weights, scaler, windows.x)
+    scaler, weights = Scaler.fit(windows.integers), random_weights(arch(), 3)
+    kept = calibration(network, weights, scaler, windows.integers)
     state = torch.get_rng_state()
     one, two = (fine_tune(windows, network, weights, scaler, kept, SPEC, 2).weights for _ in range(2))
     assert torch.equal(state, torch.get_rng_state())
@@ -106,7 +106,7 @@ def test_the_same_seed_gives_the_same_weights_and_leaves_the_global_seed_alone(m
 )
 def test_what_cannot_be_tuned_is_said(made: Make, changes: dict[str, Any], epochs: int, said: str) -> None:
     network, windows = arch(**changes), made(20)
-    scaler, weights = Scaler.fit(windows.x), random_weights(arch(**changes), 3)
-    kept = calibration(network, weights, scaler, windows.x)
+    scaler, weights = Scaler.fit(windows.integers), random_weights(arch(**changes), 3)
+    kept = calibration(network, weights, scaler, windows.integers)
     with pytest.raises(TrainingError, match=said):
         fine_tune(windows, network, weights, scaler, kept, SPEC, epochs)

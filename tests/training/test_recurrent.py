@@ -33,7 +33,7 @@ def test_it_learns_and_the_seed_decides(made: Make, both_ways: bool) -> None:
     few = fit_recurrent(train, replace(SPEC, epochs=2), 40, both_ways=both_ways, units=16)
     assert not np.array_equal(other(test), few(test))
     # Only the end of a window is read.
-    longer = replace(test, x=np.concatenate([test.x[:, :, ::-1] * 3, test.x], axis=2))
+    longer = replace(test, integers=np.concatenate([test.integers[:, :, ::-1] * 3, test.integers], axis=2))
     assert np.array_equal(once(longer), read)
     assert once(test.take(np.zeros(0, dtype=np.int64))).shape == (0, 3)
 

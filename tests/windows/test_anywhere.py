@@ -50,7 +50,7 @@ def made(tmp_path: Path, *labels: Gesture) -> Dataset:
 
 def newest(windows: WindowSet, label: str) -> list[int]:
     """The newest rows of the windows of a class, ascending."""
-    return sorted(windows.x[windows.y == windows.labels.index(label), 0, -1].tolist())
+    return sorted(windows.integers[windows.y == windows.labels.index(label), 0, -1].tolist())
 
 
 @pytest.fixture
@@ -69,9 +69,9 @@ def test_each_position_is_called_what_its_newest_sample_lies_in(dataset: Dataset
     outside = [row for row in idle if row not in resting]
     assert outside == [*range(99, 500), *range(800, 1000), *range(1200, 1500), *range(1750, 2000)]
     assert set(w.context) == {"anywhere"}
-    assert np.all(np.diff(w.x[:, 0], axis=1) == 1), "what really came before"
-    assert np.all(w.window_rows[:, 1] - 1 == w.x[:, 0, -1])
-    assert np.all(w.window_rows[:, 0] == w.x[:, 0, 0])
+    assert np.all(np.diff(w.integers[:, 0], axis=1) == 1), "what really came before"
+    assert np.all(w.window_rows[:, 1] - 1 == w.integers[:, 0, -1])
+    assert np.all(w.window_rows[:, 0] == w.integers[:, 0, 0])
 
 
 def test_trimmed_excluded_and_foreign_recordings(dataset: Dataset) -> None:
@@ -152,7 +152,7 @@ def test_no_window_reaches_over_a_break_of_the_clock(tmp_path: Path) -> None:
     person(tmp_path / "src" / "ana", {(500, 200): "Wave"}, stream=Frames(stream.values, clock, stream.host_ms))
     data = made(tmp_path)
     w = cut_anywhere(data, SPEC, data.gestures, EVERY)
-    assert np.all(np.diff(w.x[:, 0], axis=1) == 1)
+    assert np.all(np.diff(w.integers[:, 0], axis=1) == 1)
     assert not set(newest(w, "Still")) & set(range(1200, 1299))
 
 
@@ -299,4 +299,4 @@ def test_a_stream_of_just_one_window_gives_it(tmp_path: Path) -> None:
     person(tmp_path / "src" / "ana", {(20, 80): "Wave"}, rows=100)
     data = made(tmp_path)
     w = cut_anywhere(data, SPEC, data.gestures, EVERY)
-    assert w.context.tolist() == ["anywhere"] and w.x[0, 0].tolist() == [*range(100)]
+    assert w.context.tolist() == ["anywhere"] and w.integers[0, 0].tolist() == [*range(100)]

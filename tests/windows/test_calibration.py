@@ -130,7 +130,7 @@ def test_the_past_of_the_session_is_used_and_nothing_else(tmp_path: Path) -> Non
     assert windows.self_calibration == "causal"
     assert cut_windows(dataset.with_inputs(replace(LAYOUT, self_calibration=()))).self_calibration == ""
     other = cut_windows(written(tmp_path / "b", LAYOUT, 4.0, -20_000))
-    assert np.abs(windows.x - other.x).max() <= 0.02 * UNIT
+    assert np.abs(windows.integers - other.integers).max() <= 0.02 * UNIT
 
 
 def test_a_session_can_be_read_from_another_state(tmp_path: Path) -> None:

@@ -58,12 +58,12 @@ def dataset(tmp_path: Path) -> Dataset:
 
 def test_loops_repeat_from_the_start_and_are_never_padded(dataset: Dataset) -> None:
     w = cut_windows(dataset, WindowSpec(context="loop"), dataset.gestures.subset(["Wave"]))
-    short = w.x[(w.subject == "ben")][0, 0]
+    short = w.integers[(w.subject == "ben")][0, 0]
     assert np.array_equal(short, np.tile(np.arange(100), 3)[:250])
     assert w.context[w.subject == "ben"].tolist() == ["loop"]
-    long = w.x[np.array([i for i in range(len(w)) if w.context[i] == "inside"])]
+    long = w.integers[np.array([i for i in range(len(w)) if w.context[i] == "inside"])]
     assert long[:, 0, 0].tolist() == [700, 750, 800, 850], "full windows only, every 50 samples"
-    assert np.all(w.x[:, 1] == 1)
+    assert np.all(w.integers[:, 1] == 1)
     assert set(w.stream[w.subject == "ana"]) == {"ana/fulldatastream"}, "where it lies is known all the same"
     assert np.all(w.window_rows == -1)
     assert set(w.stream[w.subject == "ben"]) == {""}
@@ -74,29 +74,29 @@ def test_loops_repeat_from_the_start_and_are_never_padded(dataset: Dataset) -> N
 
 def test_stream_context_is_what_came_before(dataset: Dataset) -> None:
     w = cut_windows(dataset, WindowSpec(context="stream"), dataset.gestures.subset(["Wave", "Shake"]))
-    assert sorted(w.x[w.context == "stream", 0, -1].tolist()) == [519], "the one with a past of its own"
+    assert sorted(w.integers[w.context == "stream", 0, -1].tolist()) == [519], "the one with a past of its own"
     ana = w.take(np.flatnonzero(np.isin(w.context, ["stream", "inside"]) & (w.window_rows[:, 0] >= 0)))
-    assert sorted(ana.x[:, 0, -1].tolist()) == [519, 949, 999, 1049, 1099]
-    assert np.all(np.diff(ana.x[:, 0], axis=1) == 1)
+    assert sorted(ana.integers[:, 0, -1].tolist()) == [519, 949, 999, 1049, 1099]
+    assert np.all(np.diff(ana.integers[:, 0], axis=1) == 1)
     assert np.all(ana.window_rows[:, 1] - ana.window_rows[:, 0] == 250)
-    at = ana.window_rows[np.argmin(ana.x[:, 0, -1])]
+    at = ana.window_rows[np.argmin(ana.integers[:, 0, -1])]
     assert at.tolist() == [270, 520], "the raw rows of the stream that the window touches"
-    assert ana.recording_rows[np.argmin(ana.x[:, 0, -1])].tolist() == [400, 520]
+    assert ana.recording_rows[np.argmin(ana.integers[:, 0, -1])].tolist() == [400, 520]
 
 
 def test_too_little_past_or_a_gap_falls_back_to_a_marked_loop(dataset: Dataset) -> None:
     w = cut_windows(dataset, WindowSpec(context="stream"), dataset.gestures.subset(["Shake"]))
     assert sorted(w.context.tolist()) == ["loop", "loop"], "row 100 has no past of 250; row 1550 has a gap in it"
-    assert sorted(w.x[:, 0, 0].tolist()) == [100, 1550]
+    assert sorted(w.integers[:, 0, 0].tolist()) == [100, 1550]
 
 
 def test_a_longer_span_reaches_further_back(dataset: Dataset) -> None:
     w = cut_windows(dataset, WindowSpec(context="stream", span_s=4.99), dataset.gestures.subset(["Wave"]))
     real = w.take(np.flatnonzero(w.context == "stream"))
-    assert w.x.shape[2] == 499
+    assert w.integers.shape[2] == 499
     assert "inside" not in w.context, "410 rows do not fill 499"
-    assert real.x[:, 0, -1].tolist() == [519, 949, 999, 1049, 1099]
-    assert real.x[0, 0, 0] == 519 - 498
+    assert real.integers[:, 0, -1].tolist() == [519, 949, 999, 1049, 1099]
+    assert real.integers[0, 0, 0] == 519 - 498
 
 
 def test_trimmed_and_excluded_recordings(dataset: Dataset) -> None:
@@ -107,7 +107,7 @@ def test_trimmed_and_excluded_recordings(dataset: Dataset) -> None:
         [Mark(wave.id, "trim", "test", "late", 20, 100), Mark(long.id, "exclude", "test", "noise")],
     )
     w = cut_windows(open_dataset(dataset.path), WindowSpec(), dataset.gestures.subset(["Wave"]))
-    assert w.x[w.context == "stream", 0, -1].tolist() == [499]
+    assert w.integers[w.context == "stream", 0, -1].tolist() == [499]
     assert open_dataset(dataset.path).hash != dataset.hash
 
 
@@ -147,7 +147,7 @@ def test_a_recording_nobody_stopped_is_left_out_and_named(dataset: Dataset, tmp_
     waves = longer.gestures.subset(["Wave"])
     w = cut_windows(longer, WindowSpec(context="loop"), waves)
     assert w.left_out == ("ben/Wave_99_3000: 3000 rows where Wave usually has 110",)
-    assert w.x[:, 0].max() < 5000
+    assert w.integers[:, 0].max() < 5000
     everything = cut_windows(longer, WindowSpec(context="loop", longest_factor=0), waves)
     assert everything.left_out == ()
     assert len(everything) == len(w) + 56
@@ -170,7 +170,7 @@ def test_a_recording_with_a_gap_keeps_the_full_windows_before_it(dataset: Datase
     again = import_recordings(tmp_path / "src", tmp_path / "DS2", layout=ACCEL).dataset
     w = cut_windows(again, WindowSpec(longest_factor=0), again.gestures.subset(["Shake"]))
     mine = w.take(np.flatnonzero(w.recording == w.recording_ids.index("ana/Shake_77_651")))
-    assert mine.x[:, 0, 0].tolist() == [1150, 1200, 1250, 1501, 1551]
+    assert mine.integers[:, 0, 0].tolist() == [1150, 1200, 1250, 1501, 1551]
     assert set(mine.context) == {"inside"}
 
 
@@ -190,11 +190,14 @@ def test_sets_of_windows_are_joined_and_cut_down_to_some_inputs(dataset: Dataset
     n = len(waves)
     assert len(both) == n + 2 and both.recording_ids == waves.recording_ids * 2
     assert both.recording.tolist() == [*waves.recording, *(waves.recording[:2] + len(waves.recording_ids))]
-    assert np.array_equal(both.x[n:], waves.x[:2]) and both.subject[n:].tolist() == waves.subject[:2].tolist()
+    assert (
+        np.array_equal(both.integers[n:], waves.integers[:2])
+        and both.subject[n:].tolist() == waves.subject[:2].tolist()
+    )
     turned = waves.only(["z", "x", "y"])
     assert turned.inputs == ("z", "x", "y") and turned.vectors == ((1, 2, 0),)
-    assert np.array_equal(turned.x, waves.x[:, [2, 0, 1]])
-    assert waves.only(["y"]).vectors == () and waves.only(["y"]).x.shape == (n, 1, 250)
+    assert np.array_equal(turned.integers, waves.integers[:, [2, 0, 1]])
+    assert waves.only(["y"]).vectors == () and waves.only(["y"]).integers.shape == (n, 1, 250)
     assert repr(waves) == (
         f"WindowSet({n} windows of 3 channels × 250 samples at 100 Hz, 5 recordings, 2 classes; 4 inside, 4 loop)"
     )
@@ -223,7 +226,7 @@ def test_how_long_a_recording_is_counts_after_trimming(dataset: Dataset, tmp_pat
     longer = open_dataset(longer.path)
     assert len(recordings_in_time(list(longer.used))) == len(longer.used)
     w = cut_windows(longer, WindowSpec(context="loop"), longer.gestures.subset(["Wave"]))
-    assert w.left_out == () and 7800 in w.x[:, 0, 0]
+    assert w.left_out == () and 7800 in w.integers[:, 0, 0]
 
 
 def test_windows_that_are_constant_in_time_are_named(dataset: Dataset, tmp_path: Path) -> None:

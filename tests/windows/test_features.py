@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from plushsense.core.errors import BadInput
 from plushsense.core.layouts import load_layout, magnitude_limit
 from plushsense.windows.features import SampleInputs, Scaler, magnitude, network_inputs
+from support.fakes import plain_units
 
 LIMIT = magnitude_limit(3)
 
@@ -93,7 +94,7 @@ def test_inputs_are_distances_from_the_offset_of_a_channel() -> None:
 
 def test_no_scaling_changes_nothing_and_vectors_keep_their_zero() -> None:
     x = np.array([[[3, 4, 5], [10, 10, 10], [0, 30, 0]]], dtype=np.int32)
-    assert np.array_equal(Scaler.none(3).apply(x), x)
+    assert np.array_equal(Scaler.none(plain_units(3)).apply(x), x)
     scaler = Scaler.fit(x, [(1, 2)])
     assert scaler.offset.tolist() == [4.0, 0.0, 0.0]
     # Mean squares of the two axes: 100 and 300.

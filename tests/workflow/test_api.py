@@ -165,7 +165,7 @@ def test_the_ranges_of_a_network_trained_anywhere_come_from_its_own_windows(data
     bundle = ps.train(dataset, context="anywhere", every_s=0.5, epochs=1, filters=(4, 4, 4)).bundle
     read = dataset.with_inputs(bundle.layout)
     cut = cut_anywhere(read, WindowSpec(context="anywhere"), bundle.gestures, AnywhereSpec(every_s=0.5))
-    mine = cut.x[np.isin(cut.subject, bundle.provenance["subjects"])]
+    mine = cut.integers[np.isin(cut.subject, bundle.provenance["subjects"])]
     assert np.array_equal(training_windows(bundle, dataset), mine)
 
 

@@ -26,7 +26,7 @@ def test_training_calibrates_on_the_windows_it_trained_on_and_no_others(dataset:
     assert 0 < trained_on.sum() < len(windows), "somebody was held back"
 
     def of(mask: np.ndarray) -> dict[str, object]:
-        return calibration(bundle.arch, bundle.weights, bundle.scaler, windows.x[mask])
+        return calibration(bundle.arch, bundle.weights, bundle.scaler, windows.integers[mask])
 
     assert bundle.calibration == of(trained_on)
     assert bundle.calibration != of(np.ones(len(windows), dtype=bool)), "held-back people would show"

@@ -242,7 +242,7 @@ def test_a_classifier_of_cut_windows_is_a_bundle_that_reads_the_toy(
     assert bundle.layout == dataset.layout
     assert bundle.gestures.labels == tuple(model.classes_)
     assert bundle.provenance["subjects"] == sorted(dataset.subjects)
-    reference = bundle.network().probabilities(bundle.scaler.apply(windows.x))
+    reference = bundle.network().probabilities(bundle.scaler.apply(windows.integers))
     ours = model.predict_proba(windows.x)
     assert np.abs(reference - ours).max() < 1e-5
 
@@ -277,7 +277,8 @@ def test_any_bundle_becomes_a_classifier(bundle: Path, dataset: Dataset) -> None
     windows = ps.cut_windows(dataset.with_inputs(loaded.layout))
     model = ps.PlushClassifier.from_bundle(bundle)
     assert model.classes_.tolist() == list(loaded.gestures.labels)
-    assert np.allclose(model.predict_proba(windows.x), loaded.network().probabilities(loaded.scaler.apply(windows.x)))
+    expected = loaded.network().probabilities(loaded.scaler.apply(windows.integers))
+    assert np.allclose(model.predict_proba(windows.x), expected)
     assert set(model.predict(windows.x)) <= set(windows.labels)
 
 
@@ -354,7 +355,13 @@ def test_what_does_not_fit_is_refused_in_a_sentence() -> None:
         (r"windows of 2 channels, but channels or layout say 3", small(channels=3), x, y, None),
         (r"channels is 0", small(channels=0), rows, y, None),
         (r"channels is 2, but the layout 'accel-3' has 3", small(channels=2, layout=accel), three, y, None),
-        (r"not whole numbers, but with the layout 'accel-3'", small(layout="accel-3"), three + 0.5, y, None),
+        (
+            r"-628.5 in 'x', which the layout 'accel-3' counts in steps of 1",
+            small(layout="accel-3"),
+            three + 0.5,
+            y,
+            None,
+        ),
         (r"beyond 32 bits", small(layout="accel-3"), three * 1e9, y, None),
         (r"at least 2 samples", small(channels=120), rows, y, None),
         (r"one class \(0\)", small(), x, np.zeros(60, dtype=int), None),

@@ -258,11 +258,12 @@ class FrameGenerator:
 
 
 def measured(layout: Layout, scaler: Scaler) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return mean and spread of each measured channel, from the scaler of the inputs."""
+    """Return mean and spread of each measured channel, from the scaler of the inputs; 0 and a unit if it has none."""
     c = len(layout.channels)
     mean, spread = np.zeros(c), np.full(c, 100.0)
     derived = {d.name: d.of for d in layout.derived}
-    kinds = zip(layout.inputs, layout.input_kinds, scaler.offset, scaler.scale, strict=True)
+    means = scaler.offset if scaler.knows_training(layout) else np.zeros(len(scaler.offset))
+    kinds = zip(layout.inputs, layout.input_kinds, means, scaler.scale, strict=True)
     for name, kind, offset, scale in kinds:
         if kind == "gravity":
             continue

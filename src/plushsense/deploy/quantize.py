@@ -256,7 +256,7 @@ _MAX_WINDOWS = 1024
 def calibration(
     arch: Arch, weights: Mapping[str, NDArray[np.float32]], scaler: Scaler, x: NDArray[np.integer[Any]]
 ) -> dict[str, Any]:
-    """Calibrate on raw training windows (N, C, T); return plain values for the bundle, without samples.
+    """Calibrate on integer training windows (N, C, T); return plain values for the bundle, without samples.
 
     Empty for a network that cannot be deployed, or without windows.
     """
@@ -268,7 +268,7 @@ def calibration(
 
 
 def calibrated(bundle: Bundle, x: NDArray[np.integer[Any]]) -> Bundle:
-    """Return the bundle with the calibration of raw windows (N, C, T) of its training people.
+    """Return the bundle with the calibration of integer windows (N, C, T) of its training people.
 
     Raises:
         ArchError: for a network that cannot be deployed; BundleError: without windows.
@@ -321,5 +321,5 @@ def classifier_of(bundle: Bundle, decide: DecideSpec | None, engine: str) -> Str
 
 
 def integer_probabilities(network: IntegerNetwork, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
-    """Compute the probabilities (N, K) of raw windows (N, C, T) with a deployed network, without smoothing."""
+    """Compute the probabilities (N, K) of integer windows (N, C, T) with a deployed network, without smoothing."""
     return softmax(network.forward(x)).astype(np.float32) / np.float32(1 << PROBABILITY_BITS)

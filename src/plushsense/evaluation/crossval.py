@@ -113,8 +113,8 @@ def _ids(windows: WindowSet) -> NDArray[np.str_]:
 
 
 def _same(one: WindowSet, other: WindowSet) -> bool:
-    return one.x.shape == other.x.shape and bool(
-        np.array_equal(one.x, other.x) and np.array_equal(_ids(one), _ids(other))
+    return one.integers.shape == other.integers.shape and bool(
+        np.array_equal(one.integers, other.integers) and np.array_equal(_ids(one), _ids(other))
     )
 
 
@@ -328,8 +328,8 @@ def context_of(windows: WindowSet) -> str:
 
 def windows_fingerprint(windows: WindowSet) -> str:
     """Return a hash of the windows, for the ids of jobs that use them."""
-    digest = hashlib.sha256(repr((windows.x.shape, windows.labels, windows.recording_ids)).encode())
-    for array in (windows.x, windows.y, windows.recording):
+    digest = hashlib.sha256(repr((windows.integers.shape, windows.labels, windows.recording_ids)).encode())
+    for array in (windows.integers, windows.y, windows.recording):
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
 

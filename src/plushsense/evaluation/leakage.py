@@ -95,13 +95,13 @@ def audit_leakage(
 
 def _without_far(windows: WindowSet) -> WindowSet:
     """Return windows in which the samples that alone set the scale of their input are the input's median."""
-    found = far_inputs(windows.x)
+    found = far_inputs(windows.integers)
     if not found:
         return windows
-    x = windows.x.copy()
+    x = windows.integers.copy()
     for at, far in found.items():
         x[:, at][far] = np.median(x[:, at])
-    return replace(windows, x=x)
+    return replace(windows, integers=x)
 
 
 def warn_of_copies(audit: Mapping[str, Any], warn: Callable[[str], None]) -> None:
@@ -155,14 +155,16 @@ class _Signatures:
 
     def __init__(self, train: WindowSet, score: WindowSet, scale: NDArray[np.float32]) -> None:
         self._train, self._score, self._scale = train, score, scale
-        self._shift = min(round(SHIFT_S * score.rate_hz), score.x.shape[2] // 4)
+        self._shift = min(round(SHIFT_S * score.rate_hz), score.integers.shape[2] // 4)
         self._of_train = _sorted_values(train, scale)
         self._of_score = self._of_train if score is train else _sorted_values(score, scale)
-        self._changes = np.array([(x[:, 1:] != x[:, :-1]).any(axis=0).mean() for x in score.x])
+        self._changes = np.array([(x[:, 1:] != x[:, :-1]).any(axis=0).mean() for x in score.integers])
 
     @classmethod
     def of(cls, train: WindowSet, score: WindowSet) -> _Signatures:
-        spread = train.x.astype(np.float32).std(axis=(0, 2)) if len(train) else np.ones(train.x.shape[1], np.float32)
+        spread = (
+            train.integers.astype(np.float32).std(axis=(0, 2)) if len(train) else np.ones(len(train.inputs), np.float32)
+        )
         return cls(train, score, (1 / np.where(spread > 0, spread, 1)).astype(np.float32))
 
     def duplicates(self, known: Index, test: Index) -> tuple[Mask, Mask, Index]:
@@ -192,7 +194,7 @@ class _Signatures:
         return similar
 
     def _scaled(self, windows: WindowSet, index: Index) -> NDArray[np.float32]:
-        return windows.x[index] * self._scale[:, None]
+        return windows.integers[index] * self._scale[:, None]
 
     def _candidates(self, known: Index, test: Index) -> Iterator[tuple[Index, Index]]:
         """Yield blocks of positions in ``test`` (b,) with the most similar positions in ``known`` (b, k)."""
@@ -206,11 +208,11 @@ class _Signatures:
 
 
 def _sorted_values(windows: WindowSet, scale: NDArray[np.float32]) -> NDArray[np.float32]:
-    n, inputs, samples = windows.x.shape
+    n, inputs, samples = windows.integers.shape
     places = np.linspace(0, samples - 1, _QUANTILES).round().astype(np.int64)
     out = np.empty((n, inputs * _QUANTILES), dtype=np.float32)
     for start in range(0, n, _BLOCK):
-        ordered = np.sort(windows.x[start : start + _BLOCK], axis=2)[:, :, places] * scale[:, None]
+        ordered = np.sort(windows.integers[start : start + _BLOCK], axis=2)[:, :, places] * scale[:, None]
         out[start : start + _BLOCK] = ordered.reshape(len(ordered), -1)
     return out
 

@@ -134,7 +134,7 @@ def fold_answers(
     sure, known = sure_threshold(calibration, coverage), known_threshold(calibration, bundle.gestures, known_share)
     steps = labelled_steps(bundle, marked_streams(bundle, dataset, test, spec), spec)
     people = sorted(set(steps.person.tolist()))
-    features = bundle.network().features(bundle.scaler.apply(training.x))
+    features = bundle.network().features(bundle.scaler.apply(training.integers))
     typical = RelativeMahalanobis.fit(features, training.y)
     each = [steps.take(steps.person == person) for person in people]
     return {

@@ -339,7 +339,7 @@ def adapt(
             raise BadInput(
                 f"No recording of {person} is left to test on: {use} of each gesture are used to adapt; use fewer."
             )
-    done = personalise(given, adapting.x, adapting.y, adapting.recording, subject=person, spec=spec)
+    done = personalise(given, adapting.integers, adapting.y, adapting.recording, subject=person, spec=spec)
     for label in done.without:
         warn(f"{label}: fewer than {spec.least} recordings, so the network recognises it as before")
     tested = None
@@ -350,7 +350,7 @@ def adapt(
         tested = (one, other)
     corrected = None
     if corrections:
-        features = done.bundle.network().features(done.bundle.scaler.apply(adapting.x))
+        features = done.bundle.network().features(done.bundle.scaler.apply(adapting.integers))
         corrected = correct(done.bundle, corrections, Examples(features, adapting.y, adapting.recording))
     if not dataset.path.is_relative_to(place):  # the one made of a folder is gone by now
         dataset.generation.check()
@@ -424,14 +424,14 @@ def _recordings_of(dataset: Dataset, person: str, bundle: Bundle, warn: Warn) ->
 
 def _float_predictor(bundle: Bundle) -> Predictor:
     network, scaler = bundle.network(), bundle.scaler
-    return lambda windows: network.probabilities(scaler.apply(windows.x))
+    return lambda windows: network.probabilities(scaler.apply(windows.integers))
 
 
 def _predictors(bundle: Bundle, int8: bool) -> dict[str, Predictor]:
     predictors = {"float": _float_predictor(bundle)}
     if int8:
         network = integer_network(bundle)
-        predictors["int8"] = lambda windows: integer_probabilities(network, windows.x)
+        predictors["int8"] = lambda windows: integer_probabilities(network, windows.integers)
     return predictors
 
 
@@ -487,7 +487,7 @@ def evaluate_adapting(
 
         mine = windows.take(fold.train)
         fitted = fit(mine, windows.take(fold.validation), arch, config.training)
-        kept = calibration(arch, fitted.weights, fitted.scaler, mine.x)
+        kept = calibration(arch, fitted.weights, fitted.scaler, mine.integers)
         bundle = Bundle(
             arch,
             fitted.weights,
@@ -531,7 +531,7 @@ def evaluate_adapting(
 def _adapt_to(bundle: Bundle, person: str, spec: PersonalSpec, int8: bool, own: WindowSet) -> Predictors | None:
     """Return the predictors of the bundle adapted to windows of a person; None where it stays as it is."""
     try:
-        done = personalise(bundle, own.x, own.y, own.recording, subject=person, spec=spec)
+        done = personalise(bundle, own.integers, own.y, own.recording, subject=person, spec=spec)
     except BadInput:
         return None  # too few recordings
     return _predictors(done.bundle, int8) if done.accepted else None

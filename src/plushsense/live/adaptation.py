@@ -129,7 +129,7 @@ def personalise(
 
     Args:
         bundle: an adapted bundle is first restored to its original weights.
-        x: raw windows (N, C, T) of the person, from `windows.cut`.
+        x: windows (N, C, T) of the person, `WindowSet.integers`.
         y: (N,) class index of each, in the bundle's gestures.
         recording: (N,) id of the recording of each window.
         subject: the person's code, which is stored in the bundle, as are the weights but no recordings.

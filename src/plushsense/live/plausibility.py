@@ -47,7 +47,7 @@ def gravity_in_training(bundle: Bundle, axes: Sequence[int]) -> tuple[float, boo
     names = [layout.names[axis] for axis in axes]
     derived = {d.of: layout.inputs.index(d.name) for d in layout.derived if d.name in layout.inputs}
     mean, spread = np.asarray(scaler.offset), 1.0 / np.asarray(scaler.scale)
-    if not mean.any() and (spread == 1.0).all():  # `Scaler.none`, which knows nothing
+    if not scaler.knows_training(layout):
         return None
     squares = mean**2 + spread**2
     magnitude = next((at for of, at in derived.items() if len(of) > 1 and set(of) == set(names)), None)

@@ -110,6 +110,7 @@ class Bundle:
     The dictionaries are plain values for JSON.
 
     Attributes:
+        scaler: scaling of the integers that the toy computes (`WindowSet.integers`), not of values in units.
         windowing: settings with which the windows were cut.
         decision: settings of live decisions (`plushsense.runtime.decisions.DecideSpec`).
         provenance: origin of the weights: data set hash, subjects, code version, split, scores.

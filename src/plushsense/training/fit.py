@@ -101,9 +101,9 @@ def fit(
     device = _device(spec.device)
     vectors = train.vectors if arch.vector is not None else ()
     scaler = (
-        Scaler.none(train.x.shape[1])
+        Scaler.none(train.units, vectors)
         if spec.scaling == "none"
-        else Scaler.fit(train.x if weights is None else train.x[repeated(weights)], vectors)
+        else Scaler.fit(train.integers if weights is None else train.integers[repeated(weights)], vectors)
     )
     x, y = _tensors(train, scaler, arch, device)
     val_data = None if validation is None or not len(validation) else _tensors(validation, scaler, arch, device)
@@ -304,7 +304,7 @@ def _measure(net: Engine, data: tuple[Windows, Tensor] | None, windows: WindowSe
 
 def _tensors(windows: WindowSet, scaler: Scaler, arch: Arch, device: torch.device) -> tuple[Windows, Tensor]:
     """Return scaled windows (N, C, span or window) and classes (N,) on the device."""
-    x = scaler.apply(windows.x[:, :, windows.x.shape[2] - arch.span :])
+    x = scaler.apply(windows.integers[:, :, windows.integers.shape[2] - arch.span :])
     return Windows(x, arch, device), torch.from_numpy(windows.y.astype(np.int64)).to(device)
 
 
@@ -313,7 +313,7 @@ def _check(windows: WindowSet, arch: Arch, purpose: str, some: bool = True) -> N
         raise TrainingError(
             f"There are no windows to {purpose}: check the data set, the gestures and the split.", reason="no_windows"
         )
-    _, channels, samples = windows.x.shape
+    _, channels, samples = windows.integers.shape
     if channels != arch.channels or len(windows.labels) != arch.classes:
         raise TrainingError(
             f"The windows have {channels} channels and {len(windows.labels)} classes, but the network "

@@ -71,7 +71,7 @@ def fine_tune(
         )
     if epochs < 1:
         raise TrainingError(f"{epochs} epochs of fine-tuning: accepted are 1 and more.")
-    x = torch.from_numpy(scaler.apply(train.x[:, :, train.x.shape[2] - arch.span :]))
+    x = torch.from_numpy(scaler.apply(train.integers[:, :, train.integers.shape[2] - arch.span :]))
     highest = spec.learning_rate_at(spec.epochs) / _SLOWER
     history: list[dict[str, Any]] = []
     with torch.random.fork_rng(devices=[]), torch_threads(spec.threads):

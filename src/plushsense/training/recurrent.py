@@ -69,7 +69,7 @@ class RecurrentReader:
     def __call__(self, windows: WindowSet, /) -> NDArray[np.float32]:
         """Compute the class probabilities (N, K) of windows."""
         device = self.net.dense.weight.device
-        x = torch.from_numpy(self.scaler.apply(windows.x[:, :, -self.samples :])).to(device)
+        x = torch.from_numpy(self.scaler.apply(windows.integers[:, :, -self.samples :])).to(device)
         with torch.no_grad():
             parts = [F.softmax(self.net(x[at]), dim=1) for at in slices(len(x), _READ)]
         if not parts:
@@ -103,8 +103,9 @@ def fit_recurrent(
         raise TrainingError("There are no windows to train on: check the data set, the gestures and the split.")
     began = time.perf_counter()
     device = torch.device(resolve_device(spec).device)
-    scaler = Scaler.none(train.x.shape[1]) if spec.scaling == "none" else Scaler.fit(train.x[:, :, -samples:])
-    x = torch.from_numpy(scaler.apply(train.x[:, :, -samples:])).to(device)
+    last = train.integers[:, :, -samples:]
+    scaler = Scaler.none(train.units) if spec.scaling == "none" else Scaler.fit(last)
+    x = torch.from_numpy(scaler.apply(last)).to(device)
     y = torch.from_numpy(train.y).to(device)
     with torch.random.fork_rng(devices=[]), torch_threads(spec.threads):
         torch.manual_seed(spec.seed)

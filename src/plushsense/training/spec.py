@@ -43,7 +43,7 @@ class TrainSpec:
             toy is held differently), ``random-gain:0.3`` (stronger or weaker movement), ``random-tilt:8`` (degrees;
             down is not exactly known) and ``random-speed:0.2`` (faster or slower movement) (default: by the preset).
         scaling: ``z-score`` scales each channel by its mean and standard deviation over the training windows; ``none``
-            lets the network read the integers, as in the authors' script (one of `SCALINGS`).
+            lets the network read values in the units of the layout, as in the authors' script (one of `SCALINGS`).
         weight_decay: factor of the L2 regularisation of all parameters but biases, added to the gradient as in MATLAB's
             ``trainnet``, whose default is 0.0001 (0 to 1).
         seed: number that all random choices of the training are drawn from (from 0).
@@ -122,7 +122,9 @@ class TrainSpec:
 
     def key(self) -> dict[str, Any]:
         """Return everything that the result depends on: all settings, and the version of the code."""
-        return {"version": TRAINING_VERSION} | self.to_dict()
+        # Earlier versions read integers where nothing was scaled.
+        reads = {"reads": "units of the layout"} if self.scaling == "none" else {}
+        return {"version": TRAINING_VERSION} | self.to_dict() | reads
 
 
 # "search": paper, section 3.6.1; "loso": paper, section 4.4; "paper" is the same schedule, with the network and windows

@@ -245,7 +245,7 @@ def _planned(dataset: Dataset, grid: GridSpec, cut: _Cut, fits: Callable[[Arch],
         if not fits(arch):
             continue
         windows, folds = cut.at(arch)
-        span = windows.x.shape[2]
+        span = windows.integers.shape[2]
         used.add(span)
         if span not in prints:
             prints[span] = windows_fingerprint(windows), [fold_fingerprint(fold) for fold in folds]

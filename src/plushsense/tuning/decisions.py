@@ -377,7 +377,7 @@ def labelled_windows(bundle: Bundle, dataset: Dataset, subjects: Iterable[str]) 
     except DatasetError:
         empty = np.zeros((0, len(bundle.gestures)), dtype=np.int64)
         return LabelledSteps(empty, _ints(()), _ints(()), np.zeros(0, dtype=np.str_), _ints(()))
-    logits = integer_logits(bundle.network().forward(bundle.scaler.apply(windows.x)))
+    logits = integer_logits(bundle.network().forward(bundle.scaler.apply(windows.integers)))
     shares = softmax(logits)
     known = known_score(logits, np.array([g.idle for g in bundle.gestures.gestures]))
     return LabelledSteps(shares, known, windows.y, windows.subject, windows.recording)

@@ -29,7 +29,7 @@ from plushsense.core.sentences import Sentence, plural
 from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, usual_rows
 from plushsense.dataset.store import RECORDINGS, UNKNOWN_SUBJECT, Dataset, Progress, RecordingInfo
 from plushsense.windows.clock import Segment, whole_recording
-from plushsense.windows.features import network_inputs
+from plushsense.windows.features import InputUnits, network_inputs
 from plushsense.windows.sessions import SessionReader
 
 ROWS = "rows"
@@ -87,16 +87,18 @@ def whole_gestures(windowing: Mapping[str, Any]) -> WindowSpec:
 class WindowSet:
     """N windows with their classes, recordings and people.
 
-    ``x`` (N, F, T): unscaled inputs of the network; ``y`` (N,): class index; ``recording`` (N,): index into
-    ``recording_ids``; ``subject`` (N,): code of the person, "none" if nobody; ``context`` (N,): "inside" (wholly in its
-    recording), "stream" (begins before it in the stream), "loop", "rows" or "anywhere"; ``stream`` (N,): id of the
-    stream of the recording, or ""; ``window_rows`` and ``recording_rows`` (N, 2): rows of that stream which the window
-    and its recording cover, −1 if unknown (always for looped windows). ``vectors``: triples of inputs that are the axes
-    of one vector; ``left_out``: recordings that gave no window, and gestures of free choice, with the reason.
+    ``x`` (N, F, T): inputs of the network, unscaled, in the ``units`` of the layout; ``integers`` (N, F, T): as the toy
+    computes them, in steps; ``y`` (N,): class index; ``recording`` (N,): index into ``recording_ids``;
+    ``subject`` (N,): code of the person, "none" if nobody; ``context`` (N,): "inside" (wholly in its recording),
+    "stream" (begins before it in the stream), "loop", "rows" or "anywhere"; ``stream`` (N,): id of the stream of the
+    recording, or ""; ``window_rows`` and ``recording_rows`` (N, 2): rows of that stream which the window and its
+    recording cover, −1 if unknown (always for looped windows). ``vectors``: triples of inputs that are the axes of one
+    vector; ``left_out``: recordings that gave no window, and gestures of free choice, with the reason.
     ``self_calibration``: "causal" if sensors calibrate themselves (`plushsense.windows.sessions`), else "".
     """
 
-    x: NDArray[np.int32]
+    integers: NDArray[np.int32]
+    units: InputUnits
     y: NDArray[np.int64]
     labels: tuple[str, ...]
     affects: tuple[str, ...]
@@ -117,14 +119,19 @@ class WindowSet:
     def __len__(self) -> int:
         return len(self.y)
 
+    @property
+    def x(self) -> NDArray[np.floating[Any]]:
+        """Return `InputUnits.values`, a new array at each call."""
+        return self.units.values(self.integers)
+
     def take(self, index: NDArray[np.int64]) -> WindowSet:
         """Return the windows at ``index``; ``recording`` still refers to all ``recording_ids``."""
-        per_window = ("x", "y", "recording", "subject", "context", "stream", "window_rows", "recording_rows")
+        per_window = ("integers", "y", "recording", "subject", "context", "stream", "window_rows", "recording_rows")
         return replace(self, **{name: getattr(self, name)[index] for name in per_window})
 
     def joined(self, other: WindowSet) -> WindowSet:
         """Return these windows and those of another set of the same classes, inputs and length."""
-        names = ("x", "y", "subject", "context", "stream", "window_rows", "recording_rows")
+        names = ("integers", "y", "subject", "context", "stream", "window_rows", "recording_rows")
         both: dict[str, Any] = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names}
         recording = np.concatenate([self.recording, other.recording + len(self.recording_ids)])
         return replace(self, **both, recording=recording, recording_ids=self.recording_ids + other.recording_ids)
@@ -133,10 +140,12 @@ class WindowSet:
         """Return the windows with some of the inputs."""
         at = [self.inputs.index(name) for name in inputs]
         vectors = tuple(tuple(at.index(axis) for axis in axes) for axes in self.vectors if set(axes) <= set(at))
-        return replace(self, x=self.x[:, at], inputs=tuple(inputs), vectors=vectors)
+        return replace(
+            self, integers=self.integers[:, at], units=self.units.only(at), inputs=tuple(inputs), vectors=vectors
+        )
 
     def __repr__(self) -> str:
-        n, f, t = self.x.shape
+        n, f, t = self.integers.shape
         kinds = ", ".join(f"{int((self.context == c).sum())} {c}" for c in np.unique(self.context))
         return (
             f"WindowSet({plural(n, 'window')} of {plural(f, 'channel')} × {t} samples at {self.rate_hz:g} Hz, "
@@ -146,7 +155,7 @@ class WindowSet:
 
 @dataclass
 class WindowCut:
-    """One window (T, F), before `assemble` makes a set of windows.
+    """One window (T, F) of integers, before `assemble` makes a set of windows.
 
     ``begin`` is the sample of the recording's segment at which it begins (`from_recording`).
     """
@@ -273,7 +282,7 @@ def cut_windows(
 
 def constant_windows(windows: WindowSet) -> Sentence | None:
     """Return a warning if windows are constant in time, None if none is."""
-    constant = np.flatnonzero((windows.x == windows.x[:, :, :1]).all(axis=(1, 2)))
+    constant = np.flatnonzero((windows.integers == windows.integers[:, :, :1]).all(axis=(1, 2)))
     if not len(constant):
         return None
     first = windows.recording_ids[windows.recording[constant[0]]]
@@ -336,7 +345,7 @@ def assemble(cuts: list[tuple[RecordingInfo, WindowCut]], gestures: GestureSet, 
     ids = tuple(sorted({r.id for r, _ in cuts}))
     number = {identity: i for i, identity in enumerate(ids)}
     # Layouts ensure that every input fits 32 bits.
-    x = np.stack([c.x.astype(np.int32).T for _, c in cuts])
+    integers = np.stack([c.x.astype(np.int32).T for _, c in cuts])
     order = np.array([number[r.id] for r, _ in cuts], dtype=np.int64)
     by_recording = np.argsort(order, kind="stable")
     rows = [(r.stream_row + r.start, r.stream_row + r.stop) if r.stream_row >= 0 else (-1, -1) for r, _ in cuts]
@@ -345,7 +354,8 @@ def assemble(cuts: list[tuple[RecordingInfo, WindowCut]], gestures: GestureSet, 
         return np.array(list(values), dtype=np.str_)
 
     windows = WindowSet(
-        x=x,
+        integers=integers,
+        units=InputUnits.of(dataset.layout),
         y=np.array([gestures.index(r.gesture) for r, _ in cuts], dtype=np.int64),
         labels=gestures.labels,
         affects=gestures.affects,

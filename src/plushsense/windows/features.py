@@ -125,9 +125,24 @@ class InputUnits(NamedTuple):
             names.append(unit)
         return cls(np.array(steps), np.array(zeros, dtype=np.float64), tuple(names))
 
-    def values(self, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
-        """Return the values of integer windows (N, F, T)."""
-        return np.asarray((x + self.zero[:, None]) / self.steps[:, None], dtype=np.float32)
+    def values(self, x: NDArray[np.integer[Any]]) -> NDArray[np.floating[Any]]:
+        """Return the values of integer windows (..., F, T).
+
+        They are float32, or float64 where float32 would not tell all steps apart: beyond 2²³ steps.
+        """
+        peak = max(-int(x.min(initial=0)), int(x.max(initial=0))) + int(np.abs(self.zero).max(initial=0.0))
+        out = np.empty(x.shape, dtype=np.float32 if peak <= 1 << 23 else np.float64)
+        for at in range(len(self.steps)):
+            out[..., at, :] = (x[..., at, :] + self.zero[at]) / self.steps[at]
+        return out
+
+    def counted(self, values: NDArray[Any]) -> NDArray[np.float64]:
+        """Return values (..., F, T) as numbers of steps, the inverse of `values`; they are not rounded."""
+        return np.asarray(values * self.steps[:, None] - self.zero[:, None], dtype=np.float64)
+
+    def only(self, at: Sequence[int]) -> InputUnits:
+        """Return the units of the inputs at some places."""
+        return InputUnits(self.steps[list(at)], self.zero[list(at)], tuple(self.names[i] for i in at))
 
     def scaler(self, integers: Scaler) -> Scaler:
         """Return the scaling of values that equals the given one of integers."""
@@ -199,9 +214,19 @@ class Scaler:
         return cls(mean, np.where(spread > 0, 1.0 / np.where(spread > 0, spread, 1.0), 1.0))
 
     @classmethod
-    def none(cls, channels: int) -> Scaler:
-        """Return the scaling that changes nothing."""
-        return cls(np.zeros(channels), np.ones(channels))
+    def none(cls, units: InputUnits, vectors: Sequence[Sequence[int]] = ()) -> Scaler:
+        """Return the scaling with which a network reads the values of `InputUnits`; ``vectors`` as for `fit`."""
+        offset, scale = 0.0 - units.zero, 1.0 / units.steps
+        for axes in map(list, vectors):
+            offset[axes], scale[axes] = 0.0, scale[axes[0]]
+        return cls(offset, scale)
+
+    def knows_training(self, layout: Layout) -> bool:
+        """Return whether it was fitted to windows, unlike `none` and what earlier versions had in its place."""
+        units = InputUnits.of(layout)
+        plain_offset = ((self.offset == 0.0) | (self.offset == -units.zero)).all()
+        plain_scale = any(np.array_equal(self.scale, one) for one in (1.0 / units.steps, np.ones(len(units.steps))))
+        return not (plain_offset and plain_scale)
 
     def apply(self, x: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
         """Scale windows (N, F, T) for the network."""

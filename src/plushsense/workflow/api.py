@@ -110,9 +110,9 @@ class TrainAndPredict:
         probabilities = predict(self.arch, fitted.weights, fitted.scaler, test, self.spec.device)
         deployed = None
         if self.int8:
-            kept = calibration(self.arch, fitted.weights, fitted.scaler, train.x)
+            kept = calibration(self.arch, fitted.weights, fitted.scaler, train.integers)
             network = quantize(self.arch, fitted.weights, fitted.scaler, Ranges.from_dict(kept))
-            deployed = integer_probabilities(network, test.x)
+            deployed = integer_probabilities(network, test.integers)
         return FoldOutput(probabilities, fitted.history, fitted.seconds, fitted.best_epoch, deployed)
 
 
@@ -268,7 +268,7 @@ def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> t
     }
     if trained.ranges:
         integer = quantize(made.network, trained.weights, fitted.scaler, Ranges.from_dict(trained.ranges))
-        deployed, means, _ = score(integer_probabilities(integer, test.x))
+        deployed, means, _ = score(integer_probabilities(integer, test.integers))
         agreement = float((deployed.predicted == predictions.predicted).mean())
         scores["int8"] = {**means, "agreement": agreement}
         if agreement < _AGREEMENT:
@@ -433,7 +433,7 @@ def validation_predictions(bundle: Bundle, dataset: Dataset | str | os.PathLike[
     every = windows_for(dataset, bundle.arch, whole_gestures(bundle.windowing), bundle.gestures)
     windows = every.take(np.flatnonzero(np.isin(every.subject, list(people))))
     network = bundle.network()
-    parts = [windows.x[at : at + _BATCH] for at in range(0, len(windows), _BATCH)]
+    parts = [windows.integers[at : at + _BATCH] for at in range(0, len(windows), _BATCH)]
     logits = np.concatenate([network.forward(bundle.scaler.apply(part)) for part in parts])
     return gather_predictions(windows, [("validation", np.arange(len(windows)))], [softmax(logits).astype(np.float32)])
 

@@ -26,6 +26,7 @@ from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import VALIDATION_SHARE
 from plushsense.training.spec import PADDING, preset
 from plushsense.windows.cut import WindowSet
+from plushsense.windows.features import InputUnits
 
 ANONYMOUS = "arrays"
 ANONYMOUS_RATE_HZ = 100.0
@@ -223,24 +224,30 @@ def _step(values: NDArray[np.float64], integers: bool) -> float:
 def to_integers(x: NDArray[Any], layout: Layout) -> NDArray[np.int32]:
     """Convert windows (N, C, T) to the integers that are the input of a network with this layout.
 
-    With an anonymous layout, values are rounded to its steps and clipped to 32 bits. With a real layout, windows must
-    have the integers of `cut_windows`.
+    Values are rounded to the steps of the layout. With an anonymous layout, they are clipped to 32 bits. With a real
+    layout, they must be those of `cut_windows`: measured values in its steps.
 
     Raises:
-        ArrayError: for values that are not finite; with a real layout, also for fractions or more than 32 bits.
+        ArrayError: for values that are not finite; with a real layout, also between two steps or beyond 32 bits.
     """
     refuse_holes(x)
+    units = InputUnits.of(layout)
+    counted = units.counted(x)
+    whole = np.rint(counted)
     if layout.name == ANONYMOUS:
-        steps = np.array([c.step for c in layout.channels])
-        return np.asarray(np.clip(np.rint(x / steps[:, None]), -_INT32, _INT32), dtype=np.int32)
-    if x.dtype.kind == "f" and (np.rint(x) != x).any():
-        raise ArrayError(
-            f"X has values that are not whole numbers, but with the layout '{layout.name}' it must have the integers "
-            "of cut_windows: leave scaling to the classifier, or leave layout out."
-        )
-    if x.size and (x.max() > _INT32 or x.min() < -_INT32 - 1):
+        return np.asarray(np.clip(whole, -_INT32, _INT32), dtype=np.int32)
+    if whole.size and (whole.max() > _INT32 or whole.min() < -_INT32 - 1):
         raise ArrayError(f"X has values beyond 32 bits, the limit of the layout '{layout.name}': check X.")
-    return x.astype(np.int32)
+    for at, name in enumerate(layout.inputs):
+        # float32 has 24 bits.
+        apart = np.abs(counted[:, at] - whole[:, at]) > 0.01 + np.abs(x[:, at]) * units.steps[at] * 2.0**-23
+        if name in layout.names and name not in layout.self_calibration and apart.any():
+            step = layout.channels[layout.index(name)].step
+            raise ArrayError(
+                f"X has {float(x[:, at][apart][0]):g} in '{name}', which the layout '{layout.name}' counts in steps of "
+                f"{step:g}: give x of cut_windows, and leave scaling to the classifier, or leave layout out."
+            )
+    return whole.astype(np.int32)
 
 
 def refuse_holes(x: NDArray[Any]) -> None:
@@ -261,7 +268,8 @@ def windows_of(
     n = len(x)
     rows = np.full((n, 2), -1, dtype=np.int64)
     return WindowSet(
-        x=x,
+        integers=x,
+        units=InputUnits.of(layout),
         y=y,
         labels=gestures.labels,
         affects=gestures.affects,
@@ -365,7 +373,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
             and requires T to be at least the receptive field; ``mirror`` works with any T from 2.
         preset, epochs, batch, learning_rate: settings of the training; None: the value of the preset.
         channels: number of channels C in rows (N, C·T); default: that of ``layout``, else 1.
-        layout: a `Layout`, its name or its path, if ``X`` has the integers of `cut_windows`. Vectors are then rotated
+        layout: a `Layout`, its name or its path, if ``X`` has the values of `cut_windows`. Vectors are then rotated
             in training as by `train`, and the bundle can be used with a toy. Without it, channels are anonymous (see
             `anonymous_layout`).
         random_state: an integer for reproducible weights, a RandomState, or None.
@@ -501,7 +509,7 @@ class PlushClassifier(ClassifierMixin, BaseEstimator):
                 "training": spec.to_dict(),
                 "code_version": __version__,
             },
-            calibration=calibration(arch, fitted.weights, fitted.scaler, windows.x[~held_back]),
+            calibration=calibration(arch, fitted.weights, fitted.scaler, windows.integers[~held_back]),
         )
         return self
 

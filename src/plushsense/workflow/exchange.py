@@ -32,13 +32,13 @@ _CHUNK = 1000
 
 
 def to_torch(windows: WindowSet) -> Any:
-    """Return a ``torch.utils.data.TensorDataset`` of windows (N, C, T), float32 and not scaled, and classes (N,)."""
+    """Return a ``torch.utils.data.TensorDataset`` of windows (N, C, T), float32 and `WindowSet.x`, and classes (N,)."""
     torch, data = need("torch", "train"), need("torch.utils.data", "train")
     return data.TensorDataset(torch.from_numpy(windows.x.astype(np.float32)), torch.from_numpy(windows.y))
 
 
 def to_panel(windows: WindowSet) -> tuple[NDArray[np.float64], NDArray[np.str_]]:
-    """Return windows (N, C, T), not scaled, and labels (N,), as aeon and sktime (``numpy3D``) read them."""
+    """Return windows (N, C, T), `WindowSet.x`, and labels (N,), as aeon and sktime (``numpy3D``) read them."""
     return windows.x.astype(np.float64), np.array(windows.labels)[windows.y]
 
 
@@ -49,7 +49,7 @@ def to_pandas(windows: WindowSet) -> tuple[Any, Any]:
     is the window. Columns of the windows: gesture, affect, subject, recording, context.
     """
     pandas = need("pandas", "tables")
-    n, channels, samples = windows.x.shape
+    n, channels, samples = windows.integers.shape
     index = pandas.MultiIndex.from_product([range(n), range(samples)], names=["window", "sample"])
     values = windows.x.transpose(0, 2, 1).reshape(n * samples, channels)
     about = {

@@ -46,7 +46,7 @@ def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], war
 def training_windows(
     bundle: Bundle, dataset: Dataset | str | os.PathLike[str], warn: Warn = silent
 ) -> NDArray[np.int32]:
-    """Cut the raw windows (N, C, T) of the people on whom a bundle was trained, with the settings of the training.
+    """Cut the integer windows (N, C, T) of the people on whom a bundle was trained, with the settings of the training.
 
     Args:
         dataset: the data set of the training; ``warn`` is called if its content has changed since then.
@@ -98,7 +98,7 @@ def training_windows(
     if missing:
         message = f"no longer in '{dataset.head.name}': {', '.join(missing)}"
         warn(Sentence(message, reason="people_gone", name=dataset.head.name, people=", ".join(missing)))
-    return windows.x[at]
+    return windows.integers[at]
 
 
 def export(

@@ -143,7 +143,7 @@ class NetworkTrainer:
             start=start, save=state.save if state else None, save_every_s=_SAVE_EVERY_S,
         )  # fmt: skip
         weights = fitted.weights
-        ranges = calibration(network, weights, fitted.scaler, self.windows.x[at])
+        ranges = calibration(network, weights, fitted.scaler, self.windows.integers[at])
         if self.quantize_aware:
             from plushsense.training.quantized import fine_tune
 

@@ -132,7 +132,7 @@ def windows_for(
 
 def warn_of_far_readings(windows: WindowSet, warn: Warn) -> None:
     """Warn of each input whose scale is set by a few readings far from all others."""
-    for at, far in far_inputs(windows.x).items() if warn is not silent else ():
+    for at, far in far_inputs(windows.integers).items() if warn is not silent else ():
         name, n, percent = windows.inputs[at], int(far.sum()), 100 * float(far.mean())
         people = ", ".join(sorted(set(windows.subject[far.any(axis=1)].tolist())))
         sentence = (

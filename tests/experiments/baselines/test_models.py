@@ -53,14 +53,17 @@ def test_every_baseline_learns_gives_probabilities_and_repeats_itself(name: str)
 @pytest.mark.parametrize("name", ["forest", "extra-trees", "mlp", "subspace-knn"])
 def test_another_seed_is_another_program(name: str) -> None:
     test = rhythms(30, seed=9)
-    noisy = replace(test, x=test.x + np.random.default_rng(3).integers(-400, 400, test.x.shape).astype(np.int32))
+    noisy = replace(
+        test,
+        integers=test.integers + np.random.default_rng(3).integers(-400, 400, test.integers.shape).astype(np.int32),
+    )
     assert not np.array_equal(fitted(name, seed=0)(noisy), fitted(name, seed=1)(noisy))
 
 
 def test_scaling_and_pca_are_fitted_to_the_training_windows_only() -> None:
     train = rhythms()
     # Planted: windows to validate and to test of another level and size would show in a mean and in a direction.
-    other = replace(rhythms(40, seed=5), x=rhythms(40, seed=5).x * 50 + 90_000)
+    other = replace(rhythms(40, seed=5), integers=rhythms(40, seed=5).integers * 50 + 90_000)
     fit = ClassicalFit("knn", "flattened", True, SAMPLES, 0)
     with_them, without = fit(train, other), fit(train, rhythms(0))
     assert isinstance(with_them, FittedClassifier) and isinstance(without, FittedClassifier)
@@ -80,8 +83,8 @@ def test_scaling_and_pca_are_fitted_to_the_training_windows_only() -> None:
 def test_an_unscaled_pca_reads_the_features_as_they_are_and_its_components_are_scaled() -> None:
     train = rhythms()
     # Planted: one sample with so much variance that nothing else counts, unless everything is scaled first.
-    train = replace(train, x=train.x.copy())
-    train.x[:, 0, 0] = np.random.default_rng(2).integers(-(10**6), 10**6, len(train))
+    train = replace(train, integers=train.integers.copy())
+    train.integers[:, 0, 0] = np.random.default_rng(2).integers(-(10**6), 10**6, len(train))
     unscaled, scaled = fitted_to(train, "unscaled"), fitted_to(train, True)
     pca, scaler = unscaled.model[0], unscaled.model[1]
     flat = FEATURES["flattened"](train, SAMPLES)
@@ -101,7 +104,7 @@ def fitted_to(train: WindowSet, pca: Pca) -> FittedClassifier:
 def test_classical_programs_read_the_end_of_a_longer_window() -> None:
     long = rhythms(30, samples=80)
     past = np.random.default_rng(1).integers(-9000, 9000, (30, 2, 80 - SAMPLES))
-    other = replace(long, x=np.concatenate([past, long.x[:, :, -SAMPLES:]], axis=2).astype(np.int32))
+    other = replace(long, integers=np.concatenate([past, long.integers[:, :, -SAMPLES:]], axis=2).astype(np.int32))
     reader = fitted("rbf-svm")
     assert np.array_equal(reader(long), reader(other))
     assert FEATURES["flattened"](long, SAMPLES).shape == (30, 2 * SAMPLES)

@@ -40,7 +40,7 @@ class Known:
         with Path(self.folder, "fits").open("a") as file:
             file.write("x")
         time.sleep(self.pause)
-        return KnownReader(tuple(np.unique(train.x[:, 1, 0]).tolist()))
+        return KnownReader(tuple(np.unique(train.integers[:, 1, 0]).tolist()))
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class KnownReader:
         return 8 * len(self.seen)
 
     def __call__(self, windows: WindowSet, /) -> np.ndarray:
-        read = np.where(np.isin(windows.x[:, 1, 0], self.seen), windows.y, (windows.y + 1) % len(LABELS))
+        read = np.where(np.isin(windows.integers[:, 1, 0], self.seen), windows.y, (windows.y + 1) % len(LABELS))
         return np.eye(len(LABELS), dtype=np.float32)[read]
 
 

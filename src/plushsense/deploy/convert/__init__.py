@@ -111,7 +111,7 @@ def convert(bundle: Bundle, path: str | Path, format_name: str, *, windows: NDAr
     """Convert ``bundle`` to a format of `CONVERTERS`, test the result in that format's runtime, and write it.
 
     Args:
-        windows: raw integer windows (N, C, T) to test with, in addition to generated ones.
+        windows: integer windows (N, C, T), `WindowSet.integers`, to test with, in addition to generated ones.
 
     Raises:
         ConfigError: for an unknown format.
@@ -165,7 +165,7 @@ class ConversionJob:
     @property
     def values(self) -> Floats:
         """The windows (N, C, T) as values for the input of a file."""
-        return InputUnits.of(self.bundle.layout).values(self.windows)
+        return InputUnits.of(self.bundle.layout).values(self.windows).astype(np.float32)
 
     def reference(self) -> NDArray[np.float64]:
         """Return the logits (N, K) of the float network."""

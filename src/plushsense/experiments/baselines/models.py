@@ -80,16 +80,21 @@ BASELINES: dict[str, Baseline] = {
 }
 
 
+def _last(windows: WindowSet, samples: int) -> Floats:
+    """Return the last samples of windows in units, less the offsets: energies are those around zero."""
+    return np.asarray(windows.integers[:, :, -samples:] / windows.units.steps[:, None])
+
+
 def _statistics(windows: WindowSet, samples: int) -> Floats:
-    return statistics_in_order(windows.x[:, :, -samples:], windows.rate_hz)
+    return statistics_in_order(_last(windows, samples), windows.rate_hz)
 
 
 def _paper_statistics(windows: WindowSet, samples: int) -> Floats:
-    return statistics(windows.x[:, :, -samples:], windows.rate_hz)
+    return statistics(_last(windows, samples), windows.rate_hz)
 
 
 def _flattened(windows: WindowSet, samples: int) -> Floats:
-    return windows.x[:, :, -samples:].reshape(len(windows), -1).astype(np.float64)
+    return _last(windows, samples).reshape(len(windows), -1)
 
 
 # (name, features, PCA) left out: one fit on flattened windows of 3 channels took 52 s; 11 channels would take minutes.
@@ -196,7 +201,8 @@ def classical(
             view,
             reduced,
             ClassicalFit(name, view, reduced, samples, seed),
-            dict(key),
+            # Earlier versions read integers; the other programs scale their features.
+            {**key, "reads": "units of the layout"} if reduced == UNSCALED else dict(key),
             samples,
         )
         for view in features
@@ -354,10 +360,10 @@ class RocketFit:
     def __call__(self, train: WindowSet, validation: WindowSet, /) -> Reader:
         """Fit the classifier to ``train``; ``validation`` is not used."""
         enough_to_learn(train)
-        scaler = Scaler.fit(train.x[:, :, -self.samples :])
+        scaler = Scaler.fit(train.integers[:, :, -self.samples :])
 
         def scaled(windows: WindowSet) -> NDArray[np.float32]:
-            return scaler.apply(windows.x[:, :, -self.samples :])
+            return scaler.apply(windows.integers[:, :, -self.samples :])
 
         model = _rocket(self.name, self.seed)
         model.fit(scaled(train), train.y)
@@ -365,7 +371,7 @@ class RocketFit:
 
     def prepare(self, train: WindowSet, /) -> None:
         """Compile the kernels, once in each process."""
-        _compiled(self.name, train.x.shape[1], min(self.samples, train.x.shape[2]))
+        _compiled(self.name, train.integers.shape[1], min(self.samples, train.integers.shape[2]))
 
 
 def _rocket(name: str, seed: int) -> Any:

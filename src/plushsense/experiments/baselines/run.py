@@ -96,7 +96,7 @@ class NetworkReader:
     size_bytes: int
 
     def __call__(self, windows: WindowSet, /) -> NDArray[np.float32]:
-        x = self.scaler.apply(windows.x[:, :, windows.x.shape[2] - self.network.arch.span :])
+        x = self.scaler.apply(windows.integers[:, :, windows.integers.shape[2] - self.network.arch.span :])
         return self.network.probabilities(x).astype(np.float32)
 
 

@@ -252,7 +252,7 @@ def _row(
         "title": contender.title,
         "features": contender.features,
         "pca": contender.pca,
-        "span_s": (contender.samples or windows.x.shape[2]) / windows.rate_hz,
+        "span_s": (contender.samples or windows.integers.shape[2]) / windows.rate_hz,
         "split": split.text,
         "leaky": split.leaky,
         "apart": split.separates_people,

@@ -84,7 +84,7 @@ def explain(
     for number, name in enumerate(windows.labels):
         label = bundle.gestures.index(name)
         at = np.flatnonzero(windows.y == number)
-        x = windows.x[at][:, :, -bundle.arch.span :]
+        x = windows.integers[at][:, :, -bundle.arch.span :]
         read = np.flatnonzero(network.forward(bundle.scaler.apply(x)).argmax(axis=1) == label) if len(at) else at
         if not len(read):
             unread.append(name)

@@ -4,7 +4,8 @@ The attribution of a block is the loss of the log-probability of the gesture, in
 
 - an acceleration keeps its gravity and loses its movement: the three axes of a vector together, or a magnitude. Gravity
   is that which the network reads (divided by its fraction bits), else the mean over 0.64 s before and after;
-- any other channel has the mean of the training windows; a vector that is no acceleration has zero.
+- any other channel has the mean of the training windows (with the scaling "none", the reading that stands for zero); a
+  vector that is no acceleration has zero.
 
 Gravity, where it is an input, never changes. Blocks (Zeiler and Fergus 2014, 10.1007/978-3-319-10590-1_53) are computed
 with the float network in NumPy. Deletion (Petsiuk et al. 2018, arXiv:1806.07421) replaces the blocks one after the
@@ -79,7 +80,8 @@ class Blocks:
 
 def quiet_windows(x: NDArray[np.integer[Any]], layout: Layout, scaler: Scaler) -> Floats:
     """Return unscaled windows (N, C, T) in which nothing happens, as this module describes, for windows ``x``."""
-    quiet = np.broadcast_to(scaler.offset[:, None], x.shape).copy()
+    means = scaler.offset if scaler.knows_training(layout) else np.zeros(len(scaler.offset))
+    quiet = np.broadcast_to(means[:, None], x.shape).copy()
     # Movement along the axes of a vector; accelerations and gravity follow.
     for axes in layout.input_vectors:
         quiet[:, list(axes)] = 0.0

@@ -133,7 +133,7 @@ class TrainStreams:
             {*fold.validation, *fold.test}, progress,
         )  # fmt: skip
         fitted = fit(train, validation, arch, recipe.training, progress)
-        calibrated = calibration(arch, fitted.weights, fitted.scaler, train.x)
+        calibrated = calibration(arch, fitted.weights, fitted.scaler, train.integers)
         people = {"subjects": list(fold.train), "validation_subjects": list(fold.validation)}
         origin = {"dataset": dataset.head.name, "dataset_hash": dataset.hash, "code_version": __version__, **people}
         bundle = Bundle(

@@ -242,7 +242,7 @@ def preview(
         "held": sum(journal.has(job.id) for job in planned.jobs),
         "macs": total,
         "macs_one_by_one": sum(planned.macs(job, nested=False) for job in planned.jobs),
-        "windows_mb": sum(windows.x.nbytes for windows in planned.sets.values()) / 1e6,
+        "windows_mb": sum(windows.integers.nbytes for windows in planned.sets.values()) / 1e6,
         "training_mb": max((n for n in held if n is not None), default=0) / 1e6 if None not in held else None,
         "cost": dict(sorted(shares.items(), key=lambda item: -item[1])),
         "problems": [],
