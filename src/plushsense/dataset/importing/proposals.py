@@ -24,6 +24,7 @@ from plushsense.core.sentences import join_names
 from plushsense.dataset.quality.measurements import zeroing_limit
 from plushsense.dataset.quality.outliers import find_failed_readings
 from plushsense.dataset.store import Dataset, RecordingInfo
+from plushsense.recording.takes import duration_s
 
 DEFAULT_WINDOW_S = 2.5
 # Clocks have whole milliseconds: a faster one has rows in another unit than it says.
@@ -485,7 +486,7 @@ def median_gesture_s(dataset: Dataset, gestures: Iterable[str] | None = None) ->
     """Return the median duration of the used recordings in seconds, of all or some gestures; None without any."""
     chosen = None if gestures is None else set(gestures)
     seconds = [
-        (r.stop - r.start) / (r.rate_hz or dataset.layout.rate_hz)
+        duration_s(r.stop - r.start, r.rate_hz or dataset.layout.rate_hz)
         for r in dataset.used
         if chosen is None or r.gesture in chosen
     ]
