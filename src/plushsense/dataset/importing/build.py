@@ -386,7 +386,9 @@ def create_dataset(
             head = replace(head, gestures=GestureSet.infer(n.label for n in names if n is not None))
         built = read_copied(account, head, progress)
         if not built.dataset.recordings:
-            reasons = [*built.unreadable.values(), *(r["reason"] for r in account.rejected), *search.notes[-1:]]
+            # What is wrong with the recordings, rather than with a stream.
+            unreadable = sorted(built.unreadable.items(), key=lambda entry: not entry[0].startswith(f"{RECORDINGS}/"))
+            reasons = [*(reason for _, reason in unreadable), *(r["reason"] for r in account.rejected), *search.notes[-1:]]
             if not reasons:
                 message = f"'{source}' holds no finished recording yet, only a stream: record some first."
                 raise DatasetError(message, reason="import_only_stream")

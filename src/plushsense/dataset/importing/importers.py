@@ -16,7 +16,7 @@ from typing import Any
 from plushsense.core.errors import ConfigError, DatasetError, FileFormatError
 from plushsense.core.files import temporary_folder, work_folder, write_file
 from plushsense.core.gestures import GestureSet, load_gestures
-from plushsense.core.layouts import Layout, layout_names, load_layout
+from plushsense.core.layouts import DEVICE_MS, Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
 from plushsense.core.sentences import Sentence, plural
 from plushsense.dataset.importing.adding import add_to_dataset
@@ -40,6 +40,7 @@ from plushsense.dataset.importing.proposals import (
     matching_layouts,
     propose_settings,
     readable_layouts,
+    recorded_layouts,
 )
 from plushsense.dataset.importing.saved_windows import read_windows, windows_layout, write_windows
 from plushsense.dataset.importing.sources import (
@@ -111,12 +112,18 @@ class ImportOptions:
         if (layout := own or self.layout) is not None:
             return layout, []
         files = list(files)
-        found = matching_layouts(files)
-        if self.guess_layout and len(found) != 1:
+        found, why = matching_layouts(files), "the header of the files has its channels"
+        if not found and (found := recorded_layouts(files)):
+            why = f"the files have its {len(found[0].csv.columns)} columns"
+        if len({layout.csv.columns for layout in found}) == 1 < len(found):
+            # They differ in the clock that the toy sends. Files without rows tell nothing, and are refused later.
+            found = (readable_layouts(files, [layout.name for layout in found]) or found[::-1])[:1]
+            why += f", the last one a {'clock' if DEVICE_MS in found[0].wire else 'delay'}"
+        elif self.guess_layout and len(found) != 1:
             found = readable_layouts(files, [layout.name for layout in found])[:1]
         if len(found) == 1:
             name = found[0].name
-            message = f"the layout is '{name}', as the header of the files has its channels"
+            message = f"the layout is '{name}', as {why}"
             return found[0], [Sentence(message, reason="layout_guessed", layout=name)]
         fit = f"The header of the files fits {' and '.join(layout.name for layout in found)}. " if found else ""
         raise ConfigError(
