@@ -316,8 +316,8 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
     keys, header = column_keys(first, layout, path)
     if header and (end < 0 or not data[end:].strip()):
         raise FileFormatError(
-            f"'{path.name}' has a header but no row: the authors' recorder writes such files if the toy sends fewer than "
-            "14 integers a line.",
+            f"'{path.name}' has a header but no row: the authors' recorder writes such files if the toy sends fewer "
+            "than 14 integers a line.",
             reason="file_empty",
         )
     table, labels, malformed = parse_table(data, keys, 1 if header else 0, path)

@@ -31,7 +31,6 @@ from plushsense.dataset.importing.build import (
     unknown_labels,
 )
 from plushsense.dataset.importing.sources import SourceScan
-from plushsense.dataset.importing.truncation import truncation_marks
 from plushsense.dataset.index import open_dataset, rebuild_index
 from plushsense.dataset.marks import MARKS, Mark, adding_locked, read_marks, write_marks
 from plushsense.dataset.privacy.forget import read_removals
@@ -159,8 +158,8 @@ def add_to_dataset(
                 write_file(dest / HEAD, head.to_toml())
             marks = _new_marks(dest, account.set_aside_reasons())
             both = (*dataset.recordings, *built.dataset.recordings)
-            trims, remarks = truncation_marks(search.choices, both, account.sources, read_marks(dest))
-            write_marks(dest, marks := marks + trims)
+            trims, labels, remarks = account.marks(both, head.gestures, read_marks(dest))
+            write_marks(dest, marks := marks + trims + labels)
             if {p.subject: p for p in listed} != there:
                 write_people(dest, listed)
             # Move companions first, so that a recording in the data set always has its sidecar.

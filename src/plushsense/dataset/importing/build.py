@@ -15,10 +15,11 @@ from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
 from plushsense.core.sentences import Sentence
+from plushsense.dataset.files import sha256_of
 from plushsense.dataset.importing.sources import COMPANIONS, LEFT_OUT, SourceFile, SourceScan
-from plushsense.dataset.importing.truncation import truncation_marks
+from plushsense.dataset.importing.truncation import IMPORTER, truncation_marks
 from plushsense.dataset.index import DUPLICATE_FOLDER, IndexBuild, apply_marks, build_index, write_index_files
-from plushsense.dataset.marks import Mark, append_marks, read_marks
+from plushsense.dataset.marks import Mark, MarkState, append_marks, read_marks
 from plushsense.dataset.store import (
     HEAD,
     RECORDINGS,
@@ -28,6 +29,7 @@ from plushsense.dataset.store import (
     DatasetHead,
     PersonInfo,
     Progress,
+    RecordingInfo,
     write_people,
 )
 from plushsense.recording.session_files import SESSION_LOG
@@ -117,7 +119,10 @@ class Copier:
         except OSError as cause:
             return Sentence(f"cannot be read: {cause.strerror or cause}", reason="file_unreadable")
         content = hashlib.sha256(raw).hexdigest()
-        if (existing := self.contents.get((file.kind, content))) is not None:
+        existing = self.contents.get((file.kind, content))
+        if existing is None and self.contents and file.cut is not None:
+            existing = self.contents.get((file.kind, sha256_of(file.cut)))
+        if existing is not None:
             self.already[file.source] = existing
             return ""
         folder = self._folder(file)
@@ -294,6 +299,27 @@ class ImportedFiles:
         accounted = len(self._origin) + len(self.copier.already) + len(self.rejected) + len(self.left_out)
         assert accounted == len(self.search.found), "every source file is imported, left out or rejected"
 
+    def marks(
+        self, recordings: Iterable[RecordingInfo], gestures: GestureSet, states: Mapping[str, MarkState] | None = None
+    ) -> tuple[list[Mark], list[Mark], list[str]]:
+        """Return the trims of the truncation script, the labels of folders, and notes; decisions in ``states`` stay.
+
+        Args:
+            recordings: recordings of the data set.
+            gestures: the gesture set of the data set.
+        """
+        recordings = list(recordings)
+        trims, notes = truncation_marks(self.search.choices, recordings, self.sources, states)
+        folders = {f.source: f.gesture for f in self.search.found if f.gesture}
+        labels = []
+        for info in recordings:
+            label = folders.get(self.sources.get(info.file, Path()), "")
+            if label and not (states or {}).get(info.id, MarkState()).gesture:
+                known = gestures.find(label)
+                why = f"the file lies in the folder '{label}', though its name says '{info.recorded}'"
+                labels.append(Mark(info.id, "relabel", IMPORTER, why, gesture=known.label if known else label))
+        return trims, labels, notes
+
     def set_aside_reasons(self) -> dict[str, str]:
         """Return for each recording id, also of existing files, why the recorder discarded it ("" if it did not)."""
         places = self.copier.copied | self.copier.already
@@ -388,7 +414,11 @@ def create_dataset(
         if not built.dataset.recordings:
             # What is wrong with the recordings, rather than with a stream.
             unreadable = sorted(built.unreadable.items(), key=lambda entry: not entry[0].startswith(f"{RECORDINGS}/"))
-            reasons = [*(reason for _, reason in unreadable), *(r["reason"] for r in account.rejected), *search.notes[-1:]]
+            reasons = [
+                *(reason for _, reason in unreadable),
+                *(r["reason"] for r in account.rejected),
+                *search.notes[-1:],
+            ]
             if not reasons:
                 message = f"'{source}' holds no finished recording yet, only a stream: record some first."
                 raise DatasetError(message, reason="import_only_stream")
@@ -405,9 +435,9 @@ def create_dataset(
         listed, notes = merge_people({}, search.people, people, {r.subject for r in built.dataset.recordings})
         if listed:
             write_people(work, listed)
-        trims, remarks = truncation_marks(search.choices, built.dataset.recordings, account.sources)
+        trims, labels, remarks = account.marks(built.dataset.recordings, head.gestures)
         marks = [Mark(i, "exclude", RECORDER, why) for i, why in account.set_aside_reasons().items() if why]
-        append_marks(work, marks + trims)
+        append_marks(work, marks + trims + labels)
         (work / HEAD).write_text(head.to_toml(), encoding="utf-8")
         infos = apply_marks(built.dataset.recordings, read_marks(work), head.gestures)
         write_index_files(Dataset(work, head, infos, built.dataset.streams))

@@ -51,6 +51,7 @@ from plushsense.dataset.importing.sources import (
     classify_session_files,
     common_layout,
     is_simulation,
+    moved_note,
     people_of,
     printable_path,
     read_mapping,
@@ -60,11 +61,12 @@ from plushsense.dataset.importing.sources import (
     split_regular_files,
 )
 from plushsense.dataset.importing.tables import TableImport
-from plushsense.dataset.importing.truncation import CHOSEN, choices_of, original_of, split_backups
+from plushsense.dataset.importing.truncation import CHOSEN, REPLACED, Backups, choices_of
 from plushsense.dataset.importing.xdf import ENDINGS, is_xdf, person_and_session, read_xdf
 from plushsense.dataset.index import rebuild_index
 from plushsense.dataset.store import (
     HEAD,
+    RECORDINGS,
     UNKNOWN_SUBJECT,
     DatasetHead,
     Generation,
@@ -148,13 +150,17 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     all_files = source_files(source)
     simulated = is_simulation(around or source, all_files)
     files, refused = split_regular_files(f for f in all_files if f.name != SIMULATION_MARK)
-    files, originals = split_backups(source, files)
-    choices, of_choices, unread = choices_of(source, files)
-    files = [f for f in files if f not in of_choices]
-    refused += [SourceFile(f, LEFT_OUT, reason=original_of(backup)) for f, backup in originals.items()]
+    backups = Backups.among(source, files)
+    choices, of_choices, unread = choices_of(source, backups.kept)
+    files = [f for f in backups.kept if f not in of_choices]
+    restored = {choice.name.casefold() for choice in backups.choices}
+    choices = [choice for choice in choices if choice.name.casefold() not in restored] + backups.choices
+    refused += [SourceFile(f, LEFT_OUT, reason=why) for f, why in backups.left_out.items()]
+    refused += [SourceFile(f, LEFT_OUT, reason=REPLACED) for f in backups.originals]
     refused += [SourceFile(f, "" if why else LEFT_OUT, reason=why or CHOSEN) for f, why in of_choices.items()]
     sessions = read_sessions(files)
-    layout, notes = options.known_layout(common_layout(sessions, options.layout, options.layout_origin), files)
+    own = common_layout(sessions, options.layout, options.layout_origin)
+    layout, notes = options.known_layout(own, [*files, *backups.originals.values()])
     gestures = options.known_gestures(layout)
     in_session = [f for f in files if sessions and session_of(f, sessions) is not None]
     rest = sorted(set(files) - set(in_session)) if in_session else files
@@ -171,7 +177,14 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
         + list(classify_session_files(sessions, in_session))
         + classify_files(shape, source, plain, mapping, gestures, options.person)
     )
+    classified = [
+        replace(f, source=backups.originals[f.source], cut=f.source)
+        if f.kind == RECORDINGS and f.source in backups.originals
+        else f
+        for f in classified
+    ]
     classified = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in classified]
+    notes += moved_note(classified)
     people, more = people_of(sessions)
     notes += [*more, *unread]
     search = SourceScan(
