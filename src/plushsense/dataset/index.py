@@ -348,7 +348,7 @@ def _stream_info(folder: Path, head: DatasetHead, read: _RawFile) -> StreamInfo:
     )
 
 
-def _locate(recording: ReadResult, stream: ReadResult, at: _RowLookup) -> tuple[int, int]:
+def locate(recording: ReadResult, stream: ReadResult, at: RowLookup) -> tuple[int, int]:
     """Return the stream row at which a recording begins and how many rows from there agree; (−1, 0) if none does."""
     frames, whole = recording.frames, stream.frames
     # A clock that was summed from delays begins at 0 in every file, so only time differences can be compared.
@@ -375,7 +375,7 @@ def _locate(recording: ReadResult, stream: ReadResult, at: _RowLookup) -> tuple[
 
 
 def _best_stream(
-    folder: Path, recording: _RawFile, session: str, streams: Iterable[_RawFile], lookups: dict[int, _RowLookup]
+    folder: Path, recording: _RawFile, session: str, streams: Iterable[_RawFile], lookups: dict[int, RowLookup]
 ) -> tuple[_RawFile | None, int, int]:
     """Return the stream of ``streams`` that contains most of a recording, its first row there, and the agreeing rows.
 
@@ -387,7 +387,7 @@ def _best_stream(
         for stream in streams:
             if (_stream_session(folder, stream) == session) is not own:
                 continue
-            row, rows = _locate(recording.result, stream.result, lookups[id(stream)])
+            row, rows = locate(recording.result, stream.result, lookups[id(stream)])
             if rows > best[2] and (own or rows == len(recording.result.frames)):
                 best = (stream, row, rows)
             if best[2] == len(recording.result.frames):
@@ -418,7 +418,7 @@ def _recordings_from_files(
         by_subject.setdefault(stream.subject, []).append(stream)
     # Of files with equal content, the first in the order of the paths is the original.
     originals: dict[str, str] = {}
-    lookups = {id(s): _RowLookup.of(s.result.frames) for s in streams}
+    lookups = {id(s): RowLookup.of(s.result.frames) for s in streams}
     infos = []
     for read, name, label in named:
         frames = read.result.frames
@@ -471,14 +471,14 @@ def _facts(folder: Path, read: _RawFile, frames: Frames, epoch_ms: int) -> dict[
 
 
 @dataclass(frozen=True)
-class _RowLookup:
+class RowLookup:
     """Rows of a stream by time stamp: that of the host, or of the device if there is none."""
 
     stamps: NDArray[np.int64]
     rows: NDArray[np.int64]
 
     @classmethod
-    def of(cls, frames: Frames) -> _RowLookup:
+    def of(cls, frames: Frames) -> RowLookup:
         stamps = frames.device_ms if frames.host_ms is None else frames.host_ms
         order = np.argsort(stamps, kind="stable")
         return cls(stamps[order], order)

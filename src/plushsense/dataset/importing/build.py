@@ -190,7 +190,8 @@ SIMULATED = Sentence(
 )
 NO_PEOPLE = Sentence(
     "the folders are gestures, so the people are not known: splits by subject are not possible; "
-    "import again with --subjects map.csv (columns file,subject) if a mapping exists",
+    "import again with --streams DIR if the fulldatastream.csv of each person is there, or with --subjects map.csv "
+    "(columns file,subject) if a mapping is",
     reason="people_unknown",
 )
 
@@ -459,8 +460,9 @@ def summarize_import(
     dataset: Dataset, account: ImportedFiles, notes: list[str], new: set[str], trims: int = 0
 ) -> ImportSummary:
     """Return the summary of an import that added the files ``new``, and ``trims`` of recordings."""
-    # A search by a pattern has said so.
-    unknown = account.search.shape != PATTERN and any(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings)
+    # A search by a pattern, or in streams, has said so.
+    said = account.search.shape == PATTERN or account.search.streams_named
+    unknown = not said and any(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings)
     mine = [r for r in dataset.recordings if r.file in new]
     flagged = [s for s in dataset.streams if s.file in new] + mine
     return ImportSummary(

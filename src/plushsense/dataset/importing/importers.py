@@ -60,6 +60,7 @@ from plushsense.dataset.importing.sources import (
     source_files,
     split_regular_files,
 )
+from plushsense.dataset.importing.streams import find_people
 from plushsense.dataset.importing.tables import TableImport
 from plushsense.dataset.importing.truncation import CHOSEN, REPLACED, Backups, choices_of
 from plushsense.dataset.importing.xdf import ENDINGS, is_xdf, person_and_session, read_xdf
@@ -89,7 +90,7 @@ NO_PEOPLE_OF_PATTERN = Sentence(
 class ImportOptions:
     """Options of an import; ``layout``, ``gestures`` and ``mapping`` (file to person) may be None.
 
-    ``person`` and ``guess_layout`` are as in `import_recordings`.
+    ``person``, ``guess_layout`` and ``streams`` are as in `import_recordings`.
 
     ``layout_origin`` describes the layout in messages; ``columns`` maps roles to column names; ``new_folder`` creates
     a temporary folder for unpacked or converted files.
@@ -105,6 +106,7 @@ class ImportOptions:
     person: str | None = None
     guess_layout: bool = False
     pattern: ImportPattern | None = None
+    streams: Path | None = None
 
     def known_layout(self, own: Layout | None, files: Iterable[Path]) -> tuple[Layout, list[str]]:
         """Return the layout ``own`` of the source, else the given one, else the one that the header of a file names.
@@ -413,6 +415,8 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
         raise DatasetError(f"'{source}' cannot be read: {cause.strerror or cause} ({cause.filename}).") from None
     except FileFormatError as cause:
         raise FileFormatError(f"'{source}': {cause}.", reason=cause.reason, **cause.values) from None
+    if options.streams is not None:
+        find_people(search, options.streams)
     if not any(f.kind in ("recordings", "streams") for f in search.found):
         first = next((f" The first: '{f.origin}': {f.reason.rstrip('.')}." for f in search.found if f.reason), "")
         unknown = any(getattr(f.reason, "reason", "") == "person_unknown" for f in search.found)
@@ -477,8 +481,11 @@ def _options(
     person: str | None = None,
     guess_layout: bool = False,
     pattern: ImportPattern | str | Path | None = None,
+    streams: str | Path | None = None,
 ) -> ImportOptions:
     """Load the files that options of an import name; a layout, gestures or columns override those of the pattern."""
+    if streams is not None and (str(subjects) != FOLDER or person or pattern is not None):
+        raise ConfigError("--streams tells the people of recordings: leave --subjects, --pattern and a person out.")
     if pattern is not None and not isinstance(pattern, ImportPattern):
         pattern = read_pattern(pattern)
     if pattern is not None:
@@ -495,6 +502,7 @@ def _options(
         person=person,
         guess_layout=guess_layout,
         pattern=pattern,
+        streams=None if streams is None else Path(streams),
     )
 
 
@@ -507,7 +515,8 @@ def preview_import(source: str | Path, **given: Any) -> ImportPreview:
     """Return what `import_recordings` would understand of ``source``; nothing is written.
 
     Args:
-        given: layout, gestures, subjects, columns, limits, person, guess_layout and pattern of `import_recordings`.
+        given: layout, gestures, subjects, columns, limits, person, guess_layout, pattern and streams of
+            `import_recordings`.
 
     Raises:
         DatasetError: if there is nothing to import.
@@ -552,6 +561,7 @@ def import_recordings(
     person: str | None = None,
     guess_layout: bool = False,
     pattern: ImportPattern | str | Path | None = None,
+    streams: str | Path | None = None,
 ) -> ImportSummary:
     """Create a data set at ``dest`` from recordings, or add them to an existing one.
 
@@ -575,6 +585,8 @@ def import_recordings(
             and tables without a person. "" refuses them; None takes the name of the folder where there is one.
         guess_layout: if no layout is given or stated, take the most probable built-in one that can read the files.
         pattern: description of files of other projects, or the path of its TOML file.
+        streams: folders of people, each with its ``fulldatastream.csv``, in which recordings without a known person are
+            found: they get the person and the place in the stream, which undoes their anonymisation.
 
     Returns:
         The summary. Every source file is imported (possibly with warnings), left out, or rejected with a reason.
@@ -597,14 +609,16 @@ def import_recordings(
             name=dest.name,
         )
     with _temporary_folders(dest) as new_folder:
-        options = _options(new_folder, layout, gestures, subjects, columns, limits, person, guess_layout, pattern)
+        options = _options(
+            new_folder, layout, gestures, subjects, columns, limits, person, guess_layout, pattern, streams
+        )
         known, head = options.gestures, None
         generation = Generation.of(dest)
         if add_to:
-            if adopt_proposals or name or licence or consent:
+            if adopt_proposals or name or licence or consent or streams:
                 raise ConfigError(
-                    "--add keeps the layout, name, licence and consent statement of the data set: leave --adopt, "
-                    "--name, --licence and --consent out."
+                    "--add keeps the layout, name, licence, consent statement and people of the data set: leave "
+                    "--adopt, --name, --licence, --consent and --streams out."
                 )
             head = DatasetHead.read(dest)
             _check_layout(dest, head.layout, options.layout, named=layout is not None)

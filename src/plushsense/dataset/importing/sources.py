@@ -58,7 +58,8 @@ class SourceFile:
 class SourceScan:
     """Result of searching a source: every file once (``found``), and layout, gestures and people of its sessions.
 
-    ``choices`` are those of the authors' truncation script.
+    ``choices`` are those of the authors' truncation script. ``streams_named`` is whether streams were searched for the
+    people.
     """
 
     layout: Layout
@@ -69,6 +70,7 @@ class SourceScan:
     simulated: bool = False
     notes: list[str] = field(default_factory=list)
     choices: list[Choice] = field(default_factory=list)
+    streams_named: bool = False
 
 
 def printable_path(path: Path) -> str:
