@@ -20,6 +20,7 @@ from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, Gesture, GestureSet, plain_label
 from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_bytes, read_recording, read_stream
 from plushsense.core.sentences import Sentence
+from plushsense.core.simulation import is_marked
 from plushsense.dataset.files import (
     RECORDINGS_INDEX,
     STAMP,
@@ -66,10 +67,14 @@ class _RawFile:
 
 @dataclass
 class IndexBuild:
-    """Result of building the index: the data set, and the reason for each file that could not be read."""
+    """Result of building the index: the data set, and the reason for each file that could not be read.
+
+    ``virtual`` counts the recordings whose times have the mark of a simulation.
+    """
 
     dataset: Dataset
     unreadable: dict[str, str] = field(default_factory=dict)
+    virtual: int = 0
 
 
 def open_dataset(path: str | Path) -> Dataset:
@@ -299,7 +304,8 @@ def build_index(folder: Path, head: DatasetHead, progress: Progress | None = Non
     infos = _recordings_from_files(folder, head, recordings, streams) + _recordings_from_labels(folder, head, streams)
     infos = sorted(apply_marks(infos, read_marks(folder), head.gestures), key=lambda r: r.id)
     stream_infos = [_stream_info(folder, head, s) for s in streams]
-    return IndexBuild(Dataset(folder, head, infos, stream_infos, generation), unreadable)
+    virtual = sum(is_marked(read.result.frames) for read in recordings)
+    return IndexBuild(Dataset(folder, head, infos, stream_infos, generation), unreadable, virtual)
 
 
 DUPLICATE_FOLDER = "again-"

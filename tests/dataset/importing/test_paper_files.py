@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from plushsense.core.errors import DatasetError
 from plushsense.core.recorder_csv import parse_name
 from plushsense.dataset.importing.build import ImportSummary, group_flags
 from plushsense.dataset.importing.importers import import_recordings, preview_import
@@ -307,3 +308,50 @@ def test_recordings_at_rest_that_the_script_leaves_do_not_make_gestures_people(t
     assert (done.recordings, done.subjects, done.streams) == (RECORDINGS + 2, 0, 0)
     assert {r.subject for r in done.dataset.recordings} == {"unknown", "none"}
     assert {e["reason"] for e in done.rejected} == {"a session stream whose person is not known"}
+
+
+def shifted(folder: Path, by_ms: int) -> None:
+    """Shift the computer's times of all recordings, as if they had been real."""
+    for path in folder.rglob("*.csv"):
+        header, *rows = path.read_text().splitlines()
+        cells = [row.split("; ") for row in rows]
+        text = [header, *("; ".join([*row[:13], str(int(row[13]) + by_ms), row[14]]) for row in cells)]
+        path.write_text("\n".join(text) + "\n")
+
+
+@pytest.mark.parametrize("integers", [15, 14])
+@pytest.mark.parametrize("truncated", [False, True])
+def test_a_simulation_is_known_after_the_scripts(tmp_path: Path, integers: int, truncated: bool) -> None:
+    """Nothing is left beside the files: the mark is in the times of the rows."""
+    root = tmp_path / "study"
+    scripts.record(root, people=1, repetitions=1, integers=integers)
+    moved = tmp_path / "elsewhere"
+    scripts.move_by_label(root)
+    if truncated:
+        scripts.truncate(root, {p.name: (0, 40) for p in (root / scripts.LABELLED).rglob("*.csv")})
+    (root / scripts.LABELLED).rename(moved)
+    done = imported(moved, tmp_path / "DS", integers)
+    assert done.dataset.head.simulated and open_dataset(tmp_path / "DS").head.simulated
+    assert "3 of 3 recordings are of a virtual toy, as the times of their rows tell" in done.notes
+    assert sum(note.startswith("these recordings are a simulation") for note in done.notes) == 1
+
+
+def test_real_recordings_have_no_such_times(tmp_path: Path) -> None:
+    root = tmp_path / "study"
+    scripts.record(root, people=1, repetitions=2)
+    scripts.move_by_label(root)
+    moved = tmp_path / "elsewhere"
+    (root / scripts.LABELLED).rename(moved)
+    virtual = min((moved / "Tail pull").glob("*.csv"))
+    virtual.rename(tmp_path / virtual.name)
+    shifted(moved, 3)
+    real = imported(moved, tmp_path / "REAL")
+    assert not real.dataset.head.simulated
+    (tmp_path / virtual.name).rename(virtual)
+    done = imported(moved, tmp_path / "MIXED")
+    assert done.dataset.head.simulated
+    assert "1 of 6 recordings are of a virtual toy, as the times of their rows tell" in done.notes
+    with pytest.raises(DatasetError, match="holds recordings of a real toy, the source those of a virtual one"):
+        import_recordings(moved, tmp_path / "REAL", add_to=True)
+    assert len(open_dataset(tmp_path / "REAL").recordings) == 5
+    assert import_recordings(moved, tmp_path / "MIXED", add_to=True).added["recordings"] == 0

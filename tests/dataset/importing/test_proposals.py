@@ -245,6 +245,7 @@ def test_the_real_recordings_need_nothing_but_a_window(real_data: Path, tmp_path
     for source, layout in (("makeability-gestures", "accel-3"), ("har-phone", "phone-6")):
         done = import_recordings(real_data / source, tmp_path / layout)
         assert done.dataset.layout.name == layout and f"'{layout}'" in done.notes[0]
+        assert not done.dataset.head.simulated
         assert [p["key"] for p in done.proposals] == ["window_s"]
         (sensor,) = done.sensors
         assert sensor["recognised"] == {"accel-3": "8192 counts a g", "phone-6": "m/s²"}[layout]

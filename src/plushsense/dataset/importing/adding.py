@@ -123,13 +123,6 @@ def add_to_dataset(
     """
     with _locked_work_folder(dest) as work:
         dataset = open_dataset(dest)
-        if dataset.head.simulated != search.simulated:
-            kinds = ("real", "virtual") if search.simulated else ("virtual", "real")
-            raise DatasetError(
-                f"'{dest}' holds recordings of a {kinds[0]} toy, the source those of a {kinds[1]} one: keep them "
-                "apart.",
-                reason="real_and_virtual",
-            )
         copier = _copier(dataset, work)
         account = ImportedFiles(search, copier)
         own = dataset.head.gestures
@@ -137,6 +130,14 @@ def add_to_dataset(
             own = GestureSet(own.name, own.gestures + new_gestures)
         head = replace(dataset.head, gestures=own)
         built = read_copied(account, head, progress)
+        simulated = search.simulated or built.virtual > 0
+        if dataset.head.simulated != simulated and (simulated or account.kept):
+            kinds = ("real", "virtual") if simulated else ("virtual", "real")
+            raise DatasetError(
+                f"'{dest}' holds recordings of a {kinds[0]} toy, the source those of a {kinds[1]} one: keep them "
+                "apart.",
+                reason="real_and_virtual",
+            )
         if account.rejected and not account.kept and not copier.already:
             file, reason = account.rejected[0].values()
             raise DatasetError(

@@ -14,7 +14,7 @@ from plushsense.core.errors import DatasetError
 from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, plural
 from plushsense.dataset.files import sha256_of
 from plushsense.dataset.importing.sources import COMPANIONS, LEFT_OUT, SourceFile, SourceScan
 from plushsense.dataset.importing.truncation import IMPORTER, truncation_marks
@@ -429,7 +429,12 @@ def create_dataset(
                 layout=head.layout.name,
                 first=reasons[0],
             )
-        head = replace(head, gestures=extend_gestures(search.gestures, built.dataset))
+        virtual = [] if head.simulated or not built.virtual else [virtual_note(built)]
+        head = replace(
+            head,
+            gestures=extend_gestures(search.gestures, built.dataset),
+            simulated=head.simulated or built.virtual > 0,
+        )
         if {r.gesture for r in built.dataset.recordings} - set(head.gestures.labels):
             # The set merges spellings of labels: build the index again with the complete set.
             built = build_index(work, head)
@@ -446,7 +451,14 @@ def create_dataset(
     dataset = Dataset(dest, head, infos, built.dataset.streams)
     if search.gestures is not None and (note := unknown_labels(search.gestures, (r.gesture for r in infos))):
         notes.append(note)
-    return summarize_import(dataset, account, search.notes + notes + remarks, set(account.kept), len(trims))
+    return summarize_import(dataset, account, virtual + search.notes + notes + remarks, set(account.kept), len(trims))
+
+
+def virtual_note(built: IndexBuild) -> Sentence:
+    """Return the note that the times of recordings tell that they are simulated."""
+    of = len(built.dataset.recordings)
+    message = f"{built.virtual} of {plural(of, 'recording')} are of a virtual toy, as the times of their rows tell"
+    return Sentence(message, reason="virtual_recordings", n=built.virtual, of=of)
 
 
 def read_copied(account: ImportedFiles, head: DatasetHead, progress: Progress | None) -> IndexBuild:

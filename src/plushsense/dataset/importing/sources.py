@@ -170,16 +170,18 @@ def _label_folders(labels: Mapping[Path, str], gestures: GestureSet | None) -> d
 
 def _same_gesture(one: str, other: str, gestures: GestureSet | None) -> bool:
     """Return whether two labels are of one gesture."""
-    found = gestures.find(one) if gestures is not None else None
-    return plain_label(one) == plain_label(other) or (found is not None and found == gestures.find(other))
+    if plain_label(one) == plain_label(other) or gestures is None:
+        return plain_label(one) == plain_label(other)
+    found = gestures.find(one)
+    return found is not None and found == gestures.find(other)
 
 
 def _nobodys_folders(labels: Mapping[Path, str], gestures: GestureSet | None) -> set[Path]:
     """Return the folders in which every recording is of a gesture without a person (the toy at rest)."""
     with_nobody: set[Path] = set()
     with_people: set[Path] = set()
-    for path, label in labels.items() if gestures is not None else ():
-        gesture = gestures.find(label)
+    for path, label in labels.items():
+        gesture = gestures.find(label) if gestures is not None else None
         (with_nobody if gesture is not None and gesture.nobody else with_people).add(path.parent)
     return with_nobody - with_people
 

@@ -141,7 +141,7 @@ def read_choices(path: Path) -> list[Choice]:
                 "from 0 on, or NaN."
             ) from None
         # The script ran on another computer, whose paths may have backslashes.
-        choices.append(Choice(name, PureWindowsPath(full).parent.name, *(int(number) for number in numbers)))
+        choices.append(Choice(name, PureWindowsPath(full).parent.name, int(numbers[0]), int(numbers[1])))
     return choices
 
 
