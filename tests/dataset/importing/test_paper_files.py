@@ -18,6 +18,7 @@ from plushsense.dataset.marks import BY_HAND, read_marks
 from plushsense.dataset.privacy.pseudonymise import pseudonymise
 from plushsense.dataset.quality.checking import check
 from support import paper_scripts as scripts
+from support.real_times import as_if_real
 
 RECORDINGS = 3 * len(scripts.GESTURES) * 2
 
@@ -310,15 +311,6 @@ def test_recordings_at_rest_that_the_script_leaves_do_not_make_gestures_people(t
     assert {e["reason"] for e in done.rejected} == {"a session stream whose person is not known"}
 
 
-def shifted(folder: Path, by_ms: int) -> None:
-    """Shift the computer's times of all recordings, as if they had been real."""
-    for path in folder.rglob("*.csv"):
-        header, *rows = path.read_text().splitlines()
-        cells = [row.split("; ") for row in rows]
-        text = [header, *("; ".join([*row[:13], str(int(row[13]) + by_ms), row[14]]) for row in cells)]
-        path.write_text("\n".join(text) + "\n")
-
-
 @pytest.mark.parametrize("integers", [15, 14])
 @pytest.mark.parametrize("truncated", [False, True])
 def test_a_simulation_is_known_after_the_scripts(tmp_path: Path, integers: int, truncated: bool) -> None:
@@ -344,7 +336,7 @@ def test_real_recordings_have_no_such_times(tmp_path: Path) -> None:
     (root / scripts.LABELLED).rename(moved)
     virtual = min((moved / "Tail pull").glob("*.csv"))
     virtual.rename(tmp_path / virtual.name)
-    shifted(moved, 3)
+    as_if_real(moved)
     real = imported(moved, tmp_path / "REAL")
     assert not real.dataset.head.simulated
     (tmp_path / virtual.name).rename(virtual)
