@@ -92,7 +92,7 @@ def test_recorded_sessions_give_the_same_table_under_their_own_heading(capsys, s
     assert result["heading"].startswith("The paper's real-time protocol on recorded sessions of a simulation: raw")
     assert (result["trials"], result["people"], result["aims"]) == (4, ["P01", "P02"], [])
     assert any("nobody is left to tune the rule baseline on" in sentence for sentence in result["said"])
-    real = copied_as_if_real(sessions, tmp_path / "real")
+    real = copied_as_if_real(sessions, tmp_path / "real" / "raw")
     (real / "P02" / "fulldatastream.csv").unlink()
     status, text, err = said(capsys, "--model", stranger, "--session", real, "--json")
     result = json.loads(text)
