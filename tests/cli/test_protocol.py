@@ -18,6 +18,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
 from plushsense.recording.simulate import simulate
 from plushsense.windows.features import Scaler
+from support.real_times import copied_as_if_real
 
 
 def bundle(**provenance):
@@ -91,13 +92,9 @@ def test_recorded_sessions_give_the_same_table_under_their_own_heading(capsys, s
     assert result["heading"].startswith("The paper's real-time protocol on recorded sessions of a simulation: raw")
     assert (result["trials"], result["people"], result["aims"]) == (4, ["P01", "P02"], [])
     assert any("nobody is left to tune the rule baseline on" in sentence for sentence in result["said"])
-    (sessions / "SIMULATION.txt").rename(tmp_path / "SIMULATION.txt")
-    try:
-        (sessions / "P02" / "fulldatastream.csv").rename(tmp_path / "away.csv")
-        status, text, err = said(capsys, "--model", stranger, "--session", sessions, "--json")
-    finally:
-        (tmp_path / "away.csv").rename(sessions / "P02" / "fulldatastream.csv")
-        (tmp_path / "SIMULATION.txt").rename(sessions / "SIMULATION.txt")
+    real = copied_as_if_real(sessions, tmp_path / "real" / "raw")
+    (real / "P02" / "fulldatastream.csv").unlink()
+    status, text, err = said(capsys, "--model", stranger, "--session", real, "--json")
     result = json.loads(text)
     assert result["heading"] == "The paper's real-time protocol on recorded sessions: raw"
     assert result["simulated"] is False

@@ -10,6 +10,7 @@ from plushsense.core.recorder_csv import Frames, recording_filename, write_recor
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks
+from plushsense.dataset.quality.measurements import summarize
 from plushsense.dataset.statistics import SummaryStatistics, channel_table, duration_bands, duration_table
 from plushsense.dataset.store import Dataset, PersonInfo, write_people
 
@@ -90,3 +91,14 @@ def test_the_band_of_the_paper_around_the_mean(dataset: Dataset) -> None:
     outside = [i for i, s in wave.seconds.items() if abs(s / wave.mean_s - 1) > 0.4]
     assert wave.outliers == outside and len(outside) == 2
     assert duration_bands(dataset, 0.7)[1].outliers == []
+
+
+def test_check_and_stats_have_one_duration_of_a_recording(dataset: Dataset) -> None:
+    longest = next(r for r in dataset.recordings if r.rows == 400)
+    append_marks(dataset.path, [Mark(longest.id, "trim", "K", start=100, stop=350)])
+    trimmed = open_dataset(dataset.path)
+    seconds = {i: s for band in duration_bands(trimmed) for i, s in band.seconds.items()}
+    assert sorted(round(s, 2) for s in seconds.values()) == [0.5, 1.0, 2.0, 2.5, 3.0], "rows × 10 ms"
+    summaries = [summarize(r, trimmed.read(r), ACCEL) for r in trimmed.used]
+    assert {s.info.id: s.seconds for s in summaries} == seconds
+    assert {r.id: r.seconds for r in trimmed.used} == seconds

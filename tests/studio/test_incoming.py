@@ -71,10 +71,11 @@ def test_sources_are_imported_together_and_what_is_refused_is_named(furniture: P
     broken.write_bytes(b"PK no zip")
     found = inspect(tmp_path / "D", broken, packed, folder)
     assert found["people"] == {"P01": 3, "P02": 3}
-    assert (found["layout"], found["recordings"], found["simulated"]) == ("plush-15", 6, False)
+    assert (found["layout"], found["recordings"], found["simulated"]) == ("plush-15", 6, True)
     reasons = {r["file"]: r["reason"].reason for r in found["rejected"]}
     assert reasons == {"broken.zip": "zip_damaged", "notes.txt": "file_no_recording"}
-    assert [note.reason for note in found["notes"] if isinstance(note, Sentence)] == ["layout_guessed"]
+    told = [note.reason for note in found["notes"] if isinstance(note, Sentence)]
+    assert told == ["simulated", "virtual_recordings", "layout_guessed"]
 
 
 def test_what_all_sources_prove_is_adopted_and_told(tmp_path: Path) -> None:

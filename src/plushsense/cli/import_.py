@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     if args.guess:
         return _guess(args)
     given = {
-        **options(args, "layout", "gestures", "subjects", "pattern"),
+        **options(args, "layout", "gestures", "subjects", "pattern", "streams"),
         "columns": _columns(args.column),
         "limits": UnpackLimits.of_gigabytes(args.max_gb),
     }

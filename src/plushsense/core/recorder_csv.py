@@ -355,7 +355,11 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
         raise FileFormatError(message, reason="file_no_recording")
     keys, header = column_keys(first, layout, path)
     if header and (end < 0 or not data[end:].strip()):
-        raise FileFormatError(f"'{path.name}' has a header but no row.", reason="file_empty")
+        raise FileFormatError(
+            f"'{path.name}' has a header but no row: the authors' recorder writes such files if the toy sends fewer "
+            "than 14 integers a line.",
+            reason="file_empty",
+        )
     table, labels, malformed = parse_table(data, keys, 1 if header else 0, path)
     numeric = [k for k in keys if k != "label"]
     warnings: list[str] = ["the last line is cut off: left out"] if cut else []

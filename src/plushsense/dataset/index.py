@@ -29,6 +29,7 @@ from plushsense.core.recorder_csv import (
     stray_rows,
 )
 from plushsense.core.sentences import Sentence
+from plushsense.core.simulation import is_marked
 from plushsense.dataset.files import (
     RECORDINGS_INDEX,
     STAMP,
@@ -75,10 +76,14 @@ class _RawFile:
 
 @dataclass
 class IndexBuild:
-    """Result of building the index: the data set, and the reason for each file that could not be read."""
+    """Result of building the index: the data set, and the reason for each file that could not be read.
+
+    ``virtual`` counts the recordings whose times have the mark of a simulation.
+    """
 
     dataset: Dataset
     unreadable: dict[str, str] = field(default_factory=dict)
+    virtual: int = 0
 
 
 def open_dataset(path: str | Path) -> Dataset:
@@ -308,7 +313,8 @@ def build_index(folder: Path, head: DatasetHead, progress: Progress | None = Non
     infos = _recordings_from_files(folder, head, recordings, streams) + _recordings_from_labels(folder, head, streams)
     infos = sorted(apply_marks(infos, read_marks(folder), head.gestures), key=lambda r: r.id)
     stream_infos = [_stream_info(folder, head, s) for s in streams]
-    return IndexBuild(Dataset(folder, head, infos, stream_infos, generation), unreadable)
+    virtual = sum(is_marked(read.result.frames) for read in recordings)
+    return IndexBuild(Dataset(folder, head, infos, stream_infos, generation), unreadable, virtual)
 
 
 DUPLICATE_FOLDER = "again-"
@@ -357,7 +363,7 @@ def _stream_info(folder: Path, head: DatasetHead, read: _RawFile) -> StreamInfo:
     )
 
 
-def _locate(recording: ReadResult, stream: ReadResult, at: _RowLookup) -> tuple[int, int]:
+def locate(recording: ReadResult, stream: ReadResult, at: RowLookup) -> tuple[int, int]:
     """Return the stream row at which a recording begins and how many rows from there agree; (−1, 0) if none does."""
     frames, whole = recording.frames, stream.frames
     # A clock that was summed from delays begins at 0 in every file, so only time differences can be compared.
@@ -384,7 +390,7 @@ def _locate(recording: ReadResult, stream: ReadResult, at: _RowLookup) -> tuple[
 
 
 def _best_stream(
-    folder: Path, recording: _RawFile, session: str, streams: Iterable[_RawFile], lookups: dict[int, _RowLookup]
+    folder: Path, recording: _RawFile, session: str, streams: Iterable[_RawFile], lookups: dict[int, RowLookup]
 ) -> tuple[_RawFile | None, int, int]:
     """Return the stream of ``streams`` that contains most of a recording, its first row there, and the agreeing rows.
 
@@ -396,7 +402,7 @@ def _best_stream(
         for stream in streams:
             if (_stream_session(folder, stream) == session) is not own:
                 continue
-            row, rows = _locate(recording.result, stream.result, lookups[id(stream)])
+            row, rows = locate(recording.result, stream.result, lookups[id(stream)])
             if rows > best[2] and (own or rows == len(recording.result.frames)):
                 best = (stream, row, rows)
             if best[2] == len(recording.result.frames):
@@ -427,7 +433,7 @@ def _recordings_from_files(
         by_subject.setdefault(stream.subject, []).append(stream)
     # Of files with equal content, the first in the order of the paths is the original.
     originals: dict[str, str] = {}
-    lookups = {id(s): _RowLookup.of(s.result.frames) for s in streams}
+    lookups = {id(s): RowLookup.of(s.result.frames) for s in streams}
     infos = []
     for read, name, label in named:
         frames = read.result.frames
@@ -480,14 +486,14 @@ def _facts(folder: Path, read: _RawFile, frames: Frames, epoch_ms: int) -> dict[
 
 
 @dataclass(frozen=True)
-class _RowLookup:
+class RowLookup:
     """Rows of a stream by time stamp: that of the host, or of the device if there is none."""
 
     stamps: NDArray[np.int64]
     rows: NDArray[np.int64]
 
     @classmethod
-    def of(cls, frames: Frames) -> _RowLookup:
+    def of(cls, frames: Frames) -> RowLookup:
         stamps = frames.device_ms if frames.host_ms is None else frames.host_ms
         order = np.argsort(stamps, kind="stable")
         return cls(stamps[order], order)

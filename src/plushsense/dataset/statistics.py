@@ -59,7 +59,7 @@ class Duration:
 def duration_table(dataset: Dataset, by: str | None = None) -> list[Duration]:
     """Return the durations of the used recordings, one entry for each gesture and group of people.
 
-    Seconds are rows divided by the measured rate of the recording; recordings without a rate (one row) are left out.
+    Recordings without a rate (one row) are left out.
 
     Args:
         by: the column of subjects.csv to group by (age_group, gender or a user-defined one), or ``subject``.
@@ -79,8 +79,8 @@ def duration_table(dataset: Dataset, by: str | None = None) -> list[Duration]:
             len(recordings),
             len({r.subject for r in recordings} - {NOBODY, UNKNOWN_SUBJECT}),
             sum(r.stop - r.start < r.rows for r in recordings),
-            SummaryStatistics.of([r.rows / r.rate_hz for r in recordings]),
-            SummaryStatistics.of([(r.stop - r.start) / r.rate_hz for r in recordings]),
+            SummaryStatistics.of([r.whole_seconds for r in recordings]),
+            SummaryStatistics.of([r.seconds for r in recordings]),
             SummaryStatistics.of([r.rows for r in recordings]),
             SummaryStatistics.of([r.stop - r.start for r in recordings]),
         )
@@ -120,7 +120,7 @@ def duration_bands(dataset: Dataset, share: float = 0.4) -> list[DurationBand]:
     groups: dict[str, dict[str, float]] = {}
     for r in sorted(dataset.used, key=lambda r: (r.epoch_ms, r.id)):
         if r.rate_hz > 0:
-            groups.setdefault(r.gesture, {})[r.id] = (r.stop - r.start) / r.rate_hz
+            groups.setdefault(r.gesture, {})[r.id] = r.seconds
     bands = []
     for gesture in sorted(groups, key=lambda g: (_class_order(dataset, g), g)):
         seconds = np.array(list(groups[gesture].values()))

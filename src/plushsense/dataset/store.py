@@ -37,6 +37,7 @@ from plushsense.core.sentences import plural
 from plushsense.core.toml import load_table, read_toml
 from plushsense.dataset.about import About, HeadFile
 from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, append_marks, locked, read_marks
+from plushsense.recording.takes import duration_s
 
 FORMAT_VERSION = 1
 HEAD = "dataset.toml"
@@ -192,6 +193,16 @@ class RecordingInfo(_Row):
         # An index of an earlier version has no such column.
         if not self.recorded:
             object.__setattr__(self, "recorded", self.gesture)
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the rows in use, after trimming, by `duration_s`."""
+        return duration_s(self.stop - self.start, self.rate_hz)
+
+    @property
+    def whole_seconds(self) -> float:
+        """Duration of all rows, by `duration_s`."""
+        return duration_s(self.rows, self.rate_hz)
 
 
 @dataclass(frozen=True)
@@ -484,7 +495,7 @@ class Dataset:
         by_gesture = []
         for gesture in self.gestures.gestures:
             recordings = [r for r in self.used if r.gesture == gesture.label]
-            seconds = sorted((r.stop - r.start) / r.rate_hz for r in recordings if r.rate_hz > 0)
+            seconds = sorted(r.seconds for r in recordings if r.rate_hz > 0)
             by_gesture.append(
                 {
                     "label": gesture.label,

@@ -30,6 +30,7 @@ from plushsense.core.recorder_csv import (
     format_rows,
     recording_filename,
 )
+from plushsense.core.simulation import mark_times
 from plushsense.devices.base import Counters
 from plushsense.devices.virtual.motions import AT_REST
 from plushsense.devices.virtual.session import GESTURES, Episode, VirtualSession
@@ -113,6 +114,7 @@ def _receive(
 ) -> tuple[Frames, NDArray[np.int64], int]:
     """Return the received frames, for each sent row (and the end) the index among them, and the number of lost frames.
 
+    Their times are marked as simulated (`mark_times`).
     The frames begin at ``host_ms``; if they are the ``first`` of a session, at a random time of that day.
     """
     values = np.concatenate([e.values for e in episodes])[:, channel_columns(layout)]
@@ -123,7 +125,7 @@ def _receive(
     begin = host_ms + (int(rng.integers(0, 20_000_000)) if first else 10)
     # The host's clock drifts a little, and frames arrive 0 to 6 ms late.
     passed = (device_ms - device_ms[0]) * (1.0 + 4e-5 * rng.standard_normal())
-    host = begin + np.maximum.accumulate(np.rint(passed + 6.0 * rng.random(len(passed))).astype(np.int64))
+    host = mark_times(begin + np.rint(passed).astype(np.int64), values)
     row_of = np.concatenate(([0], np.cumsum(arrives)))
     return Frames(values[arrives], written[arrives], host[arrives]), row_of, int(np.sum(~arrives))
 
@@ -295,7 +297,7 @@ class _PlayLog:
     def received(self, layout: Layout) -> tuple[Frames, NDArray[np.int64]]:
         """Return the frames, and the number of the person (T,) who had the toy at each."""
         table = np.frombuffer(self.rows, dtype=np.int64).reshape(-1, 3 + layout.n_channels)
-        return Frames(table[:, 3:], table[:, 2], table[:, 1]), table[:, 0]
+        return Frames(table[:, 3:], table[:, 2], mark_times(table[:, 1], table[:, 3:])), table[:, 0]
 
     def cuts(self, who: int, stream: Frames, mine: NDArray[np.bool_]) -> list[tuple[str, int, int]]:
         """Return label and rows, of this person's stream, of each gesture of which anything was received."""

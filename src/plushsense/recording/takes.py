@@ -131,6 +131,15 @@ def measured_rate_hz(device_ms: Any) -> float:
     return 1000.0 * len(even) / float(even.sum()) if even.sum() > 0 else 0.0
 
 
+def duration_s(rows: int, rate_hz: float) -> float:
+    """Return how many seconds ``rows`` rows last at the rate of `measured_rate_hz`; 0 if the rate is unknown.
+
+    Each row counts for one mean period, also the last one. Lost frames count as time, as they lower the rate, but gaps
+    of more than a second and resets do not.
+    """
+    return rows / rate_hz if rate_hz > 0 else 0.0
+
+
 def sidecar(
     take: RecordingTake,
     frames: Frames,

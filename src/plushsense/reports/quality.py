@@ -16,7 +16,7 @@ from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.quality.checking import CHECKS, CheckReport
 from plushsense.dataset.quality.findings import SEVERITIES, Finding
-from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, duration_s, summarize
+from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, summarize
 from plushsense.dataset.statistics import DurationBand, duration_bands
 from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.dataset.trimming import find_recordings
@@ -91,7 +91,7 @@ def gesture_figure(result: CheckReport, gesture: str, scale: NDArray[np.float64]
     for r in dataset.used:
         if r.gesture == gesture and r.stop > r.start:
             frames = dataset.read(r)
-            lines.append(figures.line(frames, dataset.layout, scale, duration_s(frames), names.get(r.id, "")))
+            lines.append(figures.line(frames, dataset.layout, scale, r.seconds, names.get(r.id, "")))
     seconds = np.array([one.lasts for one in lines]) if lines else np.ones(1)
     mean = float(seconds[seconds <= NEVER_STOPPED_FACTOR * np.median(seconds)].mean())
     return figures.overlay(gesture, lines, mean, result.limits.duration)
@@ -148,7 +148,7 @@ def example_recordings(dataset: Dataset, spec: WindowSpec) -> list[RecordingInfo
     """
     idle = {g.label for g in dataset.gestures.gestures if g.idle or g.nobody}
     touched_first = sorted(dataset.used, key=lambda r: r.gesture in idle)
-    lasting = [(r, (r.stop - r.start) / r.rate_hz) for r in touched_first if r.rate_hz > 0]
+    lasting = [(r, r.seconds) for r in touched_first]
     several = (spec.window_s + 2 * spec.step_s, spec.window_s + 20 * spec.step_s)
     short = next((r for r, s in lasting if 0 < s < spec.window_s - 0.1), None)
     long = next((r for r, s in lasting if several[0] < s < several[1]), None)

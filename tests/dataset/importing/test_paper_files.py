@@ -7,15 +7,18 @@ from pathlib import Path
 
 import pytest
 
+from plushsense.core.errors import DatasetError
 from plushsense.core.recorder_csv import parse_name
 from plushsense.dataset.importing.build import ImportSummary, group_flags
-from plushsense.dataset.importing.importers import import_recordings
+from plushsense.dataset.importing.importers import import_recordings, preview_import
 from plushsense.dataset.importing.truncation import CHOICES
 from plushsense.dataset.index import open_dataset
+from plushsense.dataset.labelling import relabel
 from plushsense.dataset.marks import BY_HAND, read_marks
 from plushsense.dataset.privacy.pseudonymise import pseudonymise
 from plushsense.dataset.quality.checking import check
 from support import paper_scripts as scripts
+from support.real_times import as_if_real
 
 RECORDINGS = 3 * len(scripts.GESTURES) * 2
 
@@ -79,20 +82,78 @@ def test_choices_before_the_truncation_are_marks(labelled: Path, tmp_path: Path)
             assert (name in chosen) == (r.id in states and states[r.id].how == BY_HAND)
 
 
-def test_the_backup_of_the_truncation_brings_no_recordings(labelled: Path, tmp_path: Path) -> None:
+def test_the_uncut_originals_take_the_place_of_the_cut_recordings(labelled: Path, tmp_path: Path) -> None:
     chosen = scripts.choose(labelled)
     scripts.truncate(labelled, chosen)
+    for number, choices in enumerate((True, False)):
+        if not choices:
+            # What was cut off is known without the file of choices.
+            (labelled / CHOICES).unlink()
+        done = imported(labelled, tmp_path / f"DS{number}")
+        assert done.recordings == done.trimmed == done.added["recordings"] == RECORDINGS
+        replaced = [e for e in done.left_out if e["file"].startswith(scripts.LABELLED)]
+        assert len(replaced) == RECORDINGS and all(e["reason"].startswith("cut by the trunc") for e in replaced)
+        # Rows in names are those before the cut; one name is that of another recording.
+        assert ["its name states" in w for w in kinds(done)] == [False, True], kinds(done)
+        assert kinds(done)[0].endswith(f": {RECORDINGS} trim their recordings by a mark")
+        for r in done.dataset.recordings:
+            rows, cut = chosen.get(Path(r.file).name, (r.rows, 0))
+            assert (r.start, r.stop, r.rows) == (cut, rows, rows), r.id
+
+
+def test_two_truncations_leave_one_original(labelled: Path, tmp_path: Path) -> None:
+    whole = {p.name: len(scripts._rows(p)) for p in (labelled / scripts.LABELLED).rglob("*.csv")}
+    scripts.truncate(labelled, scripts.choose(labelled))
+    later = scripts.BACKUP.replace("05-06", "06-01")
+    scripts.truncate(labelled, scripts.choose(labelled, cut=10), backup=later)
     done = imported(labelled, tmp_path / "DS")
-    assert done.recordings == done.added["recordings"] == RECORDINGS
-    originals = [e for e in done.left_out if scripts.BACKUP in e["file"]]
-    assert len(originals) == RECORDINGS
-    assert {"uncut original" in e["reason"] for e in originals} == {True}
-    # One warning states what the choices did, the other that names state the rows before the cut.
-    assert len(kinds(done)) == 2, kinds(done)
-    assert [w.partition(" ")[0] for w in kinds(done) if "its name states" in w] == ["9"]
-    assert all(r.start == 0 and r.stop == r.rows for r in done.dataset.recordings)
-    cut = {Path(r.file).name: r.rows for r in done.dataset.recordings}
-    assert all(cut[name] == rows - n for name, (rows, n) in chosen.items())
+    assert {Path(r.file).name: r.rows for r in done.dataset.recordings} == whole
+    assert {r.start for r in done.dataset.recordings} == {0, 50}
+    copies = [e["reason"] for e in done.left_out if e["file"].startswith(later)]
+    assert set(copies) == {f"a copy, in '{later}', of a recording that is imported"} and len(copies) == RECORDINGS
+
+
+def test_a_recording_that_the_truncation_skipped_is_not_lost(labelled: Path, tmp_path: Path) -> None:
+    """Where nothing would remain, the script neither copies nor cuts."""
+    chosen = scripts.choose(labelled)
+    name = next(iter(chosen))
+    lines = (labelled / CHOICES).read_text().splitlines()
+    (line,) = (k for k, text in enumerate(lines) if text.startswith(f"{name},"))
+    lines[line] = lines[line].rpartition(",")[0] + f",{chosen[name][0]}"
+    (labelled / CHOICES).write_text("\n".join(lines) + "\n")
+    backup = scripts.truncate(labelled, chosen)
+    skipped = next((labelled / scripts.LABELLED).rglob(name))
+    next(backup.rglob(name)).rename(skipped)
+    done = imported(labelled, tmp_path / "DS")
+    assert done.recordings == RECORDINGS
+    (found,) = (r for r in done.dataset.recordings if Path(r.file).name == name)
+    assert (found.rows, found.start) == (chosen[name][0], 0)
+    (note,) = (w for w in kinds(done) if "cuts of the truncation script" in w)
+    assert f"{RECORDINGS - 1} trim their recordings by a mark" in note and "left out" not in note
+    assert "1 would leave nothing, so that recordings stay whole" in note
+    alone = imported(backup, tmp_path / "ALONE")
+    assert alone.recordings == RECORDINGS - 1
+    assert any("1 are of recordings that are not in the source" in w for w in kinds(alone))
+
+
+def test_a_backup_of_other_rows_is_a_copy(labelled: Path, tmp_path: Path) -> None:
+    scripts.truncate(labelled, scripts.choose(labelled))
+    changed = min((labelled / scripts.LABELLED).rglob("Tail tap 2*.csv"))
+    lines = changed.read_text().splitlines()
+    changed.write_text("\n".join(["1" + lines[0], *lines[1:]]) + "\n")
+    done = imported(labelled, tmp_path / "DS")
+    assert [e["file"] for e in done.left_out if "a copy, in" in e["reason"]] == [
+        f"{scripts.BACKUP}/Tail tap 2/{changed.name}"
+    ]
+    (found,) = (r for r in done.dataset.recordings if Path(r.file).name == changed.name)
+    assert found.rows == len(lines)
+
+
+def test_cut_recordings_of_a_data_set_are_not_added_again_as_originals(labelled: Path, tmp_path: Path) -> None:
+    scripts.truncate(labelled, scripts.choose(labelled))
+    assert imported(labelled / scripts.LABELLED, tmp_path / "DS").recordings == RECORDINGS
+    done = import_recordings(labelled, tmp_path / "DS", add_to=True)
+    assert (done.recordings, done.already_there) == (RECORDINGS, RECORDINGS)
 
 
 def test_the_backup_alone_brings_the_whole_recordings_and_the_choices(labelled: Path, tmp_path: Path) -> None:
@@ -102,11 +163,67 @@ def test_the_backup_alone_brings_the_whole_recordings_and_the_choices(labelled: 
     done = imported(backup, tmp_path / "DS")
     assert (done.recordings, done.trimmed) == (RECORDINGS, RECORDINGS - 1)
     assert sum(r.start for r in done.dataset.recordings) == 40 * sum(n > 0 for _, n in chosen.values())
-    # Without the cut recordings, a backup is no twin: the oldest one is imported.
+    # Without the cut recordings, the oldest backup is imported.
     shutil.rmtree(labelled / scripts.LABELLED)
     both = imported(labelled, tmp_path / "DS2")
     assert both.recordings == RECORDINGS
-    assert {later.name in e["file"] for e in both.left_out if "uncut" in e["reason"]} == {True}
+    assert {later.name in e["file"] for e in both.left_out if "a copy" in e["reason"]} == {True}
+
+
+def test_a_recording_moved_to_another_label_has_the_label_of_its_folder(labelled: Path, tmp_path: Path) -> None:
+    """The authors correct a label by moving the file, whose name then still says the old one."""
+    folder = labelled / scripts.LABELLED
+    moved = min(p for p in (folder / "Tail pull").glob("*.csv") if "(" not in p.name)
+    moved.rename(folder / "Tail tap 2" / moved.name)
+    done = imported(labelled, tmp_path / "DS")
+    assert {r.subject for r in done.dataset.recordings} == {"unknown"}
+    (found,) = (r for r in done.dataset.recordings if Path(r.file).name == moved.name)
+    assert (found.gesture, found.recorded) == ("Tail tap 2", "Tail pull")
+    assert sum(r.gesture == "Tail tap 2" for r in done.dataset.recordings) == 7
+    assert (
+        f"1 recording in the folder of another gesture than the name says (the first: '{moved.name}' in 'Tail tap 2'): "
+        "the folder's label is taken by a mark, as the authors' scripts read the label from the folder"
+    ) in done.notes
+    assert preview_import(labelled, layout="plush-15").gestures["Tail tap 2"] == 7
+    # A mapping names people, not labels.
+    names = [p.name for p in folder.rglob("*.csv")]
+    (tmp_path / "map.csv").write_text("file,subject\n" + "".join(f"{name},P07\n" for name in names))
+    mapped = imported(labelled, tmp_path / "MAPPED", subjects=tmp_path / "map.csv")
+    assert [r.gesture for r in mapped.dataset.recordings if Path(r.file).name == moved.name] == ["Tail tap 2"]
+    assert mapped.dataset.subjects == ["P07"]
+
+
+def test_a_correction_after_the_import_reaches_the_data_set(labelled: Path, tmp_path: Path) -> None:
+    folder = labelled / scripts.LABELLED
+    assert imported(labelled, tmp_path / "DS").recordings == RECORDINGS
+    first, other = sorted((folder / "Tail pull").glob("*.csv"))[:2]
+    for path in (first, other):
+        path.rename(folder / "Tail tap 2" / path.name)
+    relabel(open_dataset(tmp_path / "DS"), [f"unknown/{other.stem}"], "Back stroke 1", "K")
+    done = import_recordings(labelled, tmp_path / "DS", add_to=True)
+    labels = {Path(r.file).name: r.gesture for r in done.dataset.recordings}
+    assert (labels[first.name], labels[other.name]) == ("Tail tap 2", "Back stroke 1"), "a person's mark stays"
+
+
+def test_at_rest_is_nobodys_where_its_folder_says_so(labelled: Path, tmp_path: Path) -> None:
+    folder = labelled / scripts.LABELLED
+    moved = min((folder / "Tail tap 2").glob("*.csv"))
+    (folder / "At rest").mkdir()
+    moved.rename(folder / "At rest" / moved.name)
+    done = imported(labelled, tmp_path / "DS")
+    (found,) = (r for r in done.dataset.recordings if Path(r.file).name == moved.name)
+    assert (found.gesture, found.subject) == ("At rest", "none")
+    # Labels of which no gesture set is known are those of the other files.
+    for label, name in (("Shake", "Shake_1000_3"), ("Shake", "Nod_1001_3"), ("Nod", "Nod_1002_3")):
+        (tmp_path / "other" / label).mkdir(parents=True, exist_ok=True)
+        rows = "".join(f"{10 * i},{10 * i},{i},2,{int(name[-6:-2])}\n" for i in range(60))
+        (tmp_path / "other" / label / f"{name}.csv").write_text(rows)
+    done = import_recordings(tmp_path / "other", tmp_path / "OTHER", layout="accel-3")
+    assert [(r.id, r.gesture) for r in done.dataset.recordings] == [
+        ("unknown/Nod_1001_3", "Shake"),
+        ("unknown/Nod_1002_3", "Nod"),
+        ("unknown/Shake_1000_3", "Shake"),
+    ]
 
 
 def test_choices_that_come_later_are_added_but_decide_nothing_twice(labelled: Path, tmp_path: Path) -> None:
@@ -192,3 +309,41 @@ def test_recordings_at_rest_that_the_script_leaves_do_not_make_gestures_people(t
     assert (done.recordings, done.subjects, done.streams) == (RECORDINGS + 2, 0, 0)
     assert {r.subject for r in done.dataset.recordings} == {"unknown", "none"}
     assert {e["reason"] for e in done.rejected} == {"a session stream whose person is not known"}
+
+
+@pytest.mark.parametrize("integers", [15, 14])
+@pytest.mark.parametrize("truncated", [False, True])
+def test_a_simulation_is_known_after_the_scripts(tmp_path: Path, integers: int, truncated: bool) -> None:
+    """Nothing is left beside the files: the mark is in the times of the rows."""
+    root = tmp_path / "study"
+    scripts.record(root, people=1, repetitions=1, integers=integers)
+    moved = tmp_path / "elsewhere"
+    scripts.move_by_label(root)
+    if truncated:
+        scripts.truncate(root, {p.name: (0, 40) for p in (root / scripts.LABELLED).rglob("*.csv")})
+    (root / scripts.LABELLED).rename(moved)
+    done = imported(moved, tmp_path / "DS", integers)
+    assert done.dataset.head.simulated and open_dataset(tmp_path / "DS").head.simulated
+    assert "3 of 3 recordings are of a virtual toy, as the times of their rows tell" in done.notes
+    assert sum(note.startswith("these recordings are a simulation") for note in done.notes) == 1
+
+
+def test_real_recordings_have_no_such_times(tmp_path: Path) -> None:
+    root = tmp_path / "study"
+    scripts.record(root, people=1, repetitions=2)
+    scripts.move_by_label(root)
+    moved = tmp_path / "elsewhere"
+    (root / scripts.LABELLED).rename(moved)
+    virtual = min((moved / "Tail pull").glob("*.csv"))
+    virtual.rename(tmp_path / virtual.name)
+    as_if_real(moved)
+    real = imported(moved, tmp_path / "REAL")
+    assert not real.dataset.head.simulated
+    (tmp_path / virtual.name).rename(virtual)
+    done = imported(moved, tmp_path / "MIXED")
+    assert done.dataset.head.simulated
+    assert "1 of 6 recordings are of a virtual toy, as the times of their rows tell" in done.notes
+    with pytest.raises(DatasetError, match="holds recordings of a real toy, the source those of a virtual one"):
+        import_recordings(moved, tmp_path / "REAL", add_to=True)
+    assert len(open_dataset(tmp_path / "REAL").recordings) == 5
+    assert import_recordings(moved, tmp_path / "MIXED", add_to=True).added["recordings"] == 0

@@ -245,23 +245,19 @@ def test_the_real_recordings_need_nothing_but_a_window(real_data: Path, tmp_path
     for source, layout in (("makeability-gestures", "accel-3"), ("har-phone", "phone-6")):
         done = import_recordings(real_data / source, tmp_path / layout)
         assert done.dataset.layout.name == layout and f"'{layout}'" in done.notes[0]
+        assert not done.dataset.head.simulated
         assert [p["key"] for p in done.proposals] == ["window_s"]
         (sensor,) = done.sensors
         assert sensor["recognised"] == {"accel-3": "8192 counts a g", "phone-6": "m/s²"}[layout]
         assert len({s["subject"] for s in sensor["sessions"]}) == len(done.dataset.subjects)
 
 
-def test_headers_that_fit_no_layout_or_several(tmp_path: Path, cli: Callable[..., Any]) -> None:
+def test_headers_that_fit_no_layout(tmp_path: Path, cli: Callable[..., Any]) -> None:
     folder = tmp_path / "R" / "P1"
     folder.mkdir(parents=True)
     path = folder / "Wave_1700000000000_3.csv"
     path.write_text("a, b\n1, 2\n")
     with pytest.raises(ConfigError, match="--layout is needed: accepted are accel-3"):
-        import_recordings(tmp_path / "R", tmp_path / "DS")
-    layouts = [load_layout(name) for name in ("plush-14", "plush-15")]
-    path.write_text("; ".join(layouts[0].csv.header) + "\n")
-    assert layouts[0].csv.header == layouts[1].csv.header
-    with pytest.raises(ConfigError, match="fits plush-14 and plush-15"):
         import_recordings(tmp_path / "R", tmp_path / "DS")
     ran = cli("import", tmp_path / "R", tmp_path / "DS", "--add", "--adopt")
     assert ran.status == 2
@@ -279,3 +275,47 @@ def test_the_layout_is_guessed_by_what_the_files_hold(tmp_path: Path) -> None:
             path.write_text("\n".join(text) + "\n")
             assert readable_layouts([path])[0].name == first
     assert readable_layouts([tmp_path / "other.txt"]) == []
+
+
+def recorder_folder(folder: Path, integers: int, *, header: bool = True) -> Path:
+    """Write a person's folder as the authors' recorder does: its last column is the 14th integer, whatever that is."""
+    rng = np.random.default_rng(0)
+    names = load_layout("plush-15").csv.header
+    rows = [
+        [*rng.integers(0, 900, 13).tolist(), 1700000000000 + 10 * i, 5000 + 10 * i if integers == 15 else 9 + i % 3]
+        for i in range(300)
+    ]
+    rows[77] = [0] * 13 + [rows[77][13], 0]  # a line with commas
+    (folder / "Cat_M_01").mkdir(parents=True)
+    kept = rows[100:160] if integers > 13 else []
+    lines = ["; ".join(names)] * header + ["; ".join(map(str, row)) for row in kept]
+    (folder / "Cat_M_01" / f"Tail pull_1700000001600_{len(kept)}.csv").write_text("\n".join(lines) + "\n")
+    stream = rows if integers > 13 else []
+    (folder / "Cat_M_01" / "fulldatastream.csv").write_text("".join("; ".join(map(str, r)) + "\n" for r in stream))
+    return folder
+
+
+@pytest.mark.parametrize("header", [True, False])
+@pytest.mark.parametrize("integers", [15, 14])
+def test_a_folder_of_the_authors_recorder_needs_no_layout(tmp_path: Path, integers: int, header: bool) -> None:
+    done = import_recordings(recorder_folder(tmp_path / "R", integers, header=header), tmp_path / "DS")
+    assert (done.dataset.layout.name, done.recordings, done.streams) == (f"plush-{integers}", 1, 1)
+    columns = "the header of the files has its channels" if header else "the files have its 15 columns"
+    clock = "clock" if integers == 15 else "delay"
+    assert done.notes[0] == f"the layout is 'plush-{integers}', as {columns}, the last one a {clock}"
+    assert [r.stream_row for r in done.dataset.recordings] == [100]
+
+
+def test_a_toy_that_sends_no_clock_has_no_rows(tmp_path: Path, cli: Callable[..., Any]) -> None:
+    ran = cli("import", recorder_folder(tmp_path / "R", 13), tmp_path / "DS")
+    assert ran.status == 2 and len(ran.err.strip().splitlines()) == 1
+    assert "'Tail pull_1700000001600_0.csv' has a header but no row" in ran.err
+    assert ran.err.rstrip().endswith("if the toy sends fewer than 14 integers a line.")
+
+
+def test_numbers_without_a_header_are_no_recording_of_the_recorder_unless_a_column_holds_times(tmp_path: Path) -> None:
+    folder = tmp_path / "R" / "P1"
+    folder.mkdir(parents=True)
+    (folder / "Wave_1700000000000_40.csv").write_text("".join(f"{i};1;2;3;4\n" for i in range(40)))
+    with pytest.raises(ConfigError, match="--layout is needed"):
+        import_recordings(tmp_path / "R", tmp_path / "DS")

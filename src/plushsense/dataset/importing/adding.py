@@ -31,7 +31,6 @@ from plushsense.dataset.importing.build import (
     unknown_labels,
 )
 from plushsense.dataset.importing.sources import SourceScan
-from plushsense.dataset.importing.truncation import truncation_marks
 from plushsense.dataset.index import open_dataset, rebuild_index
 from plushsense.dataset.marks import MARKS, Mark, adding_locked, read_marks, write_marks
 from plushsense.dataset.privacy.forget import read_removals
@@ -124,13 +123,6 @@ def add_to_dataset(
     """
     with _locked_work_folder(dest) as work:
         dataset = open_dataset(dest)
-        if dataset.head.simulated != search.simulated:
-            kinds = ("real", "virtual") if search.simulated else ("virtual", "real")
-            raise DatasetError(
-                f"'{dest}' holds recordings of a {kinds[0]} toy, the source those of a {kinds[1]} one: keep them "
-                "apart.",
-                reason="real_and_virtual",
-            )
         copier = _copier(dataset, work)
         account = ImportedFiles(search, copier)
         own = dataset.head.gestures
@@ -138,6 +130,14 @@ def add_to_dataset(
             own = GestureSet(own.name, own.gestures + new_gestures)
         head = replace(dataset.head, gestures=own)
         built = read_copied(account, head, progress)
+        simulated = search.simulated or built.virtual > 0
+        if dataset.head.simulated != simulated and (simulated or account.kept):
+            kinds = ("real", "virtual") if simulated else ("virtual", "real")
+            raise DatasetError(
+                f"'{dest}' holds recordings of a {kinds[0]} toy, the source those of a {kinds[1]} one: keep them "
+                "apart.",
+                reason="real_and_virtual",
+            )
         if account.rejected and not account.kept and not copier.already:
             file, reason = account.rejected[0].values()
             raise DatasetError(
@@ -159,8 +159,8 @@ def add_to_dataset(
                 write_file(dest / HEAD, head.to_toml())
             marks = _new_marks(dest, account.set_aside_reasons())
             both = (*dataset.recordings, *built.dataset.recordings)
-            trims, remarks = truncation_marks(search.choices, both, account.sources, read_marks(dest))
-            write_marks(dest, marks := marks + trims)
+            trims, labels, remarks = account.marks(both, head.gestures, read_marks(dest))
+            write_marks(dest, marks := marks + trims + labels)
             if {p.subject: p for p in listed} != there:
                 write_people(dest, listed)
             # Move companions first, so that a recording in the data set always has its sidecar.

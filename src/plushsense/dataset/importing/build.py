@@ -14,11 +14,12 @@ from plushsense.core.errors import DatasetError
 from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, plural
+from plushsense.dataset.files import sha256_of
 from plushsense.dataset.importing.sources import COMPANIONS, LEFT_OUT, SourceFile, SourceScan
-from plushsense.dataset.importing.truncation import truncation_marks
+from plushsense.dataset.importing.truncation import IMPORTER, truncation_marks
 from plushsense.dataset.index import DUPLICATE_FOLDER, IndexBuild, apply_marks, build_index, write_index_files
-from plushsense.dataset.marks import Mark, append_marks, read_marks
+from plushsense.dataset.marks import Mark, MarkState, append_marks, read_marks
 from plushsense.dataset.store import (
     HEAD,
     RECORDINGS,
@@ -28,6 +29,7 @@ from plushsense.dataset.store import (
     DatasetHead,
     PersonInfo,
     Progress,
+    RecordingInfo,
     write_people,
 )
 from plushsense.recording.session_files import SESSION_LOG
@@ -117,7 +119,10 @@ class Copier:
         except OSError as cause:
             return Sentence(f"cannot be read: {cause.strerror or cause}", reason="file_unreadable")
         content = hashlib.sha256(raw).hexdigest()
-        if (existing := self.contents.get((file.kind, content))) is not None:
+        existing = self.contents.get((file.kind, content))
+        if existing is None and self.contents and file.cut is not None:
+            existing = self.contents.get((file.kind, sha256_of(file.cut)))
+        if existing is not None:
             self.already[file.source] = existing
             return ""
         folder = self._folder(file)
@@ -185,7 +190,8 @@ SIMULATED = Sentence(
 )
 NO_PEOPLE = Sentence(
     "the folders are gestures, so the people are not known: splits by subject are not possible; "
-    "import again with --subjects map.csv (columns file,subject) if a mapping exists",
+    "import again with --streams DIR if the fulldatastream.csv of each person is there, or with --subjects map.csv "
+    "(columns file,subject) if a mapping is",
     reason="people_unknown",
 )
 
@@ -294,6 +300,27 @@ class ImportedFiles:
         accounted = len(self._origin) + len(self.copier.already) + len(self.rejected) + len(self.left_out)
         assert accounted == len(self.search.found), "every source file is imported, left out or rejected"
 
+    def marks(
+        self, recordings: Iterable[RecordingInfo], gestures: GestureSet, states: Mapping[str, MarkState] | None = None
+    ) -> tuple[list[Mark], list[Mark], list[str]]:
+        """Return the trims of the truncation script, the labels of folders, and notes; decisions in ``states`` stay.
+
+        Args:
+            recordings: recordings of the data set.
+            gestures: the gesture set of the data set.
+        """
+        recordings = list(recordings)
+        trims, notes = truncation_marks(self.search.choices, recordings, self.sources, states)
+        folders = {f.source: f.gesture for f in self.search.found if f.gesture}
+        labels = []
+        for info in recordings:
+            label = folders.get(self.sources.get(info.file, Path()), "")
+            if label and not (states or {}).get(info.id, MarkState()).gesture:
+                known = gestures.find(label)
+                why = f"the file lies in the folder '{label}', though its name says '{info.recorded}'"
+                labels.append(Mark(info.id, "relabel", IMPORTER, why, gesture=known.label if known else label))
+        return trims, labels, notes
+
     def set_aside_reasons(self) -> dict[str, str]:
         """Return for each recording id, also of existing files, why the recorder discarded it ("" if it did not)."""
         places = self.copier.copied | self.copier.already
@@ -386,7 +413,13 @@ def create_dataset(
             head = replace(head, gestures=GestureSet.infer(n.label for n in names if n is not None))
         built = read_copied(account, head, progress)
         if not built.dataset.recordings:
-            reasons = [*built.unreadable.values(), *(r["reason"] for r in account.rejected), *search.notes[-1:]]
+            # What is wrong with the recordings, rather than with a stream.
+            unreadable = sorted(built.unreadable.items(), key=lambda entry: not entry[0].startswith(f"{RECORDINGS}/"))
+            reasons = [
+                *(reason for _, reason in unreadable),
+                *(r["reason"] for r in account.rejected),
+                *search.notes[-1:],
+            ]
             if not reasons:
                 message = f"'{source}' holds no finished recording yet, only a stream: record some first."
                 raise DatasetError(message, reason="import_only_stream")
@@ -396,16 +429,21 @@ def create_dataset(
                 layout=head.layout.name,
                 first=reasons[0],
             )
-        head = replace(head, gestures=extend_gestures(search.gestures, built.dataset))
+        virtual = [] if head.simulated or not built.virtual else [virtual_note(built)]
+        head = replace(
+            head,
+            gestures=extend_gestures(search.gestures, built.dataset),
+            simulated=head.simulated or built.virtual > 0,
+        )
         if {r.gesture for r in built.dataset.recordings} - set(head.gestures.labels):
             # The set merges spellings of labels: build the index again with the complete set.
             built = build_index(work, head)
         listed, notes = merge_people({}, search.people, people, {r.subject for r in built.dataset.recordings})
         if listed:
             write_people(work, listed)
-        trims, remarks = truncation_marks(search.choices, built.dataset.recordings, account.sources)
+        trims, labels, remarks = account.marks(built.dataset.recordings, head.gestures)
         marks = [Mark(i, "exclude", RECORDER, why) for i, why in account.set_aside_reasons().items() if why]
-        append_marks(work, marks + trims)
+        append_marks(work, marks + trims + labels)
         (work / HEAD).write_text(head.to_toml(), encoding="utf-8")
         infos = apply_marks(built.dataset.recordings, read_marks(work), head.gestures)
         write_index_files(Dataset(work, head, infos, built.dataset.streams))
@@ -413,7 +451,14 @@ def create_dataset(
     dataset = Dataset(dest, head, infos, built.dataset.streams)
     if search.gestures is not None and (note := unknown_labels(search.gestures, (r.gesture for r in infos))):
         notes.append(note)
-    return summarize_import(dataset, account, search.notes + notes + remarks, set(account.kept), len(trims))
+    return summarize_import(dataset, account, virtual + search.notes + notes + remarks, set(account.kept), len(trims))
+
+
+def virtual_note(built: IndexBuild) -> Sentence:
+    """Return the note that the times of recordings tell that they are simulated."""
+    of = len(built.dataset.recordings)
+    message = f"{built.virtual} of {plural(of, 'recording')} are of a virtual toy, as the times of their rows tell"
+    return Sentence(message, reason="virtual_recordings", n=built.virtual, of=of)
 
 
 def read_copied(account: ImportedFiles, head: DatasetHead, progress: Progress | None) -> IndexBuild:
@@ -427,8 +472,9 @@ def summarize_import(
     dataset: Dataset, account: ImportedFiles, notes: list[str], new: set[str], trims: int = 0
 ) -> ImportSummary:
     """Return the summary of an import that added the files ``new``, and ``trims`` of recordings."""
-    # A search by a pattern has said so.
-    unknown = account.search.shape != PATTERN and any(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings)
+    # A search by a pattern, or in streams, has said so.
+    said = account.search.shape == PATTERN or account.search.streams_named
+    unknown = not said and any(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings)
     mine = [r for r in dataset.recordings if r.file in new]
     flagged = [s for s in dataset.streams if s.file in new] + mine
     return ImportSummary(

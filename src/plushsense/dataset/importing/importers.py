@@ -16,7 +16,7 @@ from typing import Any
 from plushsense.core.errors import ConfigError, DatasetError, FileFormatError
 from plushsense.core.files import temporary_folder, work_folder, write_file
 from plushsense.core.gestures import GestureSet, load_gestures
-from plushsense.core.layouts import Layout, layout_names, load_layout
+from plushsense.core.layouts import DEVICE_MS, Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
 from plushsense.core.sentences import Sentence, plural
 from plushsense.dataset.importing.adding import add_to_dataset
@@ -40,6 +40,7 @@ from plushsense.dataset.importing.proposals import (
     matching_layouts,
     propose_settings,
     readable_layouts,
+    recorded_layouts,
 )
 from plushsense.dataset.importing.saved_windows import read_windows, windows_layout, write_windows
 from plushsense.dataset.importing.sources import (
@@ -50,6 +51,7 @@ from plushsense.dataset.importing.sources import (
     classify_session_files,
     common_layout,
     is_simulation,
+    moved_note,
     people_of,
     printable_path,
     read_mapping,
@@ -58,12 +60,14 @@ from plushsense.dataset.importing.sources import (
     source_files,
     split_regular_files,
 )
+from plushsense.dataset.importing.streams import find_people
 from plushsense.dataset.importing.tables import TableImport
-from plushsense.dataset.importing.truncation import CHOSEN, choices_of, original_of, split_backups
+from plushsense.dataset.importing.truncation import CHOSEN, REPLACED, Backups, choices_of
 from plushsense.dataset.importing.xdf import ENDINGS, is_xdf, person_and_session, read_xdf
 from plushsense.dataset.index import rebuild_index
 from plushsense.dataset.store import (
     HEAD,
+    RECORDINGS,
     UNKNOWN_SUBJECT,
     DatasetHead,
     Generation,
@@ -86,7 +90,7 @@ NO_PEOPLE_OF_PATTERN = Sentence(
 class ImportOptions:
     """Options of an import; ``layout``, ``gestures`` and ``mapping`` (file to person) may be None.
 
-    ``person`` and ``guess_layout`` are as in `import_recordings`.
+    ``person``, ``guess_layout`` and ``streams`` are as in `import_recordings`.
 
     ``layout_origin`` describes the layout in messages; ``columns`` maps roles to column names; ``new_folder`` creates
     a temporary folder for unpacked or converted files.
@@ -102,6 +106,7 @@ class ImportOptions:
     person: str | None = None
     guess_layout: bool = False
     pattern: ImportPattern | None = None
+    streams: Path | None = None
 
     def known_layout(self, own: Layout | None, files: Iterable[Path]) -> tuple[Layout, list[str]]:
         """Return the layout ``own`` of the source, else the given one, else the one that the header of a file names.
@@ -111,12 +116,18 @@ class ImportOptions:
         if (layout := own or self.layout) is not None:
             return layout, []
         files = list(files)
-        found = matching_layouts(files)
-        if self.guess_layout and len(found) != 1:
+        found, why = matching_layouts(files), "the header of the files has its channels"
+        if not found and (found := recorded_layouts(files)):
+            why = f"the files have its {len(found[0].csv.columns)} columns"
+        if len({layout.csv.columns for layout in found}) == 1 < len(found):
+            # They differ in the clock that the toy sends. Files without rows tell nothing, and are refused later.
+            found = (readable_layouts(files, [layout.name for layout in found]) or found[::-1])[:1]
+            why += f", the last one a {'clock' if DEVICE_MS in found[0].wire else 'delay'}"
+        elif self.guess_layout and len(found) != 1:
             found = readable_layouts(files, [layout.name for layout in found])[:1]
         if len(found) == 1:
             name = found[0].name
-            message = f"the layout is '{name}', as the header of the files has its channels"
+            message = f"the layout is '{name}', as {why}"
             return found[0], [Sentence(message, reason="layout_guessed", layout=name)]
         fit = f"The header of the files fits {' and '.join(layout.name for layout in found)}. " if found else ""
         raise ConfigError(
@@ -141,13 +152,17 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
     all_files = source_files(source)
     simulated = is_simulation(around or source, all_files)
     files, refused = split_regular_files(f for f in all_files if f.name != SIMULATION_MARK)
-    files, originals = split_backups(source, files)
-    choices, of_choices, unread = choices_of(source, files)
-    files = [f for f in files if f not in of_choices]
-    refused += [SourceFile(f, LEFT_OUT, reason=original_of(backup)) for f, backup in originals.items()]
+    backups = Backups.among(source, files)
+    choices, of_choices, unread = choices_of(source, backups.kept)
+    files = [f for f in backups.kept if f not in of_choices]
+    restored = {choice.name.casefold() for choice in backups.choices}
+    choices = [choice for choice in choices if choice.name.casefold() not in restored] + backups.choices
+    refused += [SourceFile(f, LEFT_OUT, reason=why) for f, why in backups.left_out.items()]
+    refused += [SourceFile(f, LEFT_OUT, reason=REPLACED) for f in backups.originals]
     refused += [SourceFile(f, "" if why else LEFT_OUT, reason=why or CHOSEN) for f, why in of_choices.items()]
     sessions = read_sessions(files)
-    layout, notes = options.known_layout(common_layout(sessions, options.layout, options.layout_origin), files)
+    own = common_layout(sessions, options.layout, options.layout_origin)
+    layout, notes = options.known_layout(own, [*files, *backups.originals.values()])
     gestures = options.known_gestures(layout)
     in_session = [f for f in files if sessions and session_of(f, sessions) is not None]
     rest = sorted(set(files) - set(in_session)) if in_session else files
@@ -164,7 +179,14 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
         + list(classify_session_files(sessions, in_session))
         + classify_files(shape, source, plain, mapping, gestures, options.person)
     )
+    classified = [
+        replace(f, source=backups.originals[f.source], cut=f.source)
+        if f.kind == RECORDINGS and f.source in backups.originals
+        else f
+        for f in classified
+    ]
     classified = [replace(f, origin=printable_path(f.source.relative_to(source))) for f in classified]
+    notes += moved_note(classified)
     people, more = people_of(sessions)
     notes += [*more, *unread]
     search = SourceScan(
@@ -393,6 +415,8 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
         raise DatasetError(f"'{source}' cannot be read: {cause.strerror or cause} ({cause.filename}).") from None
     except FileFormatError as cause:
         raise FileFormatError(f"'{source}': {cause}.", reason=cause.reason, **cause.values) from None
+    if options.streams is not None:
+        find_people(search, options.streams)
     if not any(f.kind in ("recordings", "streams") for f in search.found):
         first = next((f" The first: '{f.origin}': {f.reason.rstrip('.')}." for f in search.found if f.reason), "")
         unknown = any(getattr(f.reason, "reason", "") == "person_unknown" for f in search.found)
@@ -457,8 +481,11 @@ def _options(
     person: str | None = None,
     guess_layout: bool = False,
     pattern: ImportPattern | str | Path | None = None,
+    streams: str | Path | None = None,
 ) -> ImportOptions:
     """Load the files that options of an import name; a layout, gestures or columns override those of the pattern."""
+    if streams is not None and (str(subjects) != FOLDER or person or pattern is not None):
+        raise ConfigError("--streams tells the people of recordings: leave --subjects, --pattern and a person out.")
     if pattern is not None and not isinstance(pattern, ImportPattern):
         pattern = read_pattern(pattern)
     if pattern is not None:
@@ -475,6 +502,7 @@ def _options(
         person=person,
         guess_layout=guess_layout,
         pattern=pattern,
+        streams=None if streams is None else Path(streams),
     )
 
 
@@ -487,7 +515,8 @@ def preview_import(source: str | Path, **given: Any) -> ImportPreview:
     """Return what `import_recordings` would understand of ``source``; nothing is written.
 
     Args:
-        given: layout, gestures, subjects, columns, limits, person, guess_layout and pattern of `import_recordings`.
+        given: layout, gestures, subjects, columns, limits, person, guess_layout, pattern and streams of
+            `import_recordings`.
 
     Raises:
         DatasetError: if there is nothing to import.
@@ -532,6 +561,7 @@ def import_recordings(
     person: str | None = None,
     guess_layout: bool = False,
     pattern: ImportPattern | str | Path | None = None,
+    streams: str | Path | None = None,
 ) -> ImportSummary:
     """Create a data set at ``dest`` from recordings, or add them to an existing one.
 
@@ -555,6 +585,8 @@ def import_recordings(
             and tables without a person. "" refuses them; None takes the name of the folder where there is one.
         guess_layout: if no layout is given or stated, take the most probable built-in one that can read the files.
         pattern: description of files of other projects, or the path of its TOML file.
+        streams: folders of people, each with its ``fulldatastream.csv``, in which recordings without a known person are
+            found: they get the person and the place in the stream, which undoes their anonymisation.
 
     Returns:
         The summary. Every source file is imported (possibly with warnings), left out, or rejected with a reason.
@@ -577,14 +609,16 @@ def import_recordings(
             name=dest.name,
         )
     with _temporary_folders(dest) as new_folder:
-        options = _options(new_folder, layout, gestures, subjects, columns, limits, person, guess_layout, pattern)
+        options = _options(
+            new_folder, layout, gestures, subjects, columns, limits, person, guess_layout, pattern, streams
+        )
         known, head = options.gestures, None
         generation = Generation.of(dest)
         if add_to:
-            if adopt_proposals or name or licence or consent:
+            if adopt_proposals or name or licence or consent or streams:
                 raise ConfigError(
-                    "--add keeps the layout, name, licence and consent statement of the data set: leave --adopt, "
-                    "--name, --licence and --consent out."
+                    "--add keeps the layout, name, licence, consent statement and people of the data set: leave "
+                    "--adopt, --name, --licence, --consent and --streams out."
                 )
             head = DatasetHead.read(dest)
             _check_layout(dest, head.layout, options.layout, named=layout is not None)

@@ -58,7 +58,7 @@ def preview(search: SourceScan) -> ImportPreview:
     """Read some rows of the files that a search has found."""
     files = [f for f in search.found if f.kind in (RECORDINGS, STREAMS)]
     recordings = [f for f in files if f.kind == RECORDINGS]
-    named = {f.source: name.label for f in recordings if (name := parse_name(f.source.name)) is not None}
+    named = {f.source: f.gesture or name.label for f in recordings if (name := parse_name(f.source.name)) is not None}
     shown = _spread(recordings or files)
     rows: list[PreviewRow] = []
     frames: list[Frames] = []

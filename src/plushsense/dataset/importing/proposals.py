@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import FileFormatError, LayoutError
 from plushsense.core.layouts import ACCELERATION, DEVICE_MS, MEASURED, Layout, layout_names, load_layout
-from plushsense.core.recorder_csv import read_recording
+from plushsense.core.recorder_csv import parse_name, read_recording
 from plushsense.core.sentences import join_names
 from plushsense.dataset.quality.measurements import zeroing_limit
 from plushsense.dataset.quality.outliers import find_failed_readings
 from plushsense.dataset.store import Dataset, RecordingInfo
+from plushsense.recording.takes import duration_s
 
 DEFAULT_WINDOW_S = 2.5
 # Clocks have whole milliseconds: a faster one has rows in another unit than it says.
@@ -201,6 +202,7 @@ def matching_layouts(files: Iterable[Path]) -> list[Layout]:
 
 
 _SAMPLED_FILES, _SAMPLED_BYTES = 3, 200_000
+_SINCE_2001_MS = 978_307_200_000
 
 
 def readable_layouts(files: Iterable[Path], names: Sequence[str] = ()) -> list[Layout]:
@@ -224,6 +226,22 @@ def readable_layouts(files: Iterable[Path], names: Sequence[str] = ()) -> list[L
         if read:
             ranked.append((-read, (DEVICE_MS not in layout.wire) != (delays > 0), name))
     return [load_layout(name) for _, _, name in sorted(ranked)]
+
+
+def recorded_layouts(files: Iterable[Path]) -> list[Layout]:
+    """Return the built-in layouts that read the first recordings of the authors' recorder which have no header.
+
+    Their truncation script leaves such files. The column of the computer's time must hold times since 2001.
+    """
+    named = [path for path in files if parse_name(path.name) is not None][:_SAMPLED_FILES]
+
+    def reads(layout: Layout, path: Path) -> bool:
+        with contextlib.suppress(FileFormatError):
+            host = read_recording(path, layout).frames.host_ms
+            return host is not None and float(np.median(host)) > _SINCE_2001_MS
+        return False
+
+    return [layout for layout in map(load_layout, layout_names()) if named and all(reads(layout, f) for f in named)]
 
 
 def propose_settings(dataset: Dataset, sensors: Sequence[Sensor] | None = None) -> list[Proposal]:
@@ -485,7 +503,7 @@ def median_gesture_s(dataset: Dataset, gestures: Iterable[str] | None = None) ->
     """Return the median duration of the used recordings in seconds, of all or some gestures; None without any."""
     chosen = None if gestures is None else set(gestures)
     seconds = [
-        (r.stop - r.start) / (r.rate_hz or dataset.layout.rate_hz)
+        duration_s(r.stop - r.start, r.rate_hz or dataset.layout.rate_hz)
         for r in dataset.used
         if chosen is None or r.gesture in chosen
     ]

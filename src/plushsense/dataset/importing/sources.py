@@ -17,7 +17,7 @@ from plushsense.core.errors import BadInput, DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet, plain_label
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, STREAM_NAME, parse_name
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Sentence, plural
 from plushsense.core.toml import read_toml
 from plushsense.dataset.importing.truncation import Choice
 from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT, PersonInfo, read_csv_rows
@@ -38,6 +38,8 @@ class SourceFile:
     ``kind`` is recordings, streams, companions (copied beside another file but not read), left out (not needed), or ""
     for a refused file with its ``reason``. ``origin`` is its name in messages. ``beside`` is the file that a companion
     belongs to, None for its session's folder. ``set_aside`` is the reason why the recorder discarded the recording.
+    ``gesture`` is the label of the folder of a recording whose name has another one. ``cut`` is the file, without the
+    first rows, in whose place the recording is imported.
     """
 
     source: Path
@@ -48,13 +50,16 @@ class SourceFile:
     origin: str = ""
     beside: Path | None = None
     set_aside: str = ""
+    gesture: str = ""
+    cut: Path | None = None
 
 
 @dataclass
 class SourceScan:
     """Result of searching a source: every file once (``found``), and layout, gestures and people of its sessions.
 
-    ``choices`` are those of the authors' truncation script.
+    ``choices`` are those of the authors' truncation script. ``streams_named`` is whether streams were searched for the
+    people.
     """
 
     layout: Layout
@@ -65,6 +70,7 @@ class SourceScan:
     simulated: bool = False
     notes: list[str] = field(default_factory=list)
     choices: list[Choice] = field(default_factory=list)
+    streams_named: bool = False
 
 
 def printable_path(path: Path) -> str:
@@ -146,15 +152,37 @@ def _refusal(path: Path) -> str:
     return ""
 
 
-def _nobodys_folders(files: Iterable[Path], gestures: GestureSet | None) -> set[Path]:
+def _label_folders(labels: Mapping[Path, str], gestures: GestureSet | None) -> dict[Path, str]:
+    """Return the folders that are named like a gesture, and its label; ``labels`` are those in the names of files.
+
+    A gesture is one of the set, or a label of any file. The authors' scripts move recordings into such folders, and
+    read the label from there.
+    """
+    known = set(map(plain_label, labels.values()))
+    found: dict[Path, str] = {}
+    for place in {path.parent for path in labels}:
+        name = place.resolve().name
+        gesture = gestures.find(name) if gestures is not None else None
+        if gesture is not None or plain_label(name) in known:
+            found[place] = name if gesture is None else gesture.label
+    return found
+
+
+def _same_gesture(one: str, other: str, gestures: GestureSet | None) -> bool:
+    """Return whether two labels are of one gesture."""
+    if plain_label(one) == plain_label(other) or gestures is None:
+        return plain_label(one) == plain_label(other)
+    found = gestures.find(one)
+    return found is not None and found == gestures.find(other)
+
+
+def _nobodys_folders(labels: Mapping[Path, str], gestures: GestureSet | None) -> set[Path]:
     """Return the folders in which every recording is of a gesture without a person (the toy at rest)."""
     with_nobody: set[Path] = set()
     with_people: set[Path] = set()
-    for path in files:
-        name = parse_name(path.name)
-        if name is not None and gestures is not None:
-            gesture = gestures.find(name.label)
-            (with_nobody if gesture is not None and gesture.nobody else with_people).add(path.parent)
+    for path, label in labels.items():
+        gesture = gestures.find(label) if gestures is not None else None
+        (with_nobody if gesture is not None and gesture.nobody else with_people).add(path.parent)
     return with_nobody - with_people
 
 
@@ -213,22 +241,21 @@ def classify_gesture_recorder(
     """Classify the files in the folders of the GestureRecorder.
 
     ``subjects`` maps file names (or paths below ``source``) to people; without it the nearest folder is the person,
-    or nobody if all its recordings are of the toy at rest. A folder is a gesture, and its people are not known, if the
-    label of every recording in it is its name. ``person`` is as in `import_recordings`.
+    or nobody if all its recordings are of the toy at rest. A folder that is named like a gesture is no person: its
+    people are not known, and its label is that of all its recordings, as a label is corrected by moving the file.
+    ``person`` is as in `import_recordings`.
     """
-    labels: dict[Path, set[str]] = {}
-    for path in files if subjects is None else ():
-        if (name := parse_name(path.name)) is not None:
-            labels.setdefault(path.parent, set()).add(plain_label(name.label))
-    nobodys = _nobodys_folders(files, gestures)
-    gesture_folders = {place for place, mine in labels.items() if mine == {plain_label(place.resolve().name)}}
+    named = {path: name.label for path in files if (name := parse_name(path.name)) is not None}
+    label_folders = _label_folders(named, gestures)
+    labels = {path: label_folders.get(path.parent, label) for path, label in named.items()}
+    nobodys = _nobodys_folders(labels, gestures)
     left_behind: set[Path] = set()
-    if gesture_folders - nobodys:
+    if label_folders.keys() - nobodys:
         # Streams that the anonymising step has left behind belong to recordings that no longer name their person, and
         # the folder of all gestures is no person either.
-        left_behind = {path.parent for path in files} - (set(labels) - nobodys) | {source}
+        left_behind = {path.parent for path in files} - ({path.parent for path in named} - nobodys) | {source}
     for path in files:
-        by_label = path.parent in gesture_folders or path.parent in left_behind
+        by_label = path.parent in label_folders or path.parent in left_behind
         if subjects is not None:
             # A mapping need not list recordings of the untouched toy.
             subject = _mapped(path, source, subjects) or (NOBODY if path.parent in nobodys else None)
@@ -250,7 +277,8 @@ def classify_gesture_recorder(
         elif subject is None:
             yield SourceFile(path, "", reason=Sentence(f"not {_where(subjects)}", reason="person_unknown"))
         else:
-            yield SourceFile(path, RECORDINGS, subject)
+            moved = not _same_gesture(named[path], labels[path], gestures)
+            yield SourceFile(path, RECORDINGS, subject, gesture=labels[path] if moved else "")
 
 
 def classify_labelled_rows(
@@ -450,6 +478,19 @@ def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceF
                 "no file of a session: expected are recordings, sidecars, stream and log", reason="file_no_recording"
             )
             yield of_session("", reason=note)
+
+
+def moved_note(files: Iterable[SourceFile]) -> list[Sentence]:
+    """Return a note on recordings that get the label of their folder, and not that of their name."""
+    moved = [f for f in files if f.gesture]
+    if not moved:
+        return []
+    first = f"'{(moved[0].cut or moved[0].source).name}' in '{moved[0].gesture}'"
+    message = (
+        f"{plural(len(moved), 'recording')} in the folder of another gesture than the name says (the first: {first}): "
+        "the folder's label is taken by a mark, as the authors' scripts read the label from the folder"
+    )
+    return [Sentence(message, "moved_by_label", n=len(moved), file=first)]
 
 
 def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:

@@ -1,8 +1,8 @@
 """Read what the authors' truncation script leaves: the folder of uncut originals, and ``truncate_choices.csv``.
 
 ``c_training_data_truncation.m`` shows every recording, asks how many of its first rows to cut off, and writes the
-answers to ``truncate_choices.csv``. It then copies all recordings to ``Training Data - backup <time>`` and overwrites
-them with what remains.
+answers to ``truncate_choices.csv``. It then copies the recordings to ``Training Data - backup <time>`` and overwrites
+them with what remains; it skips those of which nothing would remain.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 
 from plushsense.core.errors import DatasetError
@@ -21,45 +21,96 @@ from plushsense.dataset.store import RecordingInfo, read_csv_rows
 
 CHOICES = "truncate_choices.csv"
 _BACKUP = re.compile(r"training data - backup \d{4}-\d\d-\d\d_\d{6}", re.IGNORECASE)
-# The author of the choices is not in the file.
-_WHO = "plushsense import"
+# The person who chose is not in the files.
+IMPORTER = "plushsense import"
 CHOSEN = Sentence("no recording: its choices become marks of the recordings", "choices_read")
 _COLUMNS = ("filename", "fullpath", "length", "truncaten")
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Answer for one recording: its file and folder, its number of rows, and how many of the first ones to cut off."""
+    """Answer for one recording: its file and folder, its number of rows, and how many of the first ones to cut off.
+
+    ``where`` tells where the answer stands.
+    """
 
     name: str
     folder: str
     rows: int
     cut: int
+    where: str = CHOICES
 
 
-def split_backups(source: Path, files: Iterable[Path]) -> tuple[list[Path], dict[Path, str]]:
-    """Split off the originals in backup folders below ``source`` of which the cut recording is among ``files`` too.
+@dataclass
+class Backups:
+    """What backup folders mean for the files of a source.
 
-    An original without that is kept as a recording; of several backups of it, the oldest is kept. The second value
-    is, by file, the name of the backup folder.
+    Attributes:
+        kept: the files to import; a cut recording stands for its original.
+        originals: the uncut original to import in place of each cut recording.
+        left_out: why other files in backup folders are not imported.
+        choices: how many rows the script has cut off, for each original.
     """
-    files = list(files)
-    backups = {path: backup for path in files if (backup := _backup_of(path, source))}
-    present = {path.name.casefold() for path in files if path not in backups and parse_name(path.name)}
-    kept, originals = [path for path in files if path not in backups], {}
-    for path in sorted(backups, key=lambda p: (backups[p], p)):
-        if path.name.casefold() in present:
-            originals[path] = backups[path]
-            continue
-        kept.append(path)
-        if parse_name(path.name):
-            present.add(path.name.casefold())
-    return sorted(kept), originals
+
+    kept: list[Path]
+    originals: dict[Path, Path] = field(default_factory=dict)
+    left_out: dict[Path, Sentence] = field(default_factory=dict)
+    choices: list[Choice] = field(default_factory=list)
+
+    @classmethod
+    def among(cls, source: Path, files: Iterable[Path]) -> Backups:
+        """Match the recordings in backup folders below ``source`` with the cut ones among ``files``, by name.
+
+        Of several backups of a recording, the oldest is its original. One without a cut recording is kept as it is.
+        """
+        files = list(files)
+        folders = {path: folder for path in files if (folder := _backup_of(path, source))}
+        found = cls([path for path in files if path not in folders])
+        present: dict[str, list[Path]] = {}
+        for path in found.kept:
+            if parse_name(path.name):
+                present.setdefault(path.name.casefold(), []).append(path)
+        for path in sorted(folders, key=lambda p: (folders[p], p)):
+            named = present.get(path.name.casefold(), [])
+            cut = next((p for p in named if p.parent.name == path.parent.name), named[0] if named else None)
+            if cut is None:
+                found.kept.append(path)
+                if parse_name(path.name):
+                    present[path.name.casefold()] = [path]
+            elif cut in folders or cut in found.originals or (counts := _rows_before(cut, path)) is None:
+                found.left_out[path] = _copy_of(folders[path])
+            else:
+                found.originals[cut] = path
+                where = f"the cut copy in '{cut.parent.name}'"
+                found.choices.append(Choice(path.name, path.parent.name, counts[0], counts[1], where))
+        found.kept.sort()
+        return found
 
 
 def _backup_of(path: Path, source: Path) -> str:
     """Return the name of the backup folder below ``source`` that contains a file; "" if there is none."""
     return next((part for part in path.relative_to(source).parts[:-1] if _BACKUP.fullmatch(part)), "")
+
+
+def _rows_before(cut: Path, original: Path) -> tuple[int, int] | None:
+    """Return the rows of ``original``, and how many of them come before those of ``cut``; None if it is no part."""
+    (rows, whole), (kept, part) = _ends(original, 0), _ends(cut, 0)
+    before = rows - kept
+    if part is None or before < 0 or whole is None or whole[1] != part[1]:
+        return None
+    first = _ends(original, before)[1]
+    return (rows, before) if first is not None and first[0] == part[0] else None
+
+
+def _ends(path: Path, start: int) -> tuple[int, tuple[list[float], list[float]] | None]:
+    """Return the number of rows of a recording, and its row ``start`` and last row; None if they are not numbers."""
+    try:
+        lines = [line for line in path.read_bytes().splitlines() if line.strip()]
+        rows = lines[bool(lines) and any(c.isalpha() for c in lines[0].decode("latin-1")) :]
+        row, last = ([float(cell) for cell in rows[at].split(b";")] for at in (start, -1))
+    except (OSError, ValueError, IndexError):
+        return 0, None
+    return len(rows), (row, last)
 
 
 def read_choices(path: Path) -> list[Choice]:
@@ -90,7 +141,7 @@ def read_choices(path: Path) -> list[Choice]:
                 "from 0 on, or NaN."
             ) from None
         # The script ran on another computer, whose paths may have backslashes.
-        choices.append(Choice(name, PureWindowsPath(full).parent.name, *(int(number) for number in numbers)))
+        choices.append(Choice(name, PureWindowsPath(full).parent.name, int(numbers[0]), int(numbers[1])))
     return choices
 
 
@@ -123,34 +174,35 @@ def truncation_marks(
             continue
         choice = mine[-1]
         if choice.cut >= choice.rows:
-            results["cut off everything, which the script skips too: left out"] += 1
+            results["would leave nothing, so that recordings stay whole, as the script leaves them"] += 1
         elif info.rows == choice.rows:
-            why = f"{CHOICES}: the first {choice.cut} of {choice.rows} rows cut off"
-            marks.append(Mark(info.id, "trim", _WHO, why, start=choice.cut, how=BY_HAND))
+            why = f"{choice.where}: the first {choice.cut} of {choice.rows} rows cut off"
+            marks.append(Mark(info.id, "trim", IMPORTER, why, start=choice.cut, how=BY_HAND))
             results["trim their recordings by a mark"] += 1
         elif info.rows == choice.rows - choice.cut:
-            why = f"{CHOICES}: the first {choice.cut} of {choice.rows} rows were cut off before the import"
-            marks.append(Mark(info.id, "trim", _WHO, why, how=BY_HAND))
+            why = f"{choice.where}: the first {choice.cut} of {choice.rows} rows were cut off before the import"
+            marks.append(Mark(info.id, "trim", IMPORTER, why, how=BY_HAND))
             results["were carried out before the import"] += 1
         else:
-            results["do not fit, because the recording has another number of rows: left out"] += 1
+            results["do not fit, because the recording has another number of rows: no mark"] += 1
+    here = {path.name.casefold() for path in origin.values()}
+    if absent := sum(name not in here for name in by_name):
+        results["are of recordings that are not in the source (a backup lacks those that the script skipped)"] = absent
     return marks, list(_notes(results))
 
 
 def _notes(results: Mapping[str, int]) -> Iterator[str]:
     if results:
         parts = "; ".join(f"{count} {result}" for result, count in results.items())
-        yield f"choices of {CHOICES}, how many rows to cut off at the beginning: {parts}"
+        yield f"cuts of the truncation script, how many rows to cut off at the beginning: {parts}"
 
 
-def original_of(backup: str) -> Sentence:
+def _copy_of(backup: str) -> Sentence:
     """Return why a recording in the folder ``backup`` is left out."""
-    return Sentence(
-        f"the uncut original, in '{backup}', of a recording that is imported: import that folder alone to have all its "
-        "rows",
-        "uncut_original",
-        folder=backup,
-    )
+    return Sentence(f"a copy, in '{backup}', of a recording that is imported", "backup_copy", folder=backup)
+
+
+REPLACED = Sentence("cut by the truncation script: its uncut original is imported, and the cut is a mark", "cut_copy")
 
 
 def choices_of(source: Path, files: Iterable[Path]) -> tuple[list[Choice], dict[Path, Sentence | None], list[Sentence]]:

@@ -209,14 +209,6 @@ def usual_rows(recordings: Iterable[tuple[str, int]]) -> dict[str, float]:
     return {gesture: float(np.median(ns)) for gesture, ns in rows.items()}
 
 
-def duration_s(frames: Frames) -> float:
-    """Return the duration of a recording by the device clock; each reset or leap counts as one period."""
-    steps = np.diff(frames.device_ms)
-    good = (steps >= 0) & (steps <= 5000)
-    period = float(np.median(steps[good])) if good.any() else 0.0
-    return (float(steps[good].sum()) + period * int((~good).sum())) / 1000.0
-
-
 LEVEL_KINDS = ("capacitive", "proximity")
 """Kinds of channels whose level shows touch; the level of other kinds also changes as the toy is turned."""
 NEAR_ZERO = 10
@@ -320,7 +312,7 @@ def summarize(info: RecordingInfo | StreamInfo, frames: Frames, layout: Layout) 
     return RecordingSummary(
         info,
         t,
-        duration_s(frames),
+        info.seconds,
         mean_ms,
         hop,
         np.zeros((0, c), np.float32) if stream else _activity(values.astype(np.float64), hop, level),

@@ -12,11 +12,11 @@ from plushsense.dataset.quality.findings import CheckLimits, Issue, Severity
 from plushsense.dataset.quality.measurements import (
     NEVER_STOPPED_FACTOR,
     Examination,
-    duration_s,
     in_order,
     rows_at_one_time,
 )
 from plushsense.devices.base import LossCounter
+from plushsense.recording.takes import duration_s, measured_rate_hz
 
 _FEW = 0.01
 # A spike is an error at so many times the usual, and a value outside a valid range at so many times the range.
@@ -65,7 +65,7 @@ def never_stopped(s: Examination) -> Iterator[Issue]:
 
 def too_short(s: Examination) -> Iterator[Issue]:
     rows = len(s.frames)
-    seconds = duration_s(s.frames) * rows / max(1, rows - 1)
+    seconds = duration_s(rows, measured_rate_hz(s.frames.device_ms))
     # A clock that stands still gives no duration.
     if seconds < s.limits.short_s and not rows_at_one_time(s.frames.device_ms):
         message = f"holds {_plural(rows, 'row')} ({seconds:.2f} s): too short for a gesture"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import ACCELERATION
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
+from plushsense.recording.takes import duration_s
 from plushsense.scoring.comparison import average_ranks
 
 TRAITS = {
@@ -110,7 +111,7 @@ def _measured(dataset: Dataset, recording: RecordingInfo, axes: list[int]) -> Fl
     layout = dataset.layout
     frames = dataset.read(recording)
     values = np.clip(frames.values, layout.valid_min_int, layout.valid_max_int) - layout.zero_int
-    seconds = len(values) / (recording.rate_hz or layout.rate_hz)
+    seconds = duration_s(len(values), recording.rate_hz or layout.rate_hz)
     strength = float(np.log(values.std(axis=0) + 1).mean())
     return np.array([seconds, np.exp(strength), *values[:, axes].mean(axis=0)])
 

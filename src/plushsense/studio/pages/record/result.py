@@ -19,6 +19,7 @@ from plushsense.dataset.quality.comparisons import usual_seconds
 from plushsense.dataset.quality.findings import CheckLimits
 from plushsense.recording.session_files import SIDECAR, discarded_recordings
 from plushsense.recording.status import RecorderStatus
+from plushsense.recording.takes import duration_s
 from plushsense.reports.quality_figures import line
 from plushsense.studio.app.shell import Page, html, tag
 from plushsense.studio.app.words import Words
@@ -72,9 +73,8 @@ def measure_result(session: ActiveSession, file: str, recordings: Path) -> Recor
 
 
 def _seconds(table: dict[str, Any]) -> float:
-    """Return the length of a recording by the toy's clock, from its sidecar."""
-    first_ms, last_ms = table["device_ms"]
-    return (int(last_ms) - int(first_ms)) / 1000.0
+    """Return the duration of a recording, from its sidecar."""
+    return duration_s(int(table["rows"]), float(table["rate_hz"]))
 
 
 def _earlier_seconds(recordings: Path, path: Path, table: dict[str, Any]) -> Iterator[float]:

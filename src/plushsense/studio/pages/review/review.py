@@ -192,12 +192,11 @@ class Review:
             return self._rows
 
     def _row(self, info: RecordingInfo, findings: tuple[Finding, ...]) -> ReviewedRecording:
-        suggestion, shape = self.prepared.suggestions.get(info.id), self.prepared.shapes.get(info.id)
-        seconds = shape.seconds if shape is not None else info.rows / info.rate_hz if info.rate_hz > 0 else 0.0
+        suggestion = self.prepared.suggestions.get(info.id)
         return ReviewedRecording(
             info,
             self._state(info, suggestion),
-            seconds,
+            info.whole_seconds,
             findings,
             suggestion.onset_confidence if suggestion is not None else 0.0,
             self._affects.get(info.gesture, "none"),
