@@ -1,10 +1,11 @@
 """Compute the results of the paper from its published archive, and print them beside the paper's.
 
-    python examples/paper.py ARCHIVE [--subjects map.csv] [--out DIR] [--seeds 3] [--quick]
+    python examples/paper.py ARCHIVE [--streams DIR | --subjects map.csv] [--out DIR] [--seeds 3] [--quick]
 
 ARCHIVE is the folder that the authors' scripts write: one folder for each gesture, with files
-<label>_<7 digits>_<rows>.csv. The file names do not contain the person, so the results over people need a mapping (CSV:
-file,subject), if the authors have one. An interrupted run is resumed by the same command.
+<label>_<7 digits>_<rows>.csv. The file names do not contain the person, so the results over people need the folders of
+people in which the scripts leave their streams ("Training Data"), or a mapping (CSV: file,subject). An interrupted run
+is resumed by the same command.
 
 This program is untested on the original, because the archive was not available to this project. It was tested on an
 archive of the same form with virtual people.
@@ -20,12 +21,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import plushsense as ps
 from plushsense.core.errors import PlushSenseError
 from plushsense.experiments.baselines.run import baselines
 from plushsense.experiments.baselines.score import UNSCALED, Pca, reads
+from plushsense.experiments.sweep.report import training_settings
+from plushsense.experiments.sweep.results import read_sweep
 from plushsense.experiments.sweep.run import sweep
 from plushsense.experiments.sweep.tables import TABLE4
+from plushsense.scoring.splits import make_folds, parse_split
 from plushsense.trials.grid import CHOSEN
 from plushsense.windows.cut import WindowSpec
 
@@ -34,6 +40,13 @@ LEAKY = "leaky: windows of one recording are in both the training and the test s
 
 # The grids of the authors' scripts and of the paper's text, each with its split.
 GRIDS = {"scripts": "as the authors' scripts train and divide", "paper": f"as the text says: random windows, {LEAKY}"}
+
+# What a later version of the authors' d_data_preparation.m printed on the real data: the recordings of each class in
+# class order, those to train, validate and test, and the rows of ten recordings at rest.
+COUNTS = (51, 72, 73, 73, 75, 74, 74, 73, 74, 73, 75, 72, 72, 73, 74, 74, 74, 75)
+DIVIDED = "912 / 194 / 195"
+AT_REST_ROWS = "666, 543, 328, 572, 503, 590, 568, 530, 551, 492"
+OUTPUTS = "outputs of their scripts"
 
 # Section 4.4: the chosen network, leave one subject out over 25 people; mean and standard deviation over the folds.
 LOSO = {"accuracy": (0.850, 0.072), "macro_recall": (0.717, 0.111), "macro_f1": (0.687, 0.114)}
@@ -86,30 +99,51 @@ def seeds_text(seeds: int) -> str:
 class Paper:
     """The data set at ``out/DS``, with one method for each part of the table."""
 
-    def __init__(self, archive: Path, subjects: Path | None, out: Path, seeds: int, quick: bool) -> None:
+    def __init__(
+        self, archive: Path, subjects: Path | None, out: Path, seeds: int, quick: bool, streams: Path | None = None
+    ) -> None:
         self.out, self.seeds, self.quick = out, seeds, quick
+        self.settings: dict[str, str] = {}
         folder = out / "DS"
+        options = {"subjects": subjects, "streams": streams}
+        given: dict[str, Any] = {key: path for key, path in options.items() if path is not None}
         if not (folder / "dataset.toml").is_file():
-            given: dict[str, Any] = {} if subjects is None else {"subjects": subjects}
             done = ps.import_recordings(archive, folder, layout="plush-15", name="the paper's archive", **given)
             for entry in done.rejected:
                 say(f"rejected: {entry['file']}: {entry['reason']}")
         else:
             say(f"using the data set '{folder}' that an earlier run imported")
         self.dataset = ps.open_dataset(folder)
-        if subjects is not None and not self.dataset.subjects:
+        if given and not self.dataset.subjects:
             raise PlushSenseError(
-                f"'{folder}' was imported without people: give another --out to import with --subjects."
+                f"'{folder}' was imported without people: give another --out to import with --{next(iter(given))}."
             )
         self.simulated = self.dataset.head.simulated
 
     def data(self) -> list[Row]:
         windows = ps.cut_windows(self.dataset, WindowSpec(context="rows"))
         people = str(len(self.dataset.subjects)) if self.dataset.subjects else "not known"
+        recordings = self.dataset.used
+        classes = self.dataset.gestures
+        label = np.array([classes.index(r.gesture) for r in recordings])
+        names, nobody = np.array([r.id for r in recordings]), np.full(len(recordings), "none")
+        (fold,) = make_folds(parse_split("recordings:holdout"), nobody, label, names=names)
+        at_rest = [str(r.rows) for r in recordings if r.gesture == "At rest"]
+        share = float(np.mean(windows.y == windows.labels.index("At rest"))) if at_rest else 0.0
+        divided = " / ".join(str(len(part)) for part in (fold.train, fold.validation, fold.test))
+        counts = [
+            Row("data", f"recordings of {name} ({OUTPUTS})", str(count), str(int((label == at).sum())))
+            for at, (name, count) in enumerate(zip(classes.labels, COUNTS, strict=True))
+        ]
         return [
-            Row("data", "recordings", "1326", str(len(self.dataset.recordings))),
+            Row("data", "recordings", "1326", str(len(recordings))),
+            Row("data", f"recordings ({OUTPUTS})", str(sum(COUNTS)), str(len(recordings))),
+            *counts,
+            Row("data", f"recordings to train, validate and test ({OUTPUTS})", DIVIDED, divided),
+            Row("data", f"rows of ten recordings at rest ({OUTPUTS})", AT_REST_ROWS, ", ".join(at_rest[:10])),
             Row("data", "people", "25", people),
             Row("data", "windows of 2.5 s, step 0.5 s, looped", "5621", str(len(windows))),
+            Row("data", f"windows at rest ({OUTPUTS})", "5.6 %", f"{100 * share:.1f} %"),
         ]
 
     def search(self) -> list[Row]:
@@ -136,6 +170,10 @@ class Paper:
             seeds=tuple(range(self.seeds)),
             out=self.out / "sweeps" / f"{symbol}-{self.seeds}-{grid}{'-quick' * self.quick}",
         )
+        results = read_sweep(swept.out)
+        described = [("Split", swept.summary["split"]), ("Context", swept.summary["context"])]
+        described += [("Padding", swept.trials["padding"][0]), *training_settings(results)]
+        self.settings[grid] = "; ".join(f"{key.lower()}: {value}" for key, value in described)
         tested = swept.runs["test_windows"][0]
         rows = []
         for trial in swept.trials.iter_rows(named=True):
@@ -153,7 +191,7 @@ class Paper:
 
     def loso(self) -> list[Row]:
         if len(self.dataset.subjects) < 3:
-            need = "needs --subjects map.csv"
+            need = "needs --streams or --subjects"
             return [Row("loso", f"{m}, leave one person out", f"{a:.3f} ± {s:.3f}", need) for m, (a, s) in LOSO.items()]
         runs = [self._one_out(seed) for seed in range(self.seeds)]
         n = f"{seeds_text(self.seeds)}, {len(self.dataset.subjects)} people"
@@ -225,6 +263,7 @@ def remarks(paper: Paper) -> list[str]:
     out = [UNTESTED]
     if paper.simulated:
         out.insert(0, "SIMULATION: these recordings are of virtual people; the results say nothing about a real toy.")
+    out += [f"The grid “{grid}” as resolved: {text}." for grid, text in paper.settings.items()]
     if paper.quick:
         out.append("--quick: two epochs per training, to test the program; do not compare these results.")
     out += [
@@ -275,13 +314,14 @@ def main(words: list[str] | None = None) -> int:
         description="Compute the results of the paper from its published archive, and print them beside the paper's."
     )
     parser.add_argument("archive", type=Path, help="folder of the archive, with one folder for each gesture")
+    parser.add_argument("--streams", type=Path, metavar="DIR", help="folders of people with their streams")
     parser.add_argument("--subjects", type=Path, metavar="CSV", help="person of each file: columns file,subject")
     parser.add_argument("--out", type=Path, default=Path("paper-out"), help="folder for the data set and the table")
     parser.add_argument("--seeds", type=int, default=1, help="number of trainings of each network (1)")
     parser.add_argument("--quick", action="store_true", help="two epochs and one network, to test the program")
     args = parser.parse_args(words)
     try:
-        paper = Paper(args.archive, args.subjects, args.out, max(1, args.seeds), args.quick)
+        paper = Paper(args.archive, args.subjects, args.out, max(1, args.seeds), args.quick, args.streams)
         rows: list[Row] = []
         parts: list[Callable[[], list[Row]]] = [paper.data, paper.loso, paper.search, paper.baselines]
         for part in parts:

@@ -127,6 +127,7 @@ def run_all() -> None:
         patch.setattr("plushsense.deploy.proof.verify.settings_of", lambda name: [Setting(name, "gcc", "-O2")])
         patch.setattr(serve, "run", lambda *given, **options: served.append(given))
         make_archive(Path("made").absolute()).rename("ARCHIVE")
+        Path("made", "sessions").rename("Training Data")
         for command in commands():
             status, said = run(command)
             if status not in STATUS.get(shlex.split(command)[1], (0,)):

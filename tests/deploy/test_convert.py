@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from plushsense.core.errors import ArchError, BadInput, BundleError, ConfigError
 from plushsense.core.gestures import load_gestures
 from plushsense.core.layouts import Derived, load_layout
 from plushsense.core.recorder_csv import read_stream
+from plushsense.dataset.importing.matfile import read_mat, texts_of
 from plushsense.deploy.convert import ConversionJob, compared, convert, describe, made_up_windows
 from plushsense.deploy.convert import onnx as as_onnx
 from plushsense.deploy.convert import tflite as as_tflite
@@ -204,7 +206,7 @@ def test_a_vector_layer_is_written_to_onnx_only(layout: str, tmp_path: Path, onn
     found = as_onnx.run_model(convert(bundle, tmp_path / "n", "onnx-int8").path.read_bytes(), values(bundle, raw))
     expected = integer_network(bundle).forward(raw) / 256
     assert found is not None and np.abs(found - expected).max() < 0.01 * max(1.0, np.abs(expected).max())
-    for name in ("tflite", "tflite-int8"):
+    for name in ("tflite", "tflite-int8", "matlab"):
         with pytest.raises(ArchError, match="begins with a vector layer, which PlushSense does not write to"):
             convert(bundle, tmp_path / "o", name)
 
@@ -437,3 +439,40 @@ def test_int8_refuses_what_has_no_whole_numbers(name: str, tmp_path: Path) -> No
     with pytest.raises(ArchError, match="padding 'causal'"):
         convert(made(NETS[-2]), tmp_path / "m", name)
     assert not list(tmp_path.iterdir())
+
+
+def forward_in_matlab(file: Path, window: Any) -> Any:
+    """The probabilities (K,) that layers of MATLAB with the properties in ``file`` give for a window (T, C)."""
+    parts = read_mat(file, file.name)
+    z = (window - parts["input"]["Mean"].T) / parts["input"]["StandardDeviation"].T
+    for i in itertools.count(1):
+        if f"convolution{i}" not in parts:
+            break
+        layer = parts[f"convolution{i}"]
+        weights, dilation = layer["Weights"].astype(float), int(layer["DilationFactor"].item())
+        past = (len(weights) - 1) * dilation
+        if layer.get("Padding") == ["causal"]:
+            mirrored = layer["PaddingValue"] == ["symmetric-exclude-edge"]
+            z = np.pad(z, ((past, 0), (0, 0)), mode="reflect" if mirrored else "constant")
+        taps = [z[k * dilation : len(z) - past + k * dilation] @ of for k, of in enumerate(weights)]
+        z = np.maximum(np.sum(taps, axis=0) + layer["Bias"], 0)
+        for kind in ("layer", "batch"):
+            norm = parts.get(f"{kind}norm{i}")
+            if norm is not None:
+                mean = z.mean(axis=1, keepdims=True) if kind == "layer" else norm["TrainedMean"].T
+                var = z.var(axis=1, keepdims=True) if kind == "layer" else norm["TrainedVariance"].T
+                z = (z - mean) / np.sqrt(var + norm["Epsilon"]) * norm["Scale"].T + norm["Offset"].T
+    logits = parts["fc"]["Weights"] @ z.mean(axis=0)[:, None] + parts["fc"]["Bias"]
+    return softmax(logits.T)[0]
+
+
+@pytest.mark.parametrize("net", NETS, ids=str)
+def test_weights_for_matlab_give_the_answers_of_the_network(net: Any, tmp_path: Path) -> None:
+    pytest.importorskip("scipy")
+    bundle = made(net)
+    done = convert(bundle, tmp_path / "model.mat", "matlab")
+    raw = others(bundle, 4)
+    found = [forward_in_matlab(done.path, window.T) for window in values(bundle, raw)]
+    np.testing.assert_allclose(found, bundle.network().probabilities(bundle.scaler.apply(raw)), atol=1e-5)
+    assert convert(bundle, tmp_path / "again.mat", "matlab").path.read_bytes() == done.path.read_bytes()
+    assert texts_of(read_mat(done.path, "model.mat")["c"]) == list(bundle.gestures.labels)

@@ -94,3 +94,17 @@ def test_rows_of_a_sensor_that_calibrates_itself_are_refused(labelled: Dataset) 
     changed = labelled.with_inputs(layout)
     with pytest.raises(ConfigError, match="calibrates its sensors"):
         ps.cut_windows(changed, WindowSpec(context="rows"))
+
+
+def test_their_option_1_is_the_first_window_of_each_recording(authors_run: Path, labelled: Dataset) -> None:
+    theirs = np.load(authors_run / "outputs.npz")
+    first = np.unique(theirs["source"], return_index=True)[1]
+    cut = ps.cut_windows(labelled, WindowSpec(context="rows", step_s=60))
+    names = [name.rpartition("/")[2].removesuffix(".csv") for name in theirs["files"].tolist()]
+    mine = [cut.recording_ids[at].rpartition("/")[2] for at in cut.recording]
+    assert sorted(mine) == sorted(names), "one window of each"
+    order = [mine.index(name) for name in names]
+    assert np.array_equal(cut.x[order].transpose(0, 2, 1)[:, :, :10], theirs["windows"][first][:, :, :10])
+    (fold,) = fold_windows(cut, cut, parse_split("recordings:holdout"))
+    for part in ("train", "validation", "test"):
+        assert sorted(order[k] for k in theirs[f"recordings_{part}"].tolist()) == getattr(fold, part).tolist()

@@ -93,6 +93,17 @@ def test_the_table_is_made_and_goes_on_where_it_stood(
     assert {(row["simulated"], row["quick"]) for row in rows} == {("yes", "yes")}
     by_what = {row["what"]: row for row in rows}
     assert (by_what["recordings"]["paper"], by_what["recordings"]["ours"]) == ("1326", "21")
+    assert by_what["recordings of Tail tap 2 (outputs of their scripts)"]["paper"] == "75"
+    assert by_what["recordings to train, validate and test (outputs of their scripts)"]["ours"] == "14 / 4 / 3"
+    resolved = [line for line in said.splitlines() if line.startswith("The grid “scripts” as resolved")]
+    assert len(resolved) == 1
+    for setting in (
+        "split: windows:file-order",
+        "padding: mirror",
+        "weight decay 0.0001",
+        "scaling of the inputs: none",
+    ):
+        assert setting in resolved[0]
     mean = by_what["macro-F1, mean over the people, with recordings at rest"]
     without = by_what["macro-F1, mean over the people, without recordings at rest"]
     assert mean["paper"] == without["paper"] and mean["ours"] != without["ours"]
@@ -142,6 +153,6 @@ def test_without_a_mapping_the_people_are_asked_for(
     made: Path, script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert script.main([str(made / "archive"), "--out", str(tmp_path), "--quick"]) == 0
-    assert "needs --subjects map.csv" in capsys.readouterr().out
+    assert "needs --streams or --subjects" in capsys.readouterr().out
     assert script.main([str(made / "nowhere"), "--out", str(tmp_path / "x")]) == 2
     assert "There is no " in capsys.readouterr().err

@@ -220,7 +220,7 @@ def evaluate(
     Args:
         train_windows, score_windows: the same recordings, possibly cut with another context; one set for both is fine.
         split: "leave-one-subject-out", "by-subject:5", "by-recording:5", "windows:5",
-            "recordings:holdout", "recordings:random", "windows:holdout", "windows:file-order".
+            "recordings:holdout", "recordings:random", "windows:holdout", "windows:file-order", "saved".
         journal: where finished folds are stored, and looked up first.
         key: with a journal, everything that ``fit_predict`` depends on besides windows and folds (network, schedule,
             its seed).

@@ -1,8 +1,9 @@
 """Split recordings, or windows, into training, validation and test sets.
 
 A unit is a recording, or a window in splits of windows. Those are leaky: overlapping windows of one recording can be in
-training and test. A split by subject keeps the people of test, validation (which decides when training stops) and
-training apart. Units of nobody (subject "none": the toy at rest) are spread over the folds.
+training and test. So are the sets in which an imported file held its windows (`SAVED`). A split by subject keeps the
+people of test, validation (which decides when training stops) and training apart. Units of nobody (subject "none": the
+toy at rest) are spread over the folds.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from plushsense.core.errors import ArrayError, BadInput, ConfigError, nearest
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import parse_name
+from plushsense.dataset.importing.saved_windows import SETS, sets_of_session
 
 Index = NDArray[np.int64]
 
@@ -67,7 +69,7 @@ class Split:
     @property
     def leaky(self) -> bool:
         """Whether overlapping windows of one recording can be in both training and test."""
-        return self.kind == "windows"
+        return self.kind in ("windows", SAVED)
 
     @property
     def unit(self) -> str:
@@ -80,6 +82,8 @@ class Split:
         return self.kind in ("leave-one-subject-out", "by-subject")
 
 
+SAVED = "saved"
+SAVED_SETS = tuple(name for name, *_ in SETS)
 _FILES, _RANDOM = "files", "random"
 _HOLDOUTS = {
     "recordings:holdout": Split("recordings", order=_FILES),
@@ -93,6 +97,7 @@ EXAMPLES = (
     "by-recording:5",
     "windows:5",
     *_HOLDOUTS,
+    SAVED,
 )
 
 
@@ -103,7 +108,7 @@ def parse_split(text: str) -> Split:
         ConfigError: for an unknown name, with the accepted forms and the nearest of them.
     """
     kind, colon, number = text.strip().partition(":")
-    if kind == "leave-one-subject-out" and not colon:
+    if kind in ("leave-one-subject-out", SAVED) and not colon:
         return Split(kind)
     if text.strip() in _HOLDOUTS:
         return _HOLDOUTS[text.strip()]
@@ -124,10 +129,11 @@ def make_folds(
 
     Args:
         names: the recording of each unit (n,), for splits in the order of the files (see `file_order`); by default the
-            order of the units.
+            order of the units. For the split `SAVED`, those of an imported file.
 
     Raises:
-        BadInput: if there are too few people or units for the split, or, when splitting by people, unknown ones.
+        BadInput: if there are too few people or units for the split, or, when splitting by people, unknown ones; for
+            `SAVED`, if the recordings name no sets.
     """
     if len(subject) != len(label):
         raise BadInput(f"A split needs one class for each unit: got {len(subject)} people and {len(label)} classes.")
@@ -141,6 +147,8 @@ def make_folds(
         return by_recording(subject, label, split.k or 5, seed)
     if split.k is not None:
         return windows(subject, label, split.k, seed)
+    if split.kind == SAVED:
+        return [_saved(subject, np.full(len(label), "") if names is None else names)]
     _enough(len(label), 3, split.text, f"{split.unit}s")
     if split.order == _FILES:
         ranks, name = (np.arange(len(label)), "holdout") if names is None else file_order(names, seed)
@@ -250,6 +258,35 @@ def _random_holdout(subject: NDArray[np.str_], label: Index, seed: int = 0) -> F
     rest = np.setdiff1d(everything, test)
     validation = _stratified_share(rest, label, VALIDATION_SHARE / (1.0 - HOLDOUT_SHARE), rng)
     return Fold("holdout", _named(subject[test]), np.setdiff1d(rest, validation), validation, test)
+
+
+def _saved(subject: NDArray[np.str_], names: NDArray[Any]) -> Fold:
+    """Return the sets in which the file that was imported held the windows, according to their sessions."""
+    found = np.full(len(names), "", dtype="<U10")
+    for name in np.unique(names).tolist():
+        mine = np.flatnonzero(names == name)
+        sets = sets_of_session(str(name).split("/")[-2:][0], len(mine))
+        if not sets:
+            raise BadInput(
+                f"The split {SAVED} takes the sets of a file of windows, and '{name}' is in none: import a .mat file "
+                f"with traindata, valdata and testdata, or use {', '.join(_HOLDOUTS)}.",
+                reason="no_saved_sets",
+                recording=str(name),
+            )
+        if len(sets) != len(mine):
+            raise BadInput(
+                f"'{name}' has {len(mine)} windows, but {len(sets)} in the file that was imported: cut windows of the "
+                "same length and step (2.5 s, 0.5 s) in the context rows, without trims.",
+                reason="saved_sets_differ",
+                recording=str(name),
+                n=len(mine),
+                of=len(sets),
+            )
+        found[mine] = sets
+    train, validation, test = (np.flatnonzero(found == one) for one in SAVED_SETS)
+    for part, one in ((train, SAVED_SETS[0]), (test, SAVED_SETS[2])):
+        _enough(len(part), 1, f"{SAVED}, set '{one}',", "windows")
+    return Fold(SAVED, _named(subject[test]), train, validation, test)
 
 
 def file_order(names: NDArray[Any], seed: int = 0) -> tuple[Index, str]:

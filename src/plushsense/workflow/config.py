@@ -97,7 +97,8 @@ class EvaluationSpec:
     Attributes:
         split: which recordings are scored and which are learned from: ``leave-one-subject-out``, ``by-subject:5`` (by
             people), ``by-recording:5``, ``recordings:holdout``, ``recordings:random``; leaky, as in the paper:
-            ``windows:5``, ``windows:holdout``, ``windows:file-order``. The numbers are those of the folds.
+            ``windows:5``, ``windows:holdout``, ``windows:file-order``, ``saved`` (the sets of an imported .mat). The
+            numbers are those of the folds.
         classes: ``shared`` (gestures that at least 90 % of the people made, without free choice), ``all``, a list of
             labels, or merged gestures: ``family``, ``affect``, the name of a built-in merge or the path of a gesture
             set file.

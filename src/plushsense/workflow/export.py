@@ -1,4 +1,4 @@
-"""Calibrate a bundle on its training data, and export it, or a patch of an export."""
+"""Calibrate a bundle on its training data, and export it, or a patch of an export; save windows for MATLAB."""
 
 from __future__ import annotations
 
@@ -11,21 +11,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ArchError, BadInput, BundleError, python_warning
+from plushsense.core.errors import ArchError, BadInput, BundleError, ConfigError, python_warning
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
 from plushsense.core.sentences import Sentence, plural
+from plushsense.dataset.importing.saved_windows import SETS, SIMULATED
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.deploy.convert import CONVERTERS, check_format, convert
+from plushsense.deploy.convert.matlab import cells, mat_bytes
 from plushsense.deploy.emit import IMAGE, ExportResult, check_model_version, check_name, check_page, emit, read_facts
 from plushsense.deploy.package import package
 from plushsense.deploy.quantize import calibrated, integer_model, refuse_undeployable
+from plushsense.evaluation.crossval import fold_windows
 from plushsense.models.bundle import Bundle, is_training_content
 from plushsense.runtime.image import image_check, patch_bytes
+from plushsense.scoring.splits import parse_split
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
-from plushsense.workflow.preparation import WHOLE_PEOPLE, Warn, silent, windows_for
+from plushsense.windows.features import InputUnits
+from plushsense.workflow.config import RunConfig, from_settings
+from plushsense.workflow.preparation import (
+    WHOLE_PEOPLE,
+    Warn,
+    classes_for,
+    network_inputs_of,
+    silent,
+    windows_for,
+)
 
 _TRIED = 512  # maximum of windows on which a conversion is compared with the network
 
@@ -181,6 +194,78 @@ def _with_step(bundle: Bundle, step_s: float) -> Bundle:
     if not 0.0 < step_s <= 60.0:
         raise ArchError(f"The step is {step_s:g} s: accepted are more than 0, and at most the window of the network.")
     return replace(bundle, arch=replace(arch, step=bundle.layout.samples(step_s)))
+
+
+@dataclass(frozen=True)
+class SavedWindows:
+    """Result of `save_windows`: the file, its size, and the number of windows in each set."""
+
+    path: Path
+    bytes: int
+    windows: dict[str, int]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the object that ``plushsense evaluate --save-windows --json`` prints."""
+        return {"file": str(self.path), "bytes": self.bytes, "windows": self.windows}
+
+
+def save_windows(
+    dataset: Dataset | str | os.PathLike[str],
+    path: str | os.PathLike[str],
+    config: RunConfig | None = None,
+    *,
+    split: str | None = None,
+    warn: Warn = python_warning,
+    **settings: Any,
+) -> SavedWindows:
+    """Write the windows that `api.evaluate` would score, with their labels and sets, as a MATLAB file.
+
+    The variables are those of the authors' ``plush_train_data_5621.mat``: cell arrays ``traindata``, ``valdata`` and
+    ``testdata`` of windows (T, C) in the units of the layout, ``trainlabels`` and so on, and the classes ``c``; beside
+    them ``trainrecordings`` and so on (ids, which begin with the person), and ``simulated``.
+
+    Args:
+        config, settings: as for `api.evaluate`.
+        split: a split with one fold, such as "windows:file-order" or "recordings:holdout".
+
+    Raises:
+        ConfigError: for a split with several folds, or a file that does not end in .mat.
+        BadInput: for a split that cannot be made, or a file that cannot be written.
+        MissingExtraError: if SciPy is not installed.
+    """
+    path = Path(path)
+    dataset, config = network_inputs_of(as_dataset(dataset), config or from_settings(**settings))
+    division = parse_split(split or config.evaluation.split)
+    if path.suffix != ".mat":
+        raise ConfigError(f"'{path}' is no name of a MATLAB file: give one that ends in .mat.")
+    gestures = classes_for(dataset, config.evaluation.classes, config.scored_on.context, warn)
+    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
+    windows = windows_for(dataset, network, config.scored_on, gestures, warn)
+    folds = fold_windows(windows, windows, division, config.evaluation.seed)
+    if len(folds) > 1:
+        raise ConfigError(
+            f"The split '{division.text}' has {len(folds)} folds, and a file of windows one: give windows:file-order, "
+            "windows:holdout, recordings:holdout, recordings:random or saved."
+        )
+    values = InputUnits.of(dataset.layout).values(windows.x).astype(np.float64)
+    variables: dict[str, Any] = {"c": cells(windows.labels), SIMULATED: dataset.head.simulated}
+    sizes = {}
+    for name, data, labels in SETS:
+        mine = getattr(folds[0], name)
+        sizes[name] = len(mine)
+        if len(mine):
+            variables[data] = cells([values[at].T for at in mine])
+            variables[labels] = cells([windows.labels[windows.y[at]] for at in mine])
+            ids = [windows.recording_ids[windows.recording[at]] for at in mine]
+            variables[labels.replace("labels", "recordings")] = cells(ids)
+    content = mat_bytes(variables)
+    try:
+        with dataset.generation.writing():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_file(path, content)
+    except OSError as cause:
+        raise BadInput(f"'{path}' cannot be written ({cause}): choose another path.") from None
+    return SavedWindows(path, len(content), sizes)
 
 
 @dataclass(frozen=True)

@@ -350,6 +350,7 @@ def scan_windows(path: Path, options: ImportOptions) -> SourceScan:
     sets = read_windows(path, path.name)
     layout = windows_layout(sets[0].windows[0].shape[1], options.layout, path.name)
     search = _scan_of_file(path, WINDOWS, options, layout)
+    search.simulated = search.simulated or sets[0].simulated
     person = (options.mapping or {}).get(path.name)
     _add(write_windows(path, path.name, options.new_folder("converted"), person, search.layout, sets), search)
     return search

@@ -8,6 +8,7 @@ was filled by repeating a short recording is cut back to it.
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,6 +39,7 @@ SETS = (
     ("test", "testdata", "testlabels"),
 )
 _WHOLE = (("", "sigdatapad", "labelspad"), ("", "sigdata", "labels"))
+SIMULATED = "simulated"
 # Names of the classes, if labels are numbers.
 _CATEGORIES = "c"
 # A window repeats its beginning if so many rows or more are equal.
@@ -49,21 +51,24 @@ _APART_MS = 10_000
 
 @dataclass(frozen=True)
 class LabelledWindows:
-    """Windows (T, C) and the label of each, in the order of the file; ``name`` is the set, "" if there is only one."""
+    """Windows (T, C) and the label of each, in the order of the file; ``name`` is the set, "" if there is only one.
+
+    ``simulated``: the file says that they are of virtual people (as `plushsense.workflow.export.save_windows` does).
+    """
 
     name: str
     windows: Sequence[Windows]
     labels: Sequence[str]
+    simulated: bool = False
 
 
 @dataclass(frozen=True)
 class JoinedRecording:
-    """Recording (T, C) restored from ``windows`` windows, the first of which is in ``sets[0]`` and the last in [-1]."""
+    """Recording (T, C) restored from windows; ``sets`` has the set of each."""
 
     label: str
     values: Windows
     sets: tuple[str, ...]
-    windows: int
 
 
 def windows_layout(channels: int, given: Layout | None, display_name: str) -> Layout:
@@ -132,7 +137,7 @@ def read_windows(path: Path, display_name: str) -> list[LabelledWindows]:
             )
         if len(texts) != len(windows):
             raise FileFormatError(f"'{display_name}' has {len(windows)} windows in '{data}' but {len(texts)} labels")
-        found.append(LabelledWindows(name, windows, texts))
+        found.append(LabelledWindows(name, windows, texts, bool(np.any(values.get(SIMULATED)))))
     widths = {w.shape[1] for s in found for w in s.windows}
     if len(widths) != 1:
         listed = ", ".join(str(w) for w in sorted(widths))
@@ -169,20 +174,43 @@ def _labels(value: Any, categories: Any) -> list[str] | None:
 
 
 def join_windows(sets: Sequence[LabelledWindows]) -> list[JoinedRecording]:
-    """Join the windows of each label that follow one another and overlap, also from one set to the next."""
+    """Join the windows of each label that follow one another by the step of the file, also from one set to the next.
+
+    Others stay apart, even if they overlap: cut again with this step, each recording gives the windows it is made of.
+    """
     by_label: dict[str, list[tuple[Windows, str]]] = {}
     for s in sets:
         for window, label in zip(s.windows, s.labels, strict=True):
             by_label.setdefault(label, []).append((window, s.name))
     joined = []
+    shifts_of = {k: [_shift(a, b) for (a, _), (b, _) in itertools.pairwise(found)] for k, found in by_label.items()}
+    counts = Counter(shift for shifts in shifts_of.values() for shift in shifts if shift)
+    step = max(counts, key=counts.__getitem__, default=0)
     for label, found in by_label.items():
-        shifts = [0, *(_shift(a, b) for (a, _), (b, _) in itertools.pairwise(found)), 0]
-        for first, last in itertools.pairwise([i for i, shift in enumerate(shifts) if not shift]):
+        shifts = [0, *shifts_of[label], 0]
+        for first, last in itertools.pairwise([i for i, shift in enumerate(shifts) if not shift or shift != step]):
             pieces = [found[i][0][: shifts[i + 1]] for i in range(first, last - 1)] + [found[last - 1][0]]
             values = np.concatenate(pieces) if len(pieces) > 1 else _without_repetition(pieces[0])
-            names = tuple(dict.fromkeys(name for _, name in found[first:last]))
-            joined.append(JoinedRecording(label, values, names, last - first))
+            joined.append(JoinedRecording(label, values, tuple(name for _, name in found[first:last])))
     return joined
+
+
+def _session(sets: Sequence[str]) -> str:
+    """Return the session of a recording with windows of these sets: their name, "train", or "train 5 validation 2"."""
+    runs = [(name, len(list(of))) for name, of in itertools.groupby(sets)]
+    return runs[0][0] if len(runs) == 1 else " ".join(f"{name} {n}" for name, n in runs)
+
+
+def sets_of_session(session: str, windows: int) -> list[str]:
+    """Return the set of each of the ``windows`` of a recording, as many as it had in the file; [] if it was in none."""
+    names, counts = session.split()[::2], session.split()[1::2]
+    if not names or not set(names) <= {name for name, *_ in SETS}:
+        return []
+    if not counts:
+        return names * windows if len(names) == 1 else []
+    if len(counts) != len(names) or not all(n.isascii() and n.isdigit() and len(n) < 7 for n in counts):
+        return []
+    return [name for name, n in zip(names, counts, strict=True) for _ in range(int(n))]
 
 
 def _shift(one: Windows, other: Windows) -> int:
@@ -214,18 +242,18 @@ def write_windows(
 ) -> Iterator[SourceFile | str]:
     """Write the recordings that windows are joined to into the new ``folder``; yield the files, and notes as text.
 
-    The session of a recording is the set of its first window. Times are those of the layout's rate.
+    The session of a recording is the set of its windows (see `_session`). Times are those of the layout's rate.
 
     Raises:
         FileFormatError: if no window can be used.
     """
     recordings = join_windows(sets)
     total = sum(len(s.windows) for s in sets)
-    several = sum(len(r.sets) > 1 for r in recordings)
+    several = sum(len(set(r.sets)) > 1 for r in recordings)
     yield (
         f"{display_name}: {total} windows joined to {len(recordings)} recordings, by the rows that they share; up to "
         "one step of rows at the end of each is lost"
-        + (f"; recordings with windows in two sets, so that scores on these sets leak: {several}" if several else "")
+        + (f"; recordings with windows in two sets, so that the split saved leaks: {several}" if several else "")
     )
     good = [r for r in recordings if r.label and len(r.label) <= LONGEST_LABEL and usable_rows(r.values).all()]
     if not good:
@@ -235,13 +263,13 @@ def write_windows(
             f"{display_name}: {len(recordings) - len(good)} recordings without a label, or with a value that is no "
             "number, left out"
         )
-    by_set: dict[str, list[JoinedRecording]] = {}
+    by_session: dict[str, list[JoinedRecording]] = {}
     for r in good:
-        by_set.setdefault(r.sets[0], []).append(r)
+        by_session.setdefault(_session(r.sets), []).append(r)
     counts: Mapping[str, int] = {s.name or "all": len(s.windows) for s in sets}
     original = ConvertedSource(path, display_name, {"windows": counts})
     begin = 0
-    for number, (name, mine) in enumerate(by_set.items()):
+    for number, (name, mine) in enumerate(by_session.items()):
         ends = np.cumsum([len(r.values) for r in mine]).tolist()
         cuts = [LabelledSegment(r.label, end - len(r.values), end) for r, end in zip(mine, ends, strict=True)]
         values, note = whole_steps(np.concatenate([r.values for r in mine]), layout)

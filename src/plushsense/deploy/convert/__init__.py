@@ -81,6 +81,7 @@ CONVERTERS: dict[str, Format] = {
     "onnx-int8": Format("model.int8.onnx", "ONNX, int8 with QuantizeLinear", "onnx:to_integer_onnx"),
     "tflite": Format("model.tflite", "LiteRT, floats", "tflite:to_tflite"),
     "tflite-int8": Format("model.int8.tflite", "LiteRT, int8 convolutions", "tflite:to_integer_tflite"),
+    "matlab": Format("model.mat", "MATLAB, weights in the shapes of its layers", "matlab:to_matlab"),
 }
 
 

@@ -370,7 +370,7 @@ def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
         ("Windows scored", count(scored) if scored else DASH),
         ("Context", wording.CONTEXT_WORDS.get(str(head.get("context")), text(head.get("context")))),
         ("Training preset", text(head.get("preset"))),
-        *_settings(sweep),
+        *training_settings(sweep),
         ("Padding", ", ".join(sorted({str(t.get("padding")) for t in sweep.trials})) or DASH),
         ("Grid", f"{grid} (the paper's has {tables.PAPER_TRIALS} trials)"),
         ("Seeds and folds", wording.describe_runs(sweep.trials)),
@@ -385,7 +385,7 @@ def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
     ]
 
 
-def _settings(sweep: SweepResults) -> list[tuple[str, str]]:
+def training_settings(sweep: SweepResults) -> list[tuple[str, str]]:
     """Return the settings of the networks and their training, with those of the preset filled in."""
     grid = sweep.head.get("grid") or {}
     preset = PRESETS.get(str(sweep.head.get("preset")))

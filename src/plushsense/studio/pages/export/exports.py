@@ -23,6 +23,7 @@ from plushsense.studio.app.workspace import EXPORTS, Workspace
 _NEEDS = {
     "onnx": ("onnx", ("onnx", "onnxruntime")),
     "tflite": ("tflite", ("ai_edge_litert", "flatbuffers")),
+    "matlab": ("matlab", ("scipy",)),
 }
 """The extra and the modules that an export format needs, by the first word of the format's name."""
 
