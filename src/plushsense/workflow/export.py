@@ -29,7 +29,6 @@ from plushsense.runtime.image import image_check, patch_bytes
 from plushsense.scoring.splits import parse_split
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
-from plushsense.windows.features import InputUnits
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.preparation import (
     WHOLE_PEOPLE,
@@ -247,7 +246,7 @@ def save_windows(
             f"The split '{division.text}' has {len(folds)} folds, and a file of windows one: give windows:file-order, "
             "windows:holdout, recordings:holdout, recordings:random or saved."
         )
-    values = InputUnits.of(dataset.layout).values(windows.x).astype(np.float64)
+    values = windows.x.astype(np.float64)
     variables: dict[str, Any] = {"c": cells(windows.labels), SIMULATED: dataset.head.simulated}
     sizes = {}
     for name, data, labels in SETS:
