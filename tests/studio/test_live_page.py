@@ -19,7 +19,6 @@ import pytest
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import read_recording
 from plushsense.dataset.index import open_dataset
-from plushsense.live.feedback import read_corrections
 from plushsense.recording.plan import load_protocol
 from plushsense.recording.session import OpenSession
 from plushsense.recording.session_files import SessionHead
@@ -420,81 +419,44 @@ def record_simulated(folder: Path) -> None:
     shutil.rmtree(folder.parent / "made")
 
 
-def test_an_event_is_marked_as_wrong_and_the_network_improved(
+def test_the_network_is_adapted_to_recordings_of_the_person(
     studio: Fixture, look: Fixture, shots: Fixture, home: Path
 ) -> None:
-    little = home / "bundles" / "little.plush"
-    before, file = little.read_bytes(), home / "feedback" / "S07.jsonl"
-    browser = look()
-    page = live(browser, studio("--device", "virtual://?person=2", "--speed", "4", home=home).url)
-    assert marked(page, "wrong").is_disabled()
-    marked(page, "start").click()
-    page.wait_for_function("!document.querySelector('[data-test=wrong]').disabled")
-    # The last event can be marked after the toy was stopped, too.
-    marked(page, "stop").click()
-    situation(page, "stopped")
-    assert axe(page) == []
-    listed = marked(page, "events").locator("li[data-gesture]:not([data-gesture=''])").first
-    gesture, begin = listed.locator("b").inner_text(), listed.locator("span").first.inner_text()
-    marked(page, "wrong-event").get_by_text(f"Last event: {gesture} at {begin}").wait_for()
-    wrong = page.get_by_role("button", name="That was wrong")
-    wrong.click()
-    page.get_by_role("alert").get_by_text("First enter the code of the person").wait_for()
-    page.wait_for_function("document.activeElement.dataset.test === 'wrong-person'")
-    page.keyboard.type("S07")
-    right = next(g for g in ("Tail pull", "Ear scratch 1") if g != gesture)
-    choose(page, "It really was", right)
-    # By keys, as a person would who cannot use a mouse.
-    wrong.focus()
-    page.keyboard.press("Enter")
-    told = f"Marked: {gesture} at {begin} was really {right}. Marks of S07: 1."
-    marked(page, "message").get_by_text(told).wait_for()
-    (kept,) = read_corrections(file)
-    assert (kept.subject, kept.gesture, kept.right) == ("S07", gesture, right)
-    assert 0.0 < kept.begun_s <= 8.0 and len(kept.frames) > 100
-    page.wait_for_function("document.querySelector('[data-test=wrong]').disabled")
-    marked(page, "marks-undo").click()
-    marked(page, "message").get_by_text("The last mark was removed. Marks of S07: 0.").wait_for()
-    assert not file.exists()
-    page.wait_for_function("document.querySelector('[data-test=improve]').disabled")
-    wrong.click()
-    marked(page, "message").get_by_text(f"Marked: {gesture} at {begin} was wrong. Marks of S07: 1.").wait_for()
-    shots(page, "live-marked")
-    marked(page, "improve").click()
-    marked(page, "message").get_by_text("Now in use for S07: little-for-S07.").wait_for()
-    marked(page, "message").get_by_text("The probability of a wrong answer falls from").wait_for()
-    marked(page, "bundle").get_by_text("little-for-S07").wait_for()
-    assert axe(page) == []
-    assert no_sideways(page)
-    shots(page, "live-improved")
-    for dark, size in ((True, TABLET), (False, DESK)):
-        other = look(size, dark, "lv", touch=size == TABLET)
-        second = live(other, page.url.removesuffix("/live"))
-        marked(second, "wrong-person").fill("S07")
-        marked(second, "marks").get_by_text("S07 atzīmes: 1").wait_for()
-        marked(second, "marks-undo").focus()
-        assert axe(second) == []
-        assert no_sideways(second)
-        shots(second, f"live-marked-lv-{'dark' if dark else 'light'}")
-        assert other.complaints == []
-        second.close()
-    assert little.read_bytes() == before
     import plushsense as ps
 
-    assert ps.load(home / "bundles" / "little-for-S07.plush").adapted_to == "S07"
-    # The former network again, by its name; it is adapted to recordings of the person, and that is undone.
-    choose(page, "Network", "little")
+    little = home / "bundles" / "little.plush"
+    before = little.read_bytes()
     record_simulated(home / "recordings" / "S08" / "1")
-    marked(page, "wrong-person").fill("S08")
+    browser = look()
+    page = live(browser, studio("--device", "virtual://?person=2", "--speed", "4", home=home).url)
+    assert marked(page, "adapt").is_disabled(), "no person is named"
+    marked(page, "start").click()
+    situation(page, *READING)
+    marked(page, "stop").click()
+    situation(page, "stopped")
+    marked(page, "adapt-person").fill("S08")
     page.wait_for_function("!document.querySelector('[data-test=adapt]').disabled")
     marked(page, "adapt").click()
     message = marked(page, "now").locator('[data-test="message"]')
     message.get_by_text("Now in use for S08: little-for-S08.").wait_for()
     assert "recordings, each left out once, it reads" in message.inner_text()
     marked(page, "bundle").get_by_text("little-for-S08").wait_for()
+    assert axe(page) == []
+    assert no_sideways(page)
+    shots(page, "live-adapted")
+    for dark, size in ((True, TABLET), (False, DESK)):
+        other = look(size, dark, "lv", touch=size == TABLET)
+        second = live(other, page.url.removesuffix("/live"))
+        marked(second, "adapt-person").fill("S08")
+        assert axe(second) == []
+        assert no_sideways(second)
+        shots(second, f"live-adapted-lv-{'dark' if dark else 'light'}")
+        assert other.complaints == []
+        second.close()
     message.get_by_role("button", name="Undo").click()
     message.get_by_text("The network little is in use again.").wait_for()
     assert ps.load(home / "bundles" / "little-for-S08.plush").adapted_to == "S08"
+    assert little.read_bytes() == before
     marked(page, "start").click()
     situation(page, *READING)
     assert browser.complaints == []

@@ -80,7 +80,7 @@ EXHAUSTIVE = {
     "studio/test_live_page.py::test_a_new_person_is_led_through_the_validation",
     "studio/test_live_page.py::test_a_toy_that_goes_away_and_comes_back",
     "studio/test_live_page.py::test_a_toy_that_goes_away_while_the_page_is_behind",
-    "studio/test_live_page.py::test_an_event_is_marked_as_wrong_and_the_network_improved",
+    "studio/test_live_page.py::test_the_network_is_adapted_to_recordings_of_the_person",
     "studio/test_live_page.py::test_another_bundle_while_it_runs_and_one_that_does_not_fit",
     "studio/test_live_page.py::test_it_reads_well_in_any_light_and_language[en-dark-desk]",
     "studio/test_live_page.py::test_it_reads_well_in_any_light_and_language[lv-dark-tablet]",

@@ -17,8 +17,8 @@ from plushsense.core.gestures import GestureSet
 from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.store import DatasetHead
 from plushsense.studio.app.shell import LINES, Page, button, html, moment, named, on_change, section, tag
+from plushsense.studio.pages.live.adapting_page import PersonFields
 from plushsense.studio.pages.live.clips import Clip, Clips
-from plushsense.studio.pages.live.feedback_page import PersonFields
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.widgets.elements import Plot
 

@@ -16,7 +16,7 @@ from plushsense.recording.recorder import is_virtual
 from plushsense.studio.app.shell import Page, button, named, on_change, query, query_path, tag
 from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.workspace import VIRTUAL, Workspace
-from plushsense.studio.pages.live import clips_page, feedback_page, validation_page
+from plushsense.studio.pages.live import adapting_page, clips_page, validation_page
 from plushsense.studio.pages.live.clips import Clips
 from plushsense.studio.pages.live.feed import PACE_S, PLOT_HZ, RATES_HZ, Feed, LiveView, follow
 from plushsense.studio.pages.live.log import LogButtons
@@ -44,10 +44,10 @@ def show(page: Page) -> None:
 
     on_change(reader.changed, update_mark)
     update_mark()
-    view, people = LiveView(words, feed), feedback_page.PersonFields(page, reader)
+    view, people = LiveView(words, feed), adapting_page.PersonFields(page, reader)
     with view:
         _person_panel(page, reader)
-        feedback_page.show(page, reader, people)
+        adapting_page.show(page, people)
     with view.add_slot("log"):
         log = LogButtons(page, reader)
     follow(view, feed, reader)
