@@ -13,18 +13,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from plushsense.core.layouts import load_layout
-from plushsense.core.recorder_csv import read_recording
-from plushsense.dataset.index import open_dataset
 from plushsense.recording.plan import load_protocol
 from plushsense.recording.session import OpenSession
 from plushsense.recording.session_files import SessionHead
-from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.live.clips import Clips
-from support.browsing import DESK, TABLET, Look, Studio, axe, connected, marked
+from support.browsing import DESK, TABLET, Look, axe, connected, marked
 from support.bundles import OTHER, odd_bundle
 
 Fixture = Callable[..., Any]
@@ -316,94 +311,6 @@ def test_two_tabs_and_a_reload_show_the_present(studio: Fixture, look: Fixture, 
         situation(tab, "stopped")
         marked(tab, "start").wait_for()
     assert browser.complaints == []
-
-
-def test_a_hard_case_is_kept_labelled_and_in_the_data_set(
-    studio: Fixture, look: Fixture, shots: Fixture, home: Path
-) -> None:
-    url = studio(*VIRTUAL, home=home).url
-    browser = look()
-    page = started(browser, url)
-    page.wait_for_function("() => window.plushsenseLive.samples > 1000")
-    marked(page, "keep").click()
-    page.get_by_role("alert").get_by_text("First enter the code of the person").wait_for()
-    page.wait_for_function("document.activeElement.dataset.test === 'person'")
-    page.keyboard.type("Anna")
-    marked(page, "keep").click()
-    page.get_by_role("alert").get_by_text("Anna").wait_for()
-    marked(page, "person").fill("S77")
-    marked(page, "keep").click()
-    page.get_by_role("button", name="Open S77/live-1").click()
-    over = marked(page, "clip-plot").locator(".u-over")
-    over.wait_for()
-    over.scroll_into_view_if_needed()
-    rows = Clips(Workspace(home)).rows(Clips(Workspace(home)).get("S77/live-1"))
-    seconds = (rows.device_ms - rows.device_ms[0]) / 1000.0
-    box = over.bounding_box()
-    for share in (0.3, 0.7):
-        over.click(position={"x": share * box["width"], "y": box["height"] / 2})
-    fields = [marked(page, name) for name in ("clip-from", "clip-to")]
-    pixel_s = seconds[-1] / box["width"]
-    page.wait_for_function(
-        "(most) => parseFloat(document.querySelector('[data-test=clip-to]').value) < most", arg=0.8 * seconds[-1]
-    )
-    for field, share in zip(fields, (0.3, 0.7), strict=True):
-        assert float(field.input_value()) == pytest.approx(share * seconds[-1], abs=pixel_s + 0.011)
-    # And by keys: the end one second on.
-    to = round(float(fields[1].input_value()) + 1.0, 2)
-    fields[1].fill(str(to))
-    fields[1].press("Tab")
-    begin, end = (float(f.input_value()) for f in fields)
-    first, last = (int(np.abs(seconds - s).argmin()) for s in (begin, end))
-    marked(page, "clip-rows").get_by_text(f"{last + 1 - first} samples").wait_for()
-    marked(page, "clip-label").click()
-    marked(page, "message").get_by_text("First choose the gesture").wait_for()
-    gesture = page.get_by_role("combobox", name="Gesture (choose, or type a new one and press Enter)")
-    gesture.click()
-    page.get_by_role("option", name="Tail hit 1", exact=True).click()
-    page.locator(".q-menu").wait_for(state="detached")
-    marked(page, "clip-label").click()
-    marked(page, "message").get_by_text("Tail hit 1: saved as").wait_for()
-    assert axe(page) == []
-    shots(page, "live-clip")
-    marked(page, "clip-add").click()
-    marked(page, "message").get_by_text("1 new recordings").wait_for()
-    marked(page, "clip-S77/live-1").get_by_text("in the data sets virtual").wait_for()
-    there = open_dataset(home / "datasets" / "virtual")
-    (made,) = [r for r in there.recordings if r.subject == "S77"]
-    assert (made.gesture, made.session, made.rows) == ("Tail hit 1", "live-1", last + 1 - first)
-    cut = read_recording(there.path / made.file, there.layout).frames
-    assert np.array_equal(cut.values, rows.values[first : last + 1])
-    assert np.array_equal(cut.device_ms, rows.device_ms[first : last + 1])
-    assert browser.complaints == []
-
-
-def test_the_server_is_killed_while_a_clip_is_recorded(studio: Fixture, look: Fixture, home: Path) -> None:
-    server: Studio = studio(*VIRTUAL, home=home)
-    page = started(look(), server.url)
-    marked(page, "person").fill("S05")
-    marked(page, "record").click()
-    marked(page, "record-end").wait_for()
-    stream = home / "recordings" / "S05" / "live-1" / "fulldatastream.csv"
-    before = look_at(page)["samples"]
-    page.wait_for_function("(n) => window.plushsenseLive.samples > n + 600", arg=before)
-    server.kill()
-    left = stream.read_bytes()
-    # Half a second of the computer's clock is a second of this toy; a busy disk may be slower.
-    assert left.count(b"\n") >= 350
-    server.start()
-    page = live(look(), server.url)
-    marked(page, "clip-S05/live-1").get_by_text("no label yet").wait_for()
-    page.get_by_role("button", name="Open S05/live-1").click()
-    gesture = page.get_by_role("combobox", name="Gesture (choose, or type a new one and press Enter)")
-    gesture.fill("my own")
-    gesture.press("Enter")
-    marked(page, "clip-label").click()
-    marked(page, "message").get_by_text("my own: saved as").wait_for()
-    whole = left[: left.rfind(b"\n") + 1]
-    assert stream.read_bytes() == whole, "at most a torn last line is gone"
-    (made,) = stream.parent.glob("my own_*.csv")
-    assert made.read_bytes().count(b"\n") == whole.count(b"\n") + 1
 
 
 def record_simulated(folder: Path) -> None:

@@ -14,8 +14,8 @@ from plushsense.core.errors import BadInput, PlushSenseError
 from plushsense.recording.session import check_subject
 from plushsense.studio.app.shell import Page, button, named, on_change, tag
 from plushsense.studio.pages.live.adapting import Adapting, Improved
-from plushsense.studio.pages.live.clips import Clips
 from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.validation import Validation
 
 
 def show(page: Page, people: PersonFields) -> None:
@@ -81,7 +81,7 @@ class _AdaptingPanel:
         # Messages are displayed here, because the top of the page may be out of view.
         self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))
         on_change(self._adapting.changed, self._update)
-        on_change(page.workspace.part(Clips).changed, self._update)
+        on_change(page.workspace.part(Validation).changed, self._update)
         self._update()
 
     async def _run(self) -> None:
