@@ -9,7 +9,6 @@
 #   make fuzz    hostile bundles, layouts, lines and models for the C, for some hours (FUZZ=10: some minutes)
 #   make soak    24 hours of toy time through recorder, live and C; an hour of the studio; long fault drills (about a day)
 #   make coverage   branch coverage of the base packages (tests of them, of deploy and of the command line; half an hour)
-#   make mutants    one change at each of MUTANTS=200 random lines: which does no test find? (uses the data of the former)
 #   make check   formatting, lint, types, layers, rules of the code base
 #   make docs    write docs/reference anew from the code, and build the documentation as a site, in build/site
 #   make dist    wheel, source archive and list of components (SBOM), in dist; the wheel is tried in an empty environment
@@ -29,7 +28,7 @@ INSTALL = $(BIN)/uv pip install --quiet --python $(BIN)/python -c constraints.tx
 # Tests start hundreds of processes, each of which would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-studio test-deploy test-training test-other test-exhaustive test-quick fuzz check docs dist setup collect soak coverage mutants install bench clean
+.PHONY: demo test test-studio test-deploy test-training test-other test-exhaustive test-quick fuzz check docs dist setup collect soak coverage install bench clean
 
 $(VENV)/.python:
 	@$(PYTHON) -c "import sys; sys.exit(0 if sys.version_info >= (3, 11) else 'PlushSense needs Python 3.11 or newer, this is ' + sys.version.split()[0] + ': run  make PYTHON=/path/to/python3.11 ...')"
@@ -107,23 +106,13 @@ soak: $(VENV)/.dev
 
 BASE := core devices recording dataset windows models runtime live tuning scoring
 COVERED := $(addprefix tests/,$(BASE) deploy cli test_formats.py test_reference.py)
-SECONDS := build/coverage/seconds.json
-# Without xdist, so that each line is counted for the test that ran it. A test that fails (some measure time) does not end it.
-$(SECONDS): $(VENV)/.dev
+# A test that fails (some measure time) does not end it.
+coverage: $(VENV)/.dev
 	rm -rf build/coverage
 	mkdir -p build/coverage
-	-TEST_SECONDS=$@ $(BIN)/python -m coverage run -m pytest $(UNLIMITED) -p no:xdist -p support.contexts $(COVERED)
+	-$(BIN)/python -m coverage run -m pytest $(UNLIMITED) -p no:xdist $(COVERED)
 	$(BIN)/python -m coverage combine -q
-
-coverage:
-	rm -f $(SECONDS)
-	$(MAKE) $(SECONDS)
 	$(BIN)/python -m coverage report
-
-MUTANTS ?= 200
-SEED ?= 1
-mutants: $(SECONDS)
-	$(BIN)/python .ci/mutation.py --mutants $(MUTANTS) --seed $(SEED)
 
 check: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -89,18 +89,6 @@ NOT_RUN = {
         "the folder of a sweep that trained",
         "tests/cli/test_paper_page.py::test_every_command_runs",
     ),
-    "plushsense feedback model.plush SESSION --wrong": (
-        "a network that reports events",
-        "tests/cli/test_adapt.py::test_events_marked_as_wrong_correct_the_bundle",
-    ),
-    "plushsense adapt model.plush --feedback": (
-        "corrections of events",
-        "tests/cli/test_adapt.py::test_events_marked_as_wrong_correct_the_bundle",
-    ),
-    "plushsense adapt model.plush RECORDINGS --feedback": (
-        "corrections of events",
-        "tests/cli/test_adapt.py::test_events_marked_as_wrong_correct_the_bundle",
-    ),
     "plushsense toy --tcp": (
         "it serves until Ctrl-C",
         "tests/cli/test_live.py::test_over_tcp",
@@ -325,7 +313,7 @@ def run(command: str) -> tuple[int, str]:
     for pattern, stand_in in STAND_INS.items():
         words = shlex.split(re.sub(pattern, stand_in, shlex.join(words)))
     known = parser_of(words[0])._option_string_actions
-    small = {"--epochs": "!1"} if "--epochs" in known and not {"--model", "--undo", "--feedback"} & {*words} else {}
+    small = {"--epochs": "!1"} if "--epochs" in known and not {"--model", "--undo"} & {*words} else {}
     small |= {"--workers": "!1"} if "--workers" in known else {}
     for verb, *needed in map(str.split, SMALL):
         small |= SMALL[" ".join([verb, *needed])] if verb == words[0] and {*needed} <= {*words} else {}

@@ -14,9 +14,7 @@ import pytest
 
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.experiments.adaptation import adapt
-from plushsense.live.feedback import read_corrections
 from plushsense.models.bundle import Bundle
-from plushsense.runtime.decisions import argmax_spec
 
 Cli = Callable[..., Any]
 Make = Callable[[Path, int], None]
@@ -168,21 +166,14 @@ def test_forget_names_a_bundle_that_was_adapted_to_the_person(
     assert any("adapted to this code" in str(found) for found in ran.json["bundles"]), ran.out
 
 
-def test_forget_names_the_corrections_that_the_studio_keeps(cli: Cli, stranger: Path, tmp_path: Path) -> None:
+def test_forget_names_the_recordings_that_the_studio_discarded(cli: Cli, stranger: Path, tmp_path: Path) -> None:
     made = import_recordings(stranger, tmp_path / "home" / "datasets" / "DS", layout="accel-3").dataset
-    files = [tmp_path / home / "feedback" / "S99.jsonl" for home in ("home", "other")]
     discarded = [tmp_path / "home" / "discarded" / p / "S99" for p in ("datasets/old/recordings", "recordings")]
     for folder in discarded:
         folder.mkdir(parents=True)
-    for file in files:
-        file.parent.mkdir(parents=True)
-        file.write_text("{}\n", encoding="utf-8")
-        file.with_name("S98.jsonl").write_text("{}\n", encoding="utf-8")
-    ran = cli("forget", made.path, "S99", "--bundles", tmp_path / "other", "--json")
-    assert ran.json["feedback"] == [str(file) for file in files]
+    ran = cli("forget", made.path, "S99", "--json")
     assert ran.json["discarded"] == [str(folder) for folder in discarded]
     ran = cli("forget", made.path, "S99")
-    assert f"corrections of this code, delete them: {files[0]}" in ran.out
     assert f"discarded recordings of this code, delete them: {discarded[0]}" in ran.out
 
 
@@ -230,45 +221,3 @@ def test_a_bundle_that_was_trained_anywhere_in_streams(
     assert ran.status in (0, 1), ran.err
     same = cli("adapt", bundle, tmp_path / "R" / "S98", "--force", "--out", tmp_path / "other.plush")
     assert ran.out.replace("mine", "other") == same.out
-
-
-def test_events_marked_as_wrong_correct_the_bundle(
-    cli: Cli, bundle: Path, stranger: Path, make_session: Make, tmp_path: Path
-) -> None:
-    folder, marks, out = tmp_path / "session", tmp_path / "S99.jsonl", tmp_path / "mine.plush"
-    make_session(folder, 106)
-    # Report the best class of every step.
-    bundle = replace(Bundle.load(bundle), decision=argmax_spec(0.3).to_dict()).save(tmp_path / "model.plush")
-    listed = cli("feedback", bundle, folder, "--json")
-    assert listed.status == 0, listed.err
-    (event, *_) = listed.json["events"]
-    assert event["gesture"] and listed.json["file"] is None and "begun s" in cli("feedback", bundle, folder).out
-    right = next(label for label in ("Slow", "Fast") if label != event["gesture"])
-    who = ("--subject", "S99", "--out", marks)
-    ran = cli("feedback", bundle, folder, "--wrong", "1", *who)
-    assert ran.status == 0 and f"{event['gesture']}: wrong" in ran.out
-    assert f"corrections appended to {marks}: 1" in ran.out
-    ran = cli("feedback", bundle, folder, "--right", f"1={right}", *who, "--json")
-    assert ran.status == 0 and ran.json["corrections"] == 1 and len(read_corrections(marks)) == 2
-    before = bundle.read_bytes()
-    ran = cli("adapt", bundle, "--feedback", marks, "--out", out, "--json")
-    assert ran.status in (0, 1) and ran.json["corrections"] == 2 and bundle.read_bytes() == before
-    assert ran.json["accepted"] is (ran.status == 0) is out.exists()
-    both = cli("adapt", bundle, stranger, "--feedback", marks, "--out", tmp_path / "both.plush", "--json")
-    assert both.status == 0 and both.json["adapted"] and both.json["corrections"]["corrections"] == 2
-    back = tmp_path / "back.plush"
-    assert cli("adapt", tmp_path / "both.plush", "--undo", "--out", back).status == 0 and back.read_bytes() == before
-    again = person(make_session, tmp_path / "R" / "S98", (107, 108))
-    for refused, said in (
-        (("feedback", bundle, folder, "--wrong", "9999"), "no event '9999'"),
-        (("feedback", bundle, folder, "--right", "1"), "names no gesture"),
-        (("feedback", bundle, folder, "--wrong", "1"), "--subject and --out are missing"),
-        (
-            ("adapt", bundle, "--feedback", marks, "--subject", "S99", "--out", out, "--force"),
-            "choose among RECORDINGS",
-        ),
-        (("adapt", bundle, again, "--feedback", marks, "--out", out, "--force"), "of S99, the recordings of S98"),
-        (("adapt", bundle, "--feedback", tmp_path / "none", "--out", out, "--force"), "cannot be read"),
-    ):
-        ran = cli(*refused)
-        assert ran.status == 2 and said in ran.err

@@ -98,7 +98,7 @@ def test_refusals_are_sentences(cli: Cli, dataset: Dataset, tmp_path: Path) -> N
 
 def test_sets_and_names_join_in_the_order_of_the_table() -> None:
     assert chosen("network, quick,tree") == (*(m for m in MODELS if m in SETS["quick"]), "network")
-    assert set(chosen("all")) == set(MODELS) - {"minirocket", "multirocket-hydra"}
+    assert set(chosen("all")) == set(MODELS)
     assert chosen("network,bilstm:units=8,lstm:layers=2,lstm:units=32") == (
         "lstm", "lstm:layers=2", "bilstm:units=8", "network",
     )  # fmt: skip

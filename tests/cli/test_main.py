@@ -267,7 +267,6 @@ def test_bad_input_is_one_sentence_and_status_2(
             "experiments.people.merging.load_evaluation",
             "is not a gesture set",
         ),
-        (["feedback", "BUNDLE", "DS", "--out", "FILE"], "live.feedback.events_of", "is not a file of corrections"),
         (["toy", "--tcp", "0", "--truth", "FILE"], "devices.virtual.server.ToyServer", "is not a file of truth"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",

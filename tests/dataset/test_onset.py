@@ -142,7 +142,7 @@ def test_a_hand_that_lies_still_is_no_rest() -> None:
 
 
 def test_suggestions_lie_near_the_marks_made_by_eye(imported_study: Any) -> None:
-    """The figures are in docs/trim.md (bench/onsets.py prints them); these floors are well below them."""
+    """The figures are in docs/trim.md; these floors are well below them."""
     with MARKS.open(encoding="utf-8", newline="") as file:
         marked = {row["recording"]: row for row in csv.DictReader(file)}
     dataset = imported_study.dataset

@@ -57,7 +57,7 @@ _FULL = {
         "model_version": "1.2.0",
     },
     "windowing": {"window_s": 2.5, "step_s": 0.5, "context": "stream", "span_s": 1.0, "anywhere": {"every_s": 0.1}},
-    "personal": {"subject": "S1", "original": _DENSE, "uncorrected": _DENSE, "recordings": 3},
+    "personal": {"subject": "S1", "original": _DENSE, "recordings": 3},
 }
 
 

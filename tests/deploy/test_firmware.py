@@ -29,10 +29,11 @@ from plushsense.deploy.package import (
     package,
 )
 from plushsense.deploy.quantize import integer_model
-from plushsense.devices.wire import LineParser, format_line
+from plushsense.devices.wire import LineParser
 from plushsense.runtime.image import IntegerModel
 from plushsense.windows.features import Scaler
 from support.exports import LAYOUTS, bundle_of
+from support.sent_lines import format_line
 from support.virtual_boards import BOARDS, BUILDS, SECONDS, WARNINGS, arduino, compiled, frames_of, idf, play, run, told
 
 Packages = dict[str, tuple[Path, IntegerModel]]

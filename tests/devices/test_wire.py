@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from plushsense.core.layouts import Channel, CsvFormat, Layout, load_layout
 from plushsense.devices.base import Counters, LossCounter
-from plushsense.devices.wire import LineParser, ParsedLine, format_line
+from plushsense.devices.wire import LineParser, ParsedLine
+from support.sent_lines import format_line
 
 PLUSH = load_layout("plush-15")
 OLD = load_layout("plush-14")

@@ -10,7 +10,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from plushsense.core.layouts import Layout, load_layout
-from plushsense.devices.wire import LineParser, ParsedLine, format_line
+from plushsense.devices.wire import LineParser, ParsedLine
+from support.sent_lines import format_line
 
 LAYOUTS = {name: load_layout(name) for name in ("plush-15", "plush-14", "accel-3", "phone-6")}
 BOM = b"\xef\xbb\xbf"

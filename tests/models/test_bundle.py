@@ -233,7 +233,7 @@ DENSE = {"dense.weight": np.zeros((5, 4)).tolist(), "dense.bias": [0.0] * 5}
         ("scaling.offset", [1e300, 0.0, 0.0]),
         ("scaling.offset", [10**400, 0.0, 0.0]),
         ("personal", {"original": {"dense.weight": [[1.0]], "dense.bias": [1.0]}}),
-        ("personal", {"uncorrected": {"dense.bias": [0.0] * 5}}),
+        ("personal", {"original": {"dense.bias": [0.0] * 5}}),
         ("personal", {"subject": 7, "original": DENSE}),
         ("provenance.seed", 1 << 64),
         ("provenance.deep", deep(40)),
@@ -256,7 +256,7 @@ def test_values_out_of_range_are_refused_at_load(where: str, value: object) -> N
 
 def test_an_earlier_layer_that_fits_is_accepted() -> None:
     content, weights = contents(make().to_bytes())
-    content["personal"] = {"subject": "S1", "original": DENSE, "uncorrected": DENSE}
+    content["personal"] = {"subject": "S1", "original": DENSE}
     assert Bundle.from_bytes(signed(content, weights)).adapted_to == "S1"
 
 

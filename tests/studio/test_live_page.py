@@ -13,19 +13,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from plushsense.core.layouts import load_layout
-from plushsense.core.recorder_csv import read_recording
-from plushsense.dataset.index import open_dataset
-from plushsense.live.feedback import read_corrections
 from plushsense.recording.plan import load_protocol
 from plushsense.recording.session import OpenSession
 from plushsense.recording.session_files import SessionHead
-from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.live.clips import Clips
-from support.browsing import DESK, TABLET, Look, Studio, axe, connected, marked
+from support.browsing import DESK, TABLET, Look, axe, connected, marked
 from support.bundles import OTHER, odd_bundle
 
 Fixture = Callable[..., Any]
@@ -319,94 +313,6 @@ def test_two_tabs_and_a_reload_show_the_present(studio: Fixture, look: Fixture, 
     assert browser.complaints == []
 
 
-def test_a_hard_case_is_kept_labelled_and_in_the_data_set(
-    studio: Fixture, look: Fixture, shots: Fixture, home: Path
-) -> None:
-    url = studio(*VIRTUAL, home=home).url
-    browser = look()
-    page = started(browser, url)
-    page.wait_for_function("() => window.plushsenseLive.samples > 1000")
-    marked(page, "keep").click()
-    page.get_by_role("alert").get_by_text("First enter the code of the person").wait_for()
-    page.wait_for_function("document.activeElement.dataset.test === 'person'")
-    page.keyboard.type("Anna")
-    marked(page, "keep").click()
-    page.get_by_role("alert").get_by_text("Anna").wait_for()
-    marked(page, "person").fill("S77")
-    marked(page, "keep").click()
-    page.get_by_role("button", name="Open S77/live-1").click()
-    over = marked(page, "clip-plot").locator(".u-over")
-    over.wait_for()
-    over.scroll_into_view_if_needed()
-    rows = Clips(Workspace(home)).rows(Clips(Workspace(home)).get("S77/live-1"))
-    seconds = (rows.device_ms - rows.device_ms[0]) / 1000.0
-    box = over.bounding_box()
-    for share in (0.3, 0.7):
-        over.click(position={"x": share * box["width"], "y": box["height"] / 2})
-    fields = [marked(page, name) for name in ("clip-from", "clip-to")]
-    pixel_s = seconds[-1] / box["width"]
-    page.wait_for_function(
-        "(most) => parseFloat(document.querySelector('[data-test=clip-to]').value) < most", arg=0.8 * seconds[-1]
-    )
-    for field, share in zip(fields, (0.3, 0.7), strict=True):
-        assert float(field.input_value()) == pytest.approx(share * seconds[-1], abs=pixel_s + 0.011)
-    # And by keys: the end one second on.
-    to = round(float(fields[1].input_value()) + 1.0, 2)
-    fields[1].fill(str(to))
-    fields[1].press("Tab")
-    begin, end = (float(f.input_value()) for f in fields)
-    first, last = (int(np.abs(seconds - s).argmin()) for s in (begin, end))
-    marked(page, "clip-rows").get_by_text(f"{last + 1 - first} samples").wait_for()
-    marked(page, "clip-label").click()
-    marked(page, "message").get_by_text("First choose the gesture").wait_for()
-    gesture = page.get_by_role("combobox", name="Gesture (choose, or type a new one and press Enter)")
-    gesture.click()
-    page.get_by_role("option", name="Tail hit 1", exact=True).click()
-    page.locator(".q-menu").wait_for(state="detached")
-    marked(page, "clip-label").click()
-    marked(page, "message").get_by_text("Tail hit 1: saved as").wait_for()
-    assert axe(page) == []
-    shots(page, "live-clip")
-    marked(page, "clip-add").click()
-    marked(page, "message").get_by_text("1 new recordings").wait_for()
-    marked(page, "clip-S77/live-1").get_by_text("in the data sets virtual").wait_for()
-    there = open_dataset(home / "datasets" / "virtual")
-    (made,) = [r for r in there.recordings if r.subject == "S77"]
-    assert (made.gesture, made.session, made.rows) == ("Tail hit 1", "live-1", last + 1 - first)
-    cut = read_recording(there.path / made.file, there.layout).frames
-    assert np.array_equal(cut.values, rows.values[first : last + 1])
-    assert np.array_equal(cut.device_ms, rows.device_ms[first : last + 1])
-    assert browser.complaints == []
-
-
-def test_the_server_is_killed_while_a_clip_is_recorded(studio: Fixture, look: Fixture, home: Path) -> None:
-    server: Studio = studio(*VIRTUAL, home=home)
-    page = started(look(), server.url)
-    marked(page, "person").fill("S05")
-    marked(page, "record").click()
-    marked(page, "record-end").wait_for()
-    stream = home / "recordings" / "S05" / "live-1" / "fulldatastream.csv"
-    before = look_at(page)["samples"]
-    page.wait_for_function("(n) => window.plushsenseLive.samples > n + 600", arg=before)
-    server.kill()
-    left = stream.read_bytes()
-    # Half a second of the computer's clock is a second of this toy; a busy disk may be slower.
-    assert left.count(b"\n") >= 350
-    server.start()
-    page = live(look(), server.url)
-    marked(page, "clip-S05/live-1").get_by_text("no label yet").wait_for()
-    page.get_by_role("button", name="Open S05/live-1").click()
-    gesture = page.get_by_role("combobox", name="Gesture (choose, or type a new one and press Enter)")
-    gesture.fill("my own")
-    gesture.press("Enter")
-    marked(page, "clip-label").click()
-    marked(page, "message").get_by_text("my own: saved as").wait_for()
-    whole = left[: left.rfind(b"\n") + 1]
-    assert stream.read_bytes() == whole, "at most a torn last line is gone"
-    (made,) = stream.parent.glob("my own_*.csv")
-    assert made.read_bytes().count(b"\n") == whole.count(b"\n") + 1
-
-
 def record_simulated(folder: Path) -> None:
     """Write a session of a virtual person who made every gesture twice, as the recorder leaves it."""
     from plushsense.recording.simulate import simulate
@@ -420,81 +326,44 @@ def record_simulated(folder: Path) -> None:
     shutil.rmtree(folder.parent / "made")
 
 
-def test_an_event_is_marked_as_wrong_and_the_network_improved(
+def test_the_network_is_adapted_to_recordings_of_the_person(
     studio: Fixture, look: Fixture, shots: Fixture, home: Path
 ) -> None:
-    little = home / "bundles" / "little.plush"
-    before, file = little.read_bytes(), home / "feedback" / "S07.jsonl"
-    browser = look()
-    page = live(browser, studio("--device", "virtual://?person=2", "--speed", "4", home=home).url)
-    assert marked(page, "wrong").is_disabled()
-    marked(page, "start").click()
-    page.wait_for_function("!document.querySelector('[data-test=wrong]').disabled")
-    # The last event can be marked after the toy was stopped, too.
-    marked(page, "stop").click()
-    situation(page, "stopped")
-    assert axe(page) == []
-    listed = marked(page, "events").locator("li[data-gesture]:not([data-gesture=''])").first
-    gesture, begin = listed.locator("b").inner_text(), listed.locator("span").first.inner_text()
-    marked(page, "wrong-event").get_by_text(f"Last event: {gesture} at {begin}").wait_for()
-    wrong = page.get_by_role("button", name="That was wrong")
-    wrong.click()
-    page.get_by_role("alert").get_by_text("First enter the code of the person").wait_for()
-    page.wait_for_function("document.activeElement.dataset.test === 'wrong-person'")
-    page.keyboard.type("S07")
-    right = next(g for g in ("Tail pull", "Ear scratch 1") if g != gesture)
-    choose(page, "It really was", right)
-    # By keys, as a person would who cannot use a mouse.
-    wrong.focus()
-    page.keyboard.press("Enter")
-    told = f"Marked: {gesture} at {begin} was really {right}. Marks of S07: 1."
-    marked(page, "message").get_by_text(told).wait_for()
-    (kept,) = read_corrections(file)
-    assert (kept.subject, kept.gesture, kept.right) == ("S07", gesture, right)
-    assert 0.0 < kept.begun_s <= 8.0 and len(kept.frames) > 100
-    page.wait_for_function("document.querySelector('[data-test=wrong]').disabled")
-    marked(page, "marks-undo").click()
-    marked(page, "message").get_by_text("The last mark was removed. Marks of S07: 0.").wait_for()
-    assert not file.exists()
-    page.wait_for_function("document.querySelector('[data-test=improve]').disabled")
-    wrong.click()
-    marked(page, "message").get_by_text(f"Marked: {gesture} at {begin} was wrong. Marks of S07: 1.").wait_for()
-    shots(page, "live-marked")
-    marked(page, "improve").click()
-    marked(page, "message").get_by_text("Now in use for S07: little-for-S07.").wait_for()
-    marked(page, "message").get_by_text("The probability of a wrong answer falls from").wait_for()
-    marked(page, "bundle").get_by_text("little-for-S07").wait_for()
-    assert axe(page) == []
-    assert no_sideways(page)
-    shots(page, "live-improved")
-    for dark, size in ((True, TABLET), (False, DESK)):
-        other = look(size, dark, "lv", touch=size == TABLET)
-        second = live(other, page.url.removesuffix("/live"))
-        marked(second, "wrong-person").fill("S07")
-        marked(second, "marks").get_by_text("S07 atzīmes: 1").wait_for()
-        marked(second, "marks-undo").focus()
-        assert axe(second) == []
-        assert no_sideways(second)
-        shots(second, f"live-marked-lv-{'dark' if dark else 'light'}")
-        assert other.complaints == []
-        second.close()
-    assert little.read_bytes() == before
     import plushsense as ps
 
-    assert ps.load(home / "bundles" / "little-for-S07.plush").adapted_to == "S07"
-    # The former network again, by its name; it is adapted to recordings of the person, and that is undone.
-    choose(page, "Network", "little")
+    little = home / "bundles" / "little.plush"
+    before = little.read_bytes()
     record_simulated(home / "recordings" / "S08" / "1")
-    marked(page, "wrong-person").fill("S08")
+    browser = look()
+    page = live(browser, studio("--device", "virtual://?person=2", "--speed", "4", home=home).url)
+    assert marked(page, "adapt").is_disabled(), "no person is named"
+    marked(page, "start").click()
+    situation(page, *READING)
+    marked(page, "stop").click()
+    situation(page, "stopped")
+    marked(page, "adapt-person").fill("S08")
     page.wait_for_function("!document.querySelector('[data-test=adapt]').disabled")
     marked(page, "adapt").click()
     message = marked(page, "now").locator('[data-test="message"]')
     message.get_by_text("Now in use for S08: little-for-S08.").wait_for()
     assert "recordings, each left out once, it reads" in message.inner_text()
     marked(page, "bundle").get_by_text("little-for-S08").wait_for()
+    assert axe(page) == []
+    assert no_sideways(page)
+    shots(page, "live-adapted")
+    for dark, size in ((True, TABLET), (False, DESK)):
+        other = look(size, dark, "lv", touch=size == TABLET)
+        second = live(other, page.url.removesuffix("/live"))
+        marked(second, "adapt-person").fill("S08")
+        assert axe(second) == []
+        assert no_sideways(second)
+        shots(second, f"live-adapted-lv-{'dark' if dark else 'light'}")
+        assert other.complaints == []
+        second.close()
     message.get_by_role("button", name="Undo").click()
     message.get_by_text("The network little is in use again.").wait_for()
     assert ps.load(home / "bundles" / "little-for-S08.plush").adapted_to == "S08"
+    assert little.read_bytes() == before
     marked(page, "start").click()
     situation(page, *READING)
     assert browser.complaints == []

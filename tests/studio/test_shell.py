@@ -22,7 +22,6 @@ from plushsense.studio.app import shell
 from plushsense.studio.app.shell import LIGHT_COOKIE, PAGES, TOUR
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.live.clips import PROTOCOL
 from plushsense.studio.pages.review.controller import VIEWS
 from plushsense.studio.pages.train.result_details import confusion_table
 from plushsense.studio.pages.train.results import Confusion
@@ -271,15 +270,13 @@ def test_what_is_filled_in_is_escaped() -> None:
 
 def hostile_home(home: Path, made: Path) -> Path:
     """A home whose every folder, file, person, gesture and title has a name that is HTML; its data set."""
-    clip = record(Workspace(home), "S01").rename(home / "recordings" / "S01" / f"live-{HOSTILE}")
-    head = json.loads((clip / SESSION_HEAD).read_text("utf-8"))
-    head["protocol"]["name"] = PROTOCOL
-    (clip / SESSION_HEAD).write_text(json.dumps(head), "utf-8")
+    session = record(Workspace(home), "S01").rename(home / "recordings" / "S01" / HOSTILE)
+    head = json.loads((session / SESSION_HEAD).read_text("utf-8"))
     taken = {"what": "take", "at_ms": 1, "file": f"{HOSTILE}_1_2.csv", "gesture": HOSTILE, "repetition": 1, "rows": 2}
-    with (clip / SESSION_LOG).open("a", encoding="utf-8") as log:
+    with (session / SESSION_LOG).open("a", encoding="utf-8") as log:
         log.write(json.dumps(taken) + "\n")
     # A session that was never finished: the page Record lists it by the names of its head.
-    unfinished = Path(shutil.copytree(clip, home / "recordings" / HOSTILE / HOSTILE))
+    unfinished = Path(shutil.copytree(session, home / "recordings" / HOSTILE / HOSTILE))
     head |= {"subject": HOSTILE, "session": HOSTILE, "device": f"tcp://{HOSTILE}"}
     head["protocol"] |= {"name": HOSTILE, "title": HOSTILE}
     (unfinished / SESSION_HEAD).write_text(json.dumps(head), "utf-8")
@@ -329,9 +326,6 @@ def test_no_name_runs_as_script(studio: Fixture, look: Fixture, tmp_path: Path) 
     for path in (*pages, f"/record?session={quote(f'{HOSTILE}/{HOSTILE}')}"):
         page = browser.open(url + path)
         page.get_by_text(HOSTILE).first.wait_for(state="attached")
-        if path == PAGES["live"]:
-            page.get_by_role("button", name=f"Open S01/live-{HOSTILE}").click()
-            page.get_by_role("heading", name=HOSTILE).wait_for()
         if path == PAGES["train"]:
             # The tables of the details, by gesture and by affect, and the plot of both results.
             page.locator("[data-row] button").first.click()

@@ -1,4 +1,4 @@
-"""The paper's live validation on the page: prompts by the clock of the toy, trials kept as a clip, scores in files."""
+"""The paper's live validation: prompts by the clock of the toy, trials kept in a session, scores in files."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import pytest
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import load_gestures
+from plushsense.recording.session_files import read_events
 from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.live.clips import Clips
 from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.signal_recording import SignalRecording
 from plushsense.studio.pages.live.state import LiveChoice
 from plushsense.studio.pages.live.validation import GESTURE_S, Validation
 from support.bundles import odd_bundle
@@ -35,7 +36,7 @@ def workspace(tmp_path: Path) -> Iterator[Workspace]:
 
 
 def test_every_gesture_is_prompted_made_kept_and_scored(workspace: Workspace) -> None:
-    validation, clips, reader = (workspace.part(kind) for kind in (Validation, Clips, LiveReader))
+    validation, reader = workspace.part(Validation), workspace.part(LiveReader)
     with pytest.raises(DatasetError, match="no code"):
         validation.begin("Anna", 1, None)
     commands = [
@@ -80,9 +81,9 @@ def test_every_gesture_is_prompted_made_kept_and_scored(workspace: Workspace) ->
     outside = next(row["positive"] for row in result["between"] if row["system"] == "toy")
     assert len(in_trials) == 3 and sum(s is not None for s in in_trials) + outside == 1
     assert "noted by a person" in (validation.status.result / "protocol.html").read_text("utf-8")
-    (clip,) = clips.all()
-    assert (clip.labels[0].gesture, clip.labels[-1].gesture) == ("Ear scratch 1", "Tail pull")
-    assert all(label.last - label.first > 50 for label in clip.labels)
+    takes = [e.details for e in read_events(workspace.recordings / "S31" / "live-1") if e.kind == "take"]
+    assert (takes[0]["gesture"], takes[-1]["gesture"]) == ("Ear scratch 1", "Tail pull")
+    assert all(take["rows"] > 50 for take in takes)
     with (validation.status.result / "trials.csv").open(encoding="utf-8") as file:
         assert {row["simulated"] for row in csv.DictReader(file)} == {"yes"}
     # The person does as they like again.
@@ -91,16 +92,16 @@ def test_every_gesture_is_prompted_made_kept_and_scored(workspace: Workspace) ->
 
 
 def test_a_validation_that_ends_early_keeps_what_was_made(workspace: Workspace) -> None:
-    validation, clips, reader = (workspace.part(kind) for kind in (Validation, Clips, LiveReader))
+    validation, recording, reader = (workspace.part(kind) for kind in (Validation, SignalRecording, LiveReader))
     validation.begin("S31", 1, None)
     validation.react("positive")
     assert validation.status.reactions is None
     validation.stop()
     until(lambda: validation.status.phase == "")
-    assert (validation.status.result, validation.status.failed, clips.recording) == (None, None, "")
+    assert (validation.status.result, validation.status.failed, recording.key) == (None, None, "")
     validation.begin("S31", 1, None)
     until(lambda: validation.status.done)
-    clips.end()
+    recording.end()
     until(lambda: validation.status.phase == "" and validation.status.result is not None)
     assert validation.results() == [workspace.folder / "validations" / "S31"]
     reader.stop()

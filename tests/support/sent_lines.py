@@ -1,10 +1,10 @@
-"""A toy whose lines arrive one at a time, without waiting."""
+"""Lines as a toy sends them, and a toy whose lines arrive one at a time, without waiting."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
-from plushsense.core.layouts import load_layout
+from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Layout, load_layout
 from plushsense.devices.bytestreams import LineDevice, Link
 
 
@@ -34,3 +34,18 @@ DAMAGED = [b"%d 1 2 %s\n" % (10 * k, b"1F" if k % 3 == 2 else b"3") for k in ran
 """Lines of which every third cannot be read."""
 NAMED = [b"ms:%d,X:1,Y:2,Z:3\r\n" % (10 * k) for k in range(60)]
 """Lines as the plotter of the Arduino IDE reads them."""
+
+
+def format_line(layout: Layout, values: Sequence[int], device_ms: int, delay_ms: int) -> bytes:
+    """Format a frame as the toy sends it, with a line feed; ``values`` (C,) are in integer steps, in layout order."""
+    fields = []
+    for name in layout.wire:
+        if name == DEVICE_MS:
+            fields.append(str(device_ms))
+        elif name == DELAY_MS:
+            fields.append(str(delay_ms))
+        else:
+            at = layout.names.index(name)
+            step = layout.channels[at].step
+            fields.append(str(int(values[at])) if step == 1.0 else repr(round(values[at] * step, 9)))
+    return (" ".join(fields) + "\n").encode("ascii")

@@ -84,14 +84,6 @@ def test_tilt_turns_gravity_alone() -> None:
     assert 3 < np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean() < 30
 
 
-def test_speed_keeps_the_end_and_stretches_the_rest() -> None:
-    ramp = np.broadcast_to(np.arange(40.0), (50, 9, 40)).astype(np.int64) * 100
-    before, after = moved(["random-speed:0.5"], ramp)
-    assert np.allclose(after[:, :, -1], before[:, :, -1], atol=1)
-    slopes = (after[:, 0, -1] - after[:, 0, -11]) / 1000
-    assert slopes.min() > 1 / 1.51 and slopes.max() < 1.51 and slopes.std() > 0.1
-
-
 def test_gain_and_tilt_need_gravity() -> None:
     channels = Channels(((0, 1, 2),), Scaler(np.zeros(3), np.ones(3)), torch.device("cpu"))
     assert augmentations(["random-gain:0.3", "random-tilt:8"], channels) is None

@@ -216,7 +216,6 @@ def test_no_byte_of_the_person_is_left_that_is_not_listed(
     shutil.copytree(folder.parent / "src" / PERSON, home / "recordings" / PERSON)
     shutil.copytree(folder.parent / "src" / PERSON, home / "discarded" / "recordings" / PERSON)
     for place, text in {
-        f"feedback/{PERSON}.jsonl": "{}",
         "work/job.json": json.dumps({"sessions": [f"recordings/{PERSON}/1"]}),
         "selections/a.json": json.dumps([f"{PERSON}/Slow_1"]),
         "studio.log": f"12:00 recording {PERSON}",
@@ -230,10 +229,10 @@ def test_no_byte_of_the_person_is_left_that_is_not_listed(
         (home / place).write_text(text)
     shutil.copytree(home / "datasets" / ".DS-unfinished-1", scratch / ".plushsense-unfinished-1")
     before = {where.split("/")[0] for where in bytes_of(home)}
-    assert {"backups", "bundles", "copy", "datasets", "discarded", "feedback", "key.csv", "work"} - before == {"copy"}
+    assert {"backups", "bundles", "copy", "datasets", "discarded", "key.csv", "work"} - before == {"copy"}
     done = cli("forget", dataset, PERSON, "--yes", "--json").json
     listed = [dataset / at for at in done["mentions"]] + [Path(b["bundle"]) for b in done["bundles"]]
-    listed += map(Path, (*done["feedback"], *done["discarded"], *done["elsewhere"]))
+    listed += map(Path, (*done["discarded"], *done["elsewhere"]))
     left = [home / where for where in bytes_of(home)]
     assert [path for path in left if not {path, *path.parents} & set(listed)] == []
     assert not bytes_of(scratch) and not list(scratch.iterdir())

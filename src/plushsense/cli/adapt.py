@@ -1,4 +1,4 @@
-"""Implement ``plushsense adapt BUNDLE RECORDINGS --out BUNDLE`` and ``plushsense feedback BUNDLE STREAM``."""
+"""Implement ``plushsense adapt BUNDLE RECORDINGS --out BUNDLE``."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, say, spread, table, warn
-from plushsense.cli.settings import listed, marks, settings
+from plushsense.cli.settings import marks, settings
 from plushsense.core.errors import ConfigError
 from plushsense.core.sentences import plural
 
 if TYPE_CHECKING:
     from plushsense.experiments.adaptation import Adapted
-    from plushsense.live.feedback import Corrected
 
 
 def run(args: argparse.Namespace) -> int:
@@ -22,11 +21,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.evaluate is not None:
         return _evaluate(args)
-    given = sum((args.recordings is not None or args.feedback is not None, args.undo))
-    if args.bundle is None or given != 1:
-        raise ConfigError(
-            "Give BUNDLE and RECORDINGS, or BUNDLE --feedback FILE, or both, or BUNDLE --undo, or --evaluate DATASET."
-        )
+    if args.bundle is None or (args.recordings is not None) == args.undo:
+        raise ConfigError("Give BUNDLE and RECORDINGS, or BUNDLE --undo, or --evaluate DATASET.")
     if args.out is None:
         raise ConfigError("--out is missing: give the bundle to write; the given bundle is never changed.")
     out = check_bundle_path(args.out)
@@ -36,84 +32,13 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"'{out}' is already there: choose another --out, or --force to replace it.")
     if args.undo:
         return _undo(args, out)
-    if args.recordings is None:
-        return _correct(args, out)
     from plushsense.experiments.adaptation import adapt
 
-    chosen = options(args, "subject", "use", "feedback")
-    done = adapt(args.bundle, args.recordings, **chosen, warn=warn)
+    done = adapt(args.bundle, args.recordings, **options(args, "subject", "use"), warn=warn)
     if done.accepted:
         done.save(out)
     emit(args, {"bundle": str(out) if done.accepted else None, **done.to_dict()}, _lines(done, out))
     return 0 if done.accepted else 1
-
-
-def _correct(args: argparse.Namespace, out: Path) -> int:
-    from plushsense.live.feedback import correct, read_corrections
-    from plushsense.models.bundle import Bundle
-
-    if args.subject is not None or args.use is not None:
-        raise ConfigError("--subject and --use choose among RECORDINGS: give RECORDINGS, or leave them out.")
-    done = correct(Bundle.load(args.bundle), read_corrections(args.feedback))
-    if done.accepted:
-        done.bundle.save(out)
-    emit(args, {"bundle": str(out) if done.accepted else None, **done.to_dict()}, _correction_lines(done, str(out)))
-    return 0 if done.accepted else 1
-
-
-def _correction_lines(done: Corrected, out: str) -> list[str]:
-    if done.accepted:
-        return [f"{out}: corrected by {done.bundle.adapted_to}; {done.reason}."]
-    return [f"the corrections change nothing, because {done.reason}."]
-
-
-def run_feedback(args: argparse.Namespace) -> int:
-    from plushsense.core.recorder_csv import STREAM_NAME, read_stream
-    from plushsense.live.feedback import append_corrections, check_corrections_path, correction_of, events_of
-    from plushsense.models.bundle import Bundle
-
-    if args.out is not None:
-        check_corrections_path(args.out)
-    bundle, path = Bundle.load(args.bundle), Path(args.stream)
-    frames = read_stream(path / STREAM_NAME if path.is_dir() else path, bundle.layout).frames
-    events = events_of(bundle, frames)
-    labels = bundle.gestures.labels
-    wrong = {_number(text, len(events)): "" for text in listed(args.wrong or "")}
-    for text in listed(args.right or ""):
-        number, equals, label = text.partition("=")
-        if not equals:
-            raise ConfigError(f"--right '{text}' names no gesture: write the number of the event, = and the gesture.")
-        wrong[_number(number, len(events))] = label.strip()
-    if not wrong:
-        rows = [
-            {
-                "event": n,
-                "begun_s": round(e.start_s, 2),
-                "ended_s": round(e.stop_s, 2),
-                "gesture": labels[e.gesture] if e.gesture < len(labels) else None,
-            }
-            for n, e in enumerate(events, 1)
-        ]
-        lines = [table(("event", "begun s", "ended s", "gesture"), [tuple(row.values()) for row in rows])]
-        emit(args, {"events": rows, "corrections": 0, "file": None}, [*lines, "mark one with --wrong EVENT"])
-        return 0
-    if args.subject is None or args.out is None:
-        raise ConfigError("--subject and --out are missing: say who corrects, and the file to append to.")
-    corrections = [
-        correction_of(bundle, frames, events[n - 1], subject=args.subject, right=right)
-        for n, right in sorted(wrong.items())
-    ]
-    append_corrections(args.out, corrections)
-    result = {"events": [], "corrections": len(corrections), "file": args.out}
-    told = [f"{c.gesture}: {f'it was {c.right}' if c.right else 'wrong'}" for c in corrections]
-    emit(args, result, [*told, f"corrections appended to {args.out}: {len(corrections)}"])
-    return 0
-
-
-def _number(text: str, events: int) -> int:
-    if not text.strip().isdecimal() or not 1 <= int(text) <= events:
-        raise ConfigError(f"There is no event '{text}': the bundle reports {events} on this stream, from 1.")
-    return int(text)
 
 
 def _undo(args: argparse.Namespace, out: Path) -> int:
@@ -133,8 +58,6 @@ def _lines(done: Adapted, out: Path) -> list[str]:
     mark = "  [SIMULATION]" if done.simulated else ""
     head = f"{out}: adapted to {done.subject}{mark}" if done.accepted else "nothing written: the bundle stays as it is"
     text = [head, f"{personal.reason}." if personal.accepted else f"recordings not used: {personal.reason}."]
-    if done.corrected is not None:
-        text += _correction_lines(done.corrected, "corrections")
     if done.tested is not None:
         before, after = done.tested
         text.append(

@@ -90,7 +90,6 @@ def _removal_lines(result: Forgotten) -> list[str]:
     lines += [f"contains the code or cannot be read, check it: {path}" for path in plan.mentions]
     lines += [f"a running program uses it, and removes it when it ends: {path}" for path in plan.running]
     lines += [f"bundle: {b.bundle}: {b.message}" for b in result.bundles]
-    lines += [f"corrections of this code, delete them: {path}" for path in result.feedback]
     lines += [f"discarded recordings of this code, delete them: {path}" for path in result.discarded]
     lines += [f"contains the code or cannot be read, check it: {path}" for path in result.elsewhere]
     if plan.published:

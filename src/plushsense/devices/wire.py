@@ -6,7 +6,6 @@ Any input is accepted: noise, incomplete lines and lines without end are counted
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from plushsense.core.errors import printable
@@ -305,18 +304,3 @@ def _steps(field: bytes, step: float) -> int | None:
         return None
     number = float(field) / step
     return round(number) if -_LIMIT <= number <= _LIMIT else None
-
-
-def format_line(layout: Layout, values: Sequence[int], device_ms: int, delay_ms: int) -> bytes:
-    """Format a frame as the toy sends it, with a line feed; ``values`` (C,) are in integer steps, in layout order."""
-    fields = []
-    for name in layout.wire:
-        if name == DEVICE_MS:
-            fields.append(str(device_ms))
-        elif name == DELAY_MS:
-            fields.append(str(delay_ms))
-        else:
-            at = layout.names.index(name)
-            step = layout.channels[at].step
-            fields.append(str(int(values[at])) if step == 1.0 else repr(round(values[at] * step, 9)))
-    return (" ".join(fields) + "\n").encode("ascii")

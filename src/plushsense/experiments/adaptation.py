@@ -25,7 +25,6 @@ from plushsense.dataset.store import HEAD, Dataset
 from plushsense.deploy.quantize import calibration, integer_network, integer_probabilities, refuse_undeployable
 from plushsense.evaluation.crossval import context_of, fold_fingerprint, fold_windows, windows_fingerprint
 from plushsense.live.adaptation import (
-    Examples,
     Personal,
     PersonalSpec,
     RecordingScores,
@@ -33,7 +32,6 @@ from plushsense.live.adaptation import (
     personalise,
     restore_original,
 )
-from plushsense.live.feedback import Corrected, correct, read_corrections
 from plushsense.models.bundle import Bundle
 from plushsense.scoring import metrics
 from plushsense.scoring.splits import Fold, parse_split, purge
@@ -231,8 +229,7 @@ class Adapted:
     """The outcome of `adapt`.
 
     ``tested``: with ``use``, the scores on the other recordings, before and after; None where all were used.
-    ``left_out`` maps each label to the reason why recordings could not be used. ``corrected`` is the outcome of the
-    corrections, if some were given.
+    ``left_out`` maps each label to the reason why recordings could not be used.
     """
 
     personal: Personal
@@ -241,17 +238,16 @@ class Adapted:
     tested: tuple[RecordingScores, RecordingScores] | None
     left_out: dict[str, str]
     simulated: bool
-    corrected: Corrected | None = None
 
     @property
     def accepted(self) -> bool:
-        """Whether recordings or corrections changed the bundle."""
-        return self.personal.accepted or (self.corrected is not None and self.corrected.accepted)
+        """Whether the recordings changed the bundle."""
+        return self.personal.accepted
 
     @property
     def bundle(self) -> Bundle:
         """The adapted bundle, or the given one where it was left as it is."""
-        return self.personal.bundle if self.corrected is None else self.corrected.bundle
+        return self.personal.bundle
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Save the adapted bundle.
@@ -279,7 +275,6 @@ class Adapted:
             "tested": None
             if self.tested is None
             else {"before": self.tested[0].to_dict(), "after": self.tested[1].to_dict()},
-            "corrections": None if self.corrected is None else self.corrected.to_dict(),
             "simulated": self.simulated,
         }
 
@@ -293,7 +288,6 @@ def adapt(
     *,
     subject: str | None = None,
     use: int | None = None,
-    feedback: str | os.PathLike[str] | None = None,
     spec: PersonalSpec | None = None,
     warn: Warn = python_warning,
 ) -> Adapted:
@@ -301,8 +295,6 @@ def adapt(
 
     Args:
         recordings: a data set, or the folder of a recorder.
-        feedback: a file of corrections of this person (`plushsense.live.feedback`), to which the layer is fitted after
-            the recordings. They are refused if fewer of these recordings are then read right.
         subject: the person; may be left out where there is only one.
         use: number of recordings of each gesture to adapt to, the first ones; the rest are scored before and after.
         warn: called with what was left out, and what limits the meaning of the scores.
@@ -320,11 +312,6 @@ def adapt(
     with temporary_folder() as place:
         dataset = _dataset(recordings, given, place)
         person = _person(dataset, subject)
-        corrections = [] if feedback is None else read_corrections(feedback)
-        if others := sorted({c.subject for c in corrections} - {person}):
-            raise BadInput(
-                f"The corrections are of {', '.join(others)}, the recordings of {person}: give one person's."
-            )
         dataset = dataset.with_inputs(given.layout).with_gestures(given.gestures)
         _same_layout(given, dataset)
         _warn_of_training(given, person, warn)
@@ -348,13 +335,9 @@ def adapt(
         predictors = (_float_predictor(original), _float_predictor(done.bundle if done.accepted else original))
         one, other = (judge(predict(test), test.y, test.recording).scores for predict in predictors)
         tested = (one, other)
-    corrected = None
-    if corrections:
-        features = done.bundle.network().features(done.bundle.scaler.apply(adapting.integers))
-        corrected = correct(done.bundle, corrections, Examples(features, adapting.y, adapting.recording))
     if not dataset.path.is_relative_to(place):  # the one made of a folder is gone by now
         dataset.generation.check()
-    return Adapted(done, person, use, tested, left_out, dataset.head.simulated, corrected)
+    return Adapted(done, person, use, tested, left_out, dataset.head.simulated)
 
 
 def _dataset(recordings: Dataset | str | os.PathLike[str], bundle: Bundle, place: Path) -> Dataset:

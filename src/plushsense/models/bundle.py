@@ -88,7 +88,6 @@ class _Adaptation:
     subject: str | None = None
     leave_one_recording_out: dict[str, dict[str, Any]] = field(default_factory=dict)
     original: dict[str, Any] = field(default_factory=dict)
-    uncorrected: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -174,9 +173,7 @@ class Bundle:
 
     def without_people(self) -> Bundle:
         """Return the bundle for an export: without people's codes and the weights before an adaptation; idempotent."""
-        personal = {
-            key: value for key, value in self.personal.items() if key not in ("subject", "original", "uncorrected")
-        }
+        personal = {key: value for key, value in self.personal.items() if key not in ("subject", "original")}
         return replace(self, provenance=_without_people(self.provenance), personal=personal)
 
     def save(self, path: str | Path) -> Path:
@@ -274,11 +271,10 @@ class Bundle:
 
     def _check_earlier(self) -> None:
         """Raise BundleError if the layer before an adaptation does not fit the network."""
-        for key in ("original", "uncorrected"):
-            if earlier := self.personal.get(key):
-                with np.errstate(over="ignore"):
-                    layer = {name: np.array(earlier[name], dtype=np.float32) for name in _DENSE}
-                check_weights(self.arch, {**self.weights, **layer})
+        if earlier := self.personal.get("original"):
+            with np.errstate(over="ignore"):
+                layer = {name: np.array(earlier[name], dtype=np.float32) for name in _DENSE}
+            check_weights(self.arch, {**self.weights, **layer})
 
     def _implied(self) -> dict[str, Any]:
         """Return values that follow from the parts, for programs in other languages."""

@@ -125,27 +125,6 @@ def random_tilt(degrees: float, channels: Channels) -> Transform | None:
     return tilt
 
 
-def random_speed(share: float, channels: Channels) -> Transform | None:
-    """Read every window faster or slower by a random factor, up to ``share`` more or less; its end stays.
-
-    Samples between two others are interpolated; before the start of the window it is mirrored. The logarithm of the
-    factor is uniform.
-    """
-    import torch
-
-    def warp(x: Tensor, random: torch.Generator) -> Tensor:
-        last = x.shape[2] - 1
-        speed = _factors(len(x), share, random).to(x.device, non_blocking=True)
-        back = torch.arange(last, -1, -1, device=x.device)
-        at = (last - back * speed[:, None]).abs().clamp_max(last)
-        before = at.floor().long().clamp_max(max(last - 1, 0))
-        part = (at - before)[:, None]
-        index = before[:, None].expand(-1, x.shape[1], -1)
-        return x.gather(2, index) * (1.0 - part) + x.gather(2, (index + 1).clamp_max(last)) * part
-
-    return warp
-
-
 def _factors(n: int, share: float, random: torch.Generator) -> Tensor:
     """Draw factors (n,) between 1 / (1 + share) and 1 + share, with a uniform logarithm."""
     import torch
@@ -170,7 +149,6 @@ AUGMENTATIONS: dict[str, Augmentation] = {
     "random-rotation": Augmentation(random_rotation, 180.0, "degrees"),
     "random-gain": Augmentation(random_gain, 1.0),
     "random-tilt": Augmentation(random_tilt, 90.0, "degrees"),
-    "random-speed": Augmentation(random_speed, 1.0),
 }
 
 

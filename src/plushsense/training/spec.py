@@ -40,8 +40,8 @@ class TrainSpec:
             weights are kept; without it, all epochs run and the last weights are kept (from 1; default: by the preset).
         stop_on: result that ``patience`` watches (one of `STOP_ON`).
         augment: changes of the training windows, each with its strength, such as ``random-rotation:45`` (degrees; the
-            toy is held differently), ``random-gain:0.3`` (stronger or weaker movement), ``random-tilt:8`` (degrees;
-            down is not exactly known) and ``random-speed:0.2`` (faster or slower movement) (default: by the preset).
+            toy is held differently), ``random-gain:0.3`` (stronger or weaker movement) and ``random-tilt:8`` (degrees;
+            down is not exactly known) (default: by the preset).
         scaling: ``z-score`` scales each channel by its mean and standard deviation over the training windows; ``none``
             lets the network read values in the units of the layout, as in the authors' script (one of `SCALINGS`).
         weight_decay: factor of the L2 regularisation of all parameters but biases, added to the gradient as in MATLAB's

@@ -32,7 +32,6 @@ from plushsense.dataset.quality.checking import CheckReport, check
 from plushsense.dataset.quality.findings import CheckLimits
 from plushsense.dataset.store import Dataset, DatasetHead, Progress
 from plushsense.evaluation.reidentification import reidentify, report, verdict
-from plushsense.live.feedback import FOLDER
 from plushsense.models.bundle import Bundle, is_training_content
 
 if TYPE_CHECKING:
@@ -261,16 +260,14 @@ class TrainedOn:
 class Forgotten:
     """The files that were removed from a data set (``done``) or would be, and what else holds the person's data.
 
-    ``bundles`` were trained on the person; ``feedback`` are files of the studio with corrections of this code, and
-    ``discarded`` folders of recordings that were discarded there. ``elsewhere`` are other files and folders in the same
-    places that contain the code or cannot be read.
+    ``bundles`` were trained on the person; ``discarded`` are folders of recordings that were discarded in the studio.
+    ``elsewhere`` are other files and folders in the same places that contain the code or cannot be read.
     """
 
     plan: RemovalPlan
     bundles: list[TrainedOn]
     done: bool
     dataset: str
-    feedback: list[str] = field(default_factory=list)
     discarded: list[str] = field(default_factory=list)
     elsewhere: list[str] = field(default_factory=list)
 
@@ -281,7 +278,6 @@ class Forgotten:
             "done": self.done,
             **self.plan.to_dict(),
             "bundles": [vars(b) for b in self.bundles],
-            "feedback": self.feedback,
             "discarded": self.discarded,
             "elsewhere": self.elsewhere,
         }
@@ -311,19 +307,18 @@ def forget(
     places = [folder, *map(Path, bundles)]
     trained = trained_on(folder, subject, places)
     homes = {place.resolve() for place in [*places, folder.resolve().parent.parent]}
-    feedback = sorted(str(p) for home in homes if (p := home / FOLDER / f"{subject}.jsonl").is_file())
     code = glob.escape(subject)
     patterns = (f"recordings/{code}", f"datasets/*/recordings/{code}")
     discarded = sorted(str(p) for home in homes for pattern in patterns for p in (home / "discarded").glob(pattern))
     inside = folder.resolve()
     studio = [inside.parent.parent] if inside.parent.name == "datasets" else []
     searched = dict.fromkeys(place for p in bundles if (place := Path(p).resolve()).is_dir() and place not in studio)
-    listed = {Path(path).resolve() for path in (*feedback, *discarded, *(b.bundle for b in trained))}
+    listed = {Path(path).resolve() for path in (*discarded, *(b.bundle for b in trained))}
     found = find_mentions([*studio, *searched], subject, inside)
     elsewhere = sorted({str(p) for p in found if not listed & {p.resolve(), *p.resolve().parents}})
     if confirm:
         plan = remove_person(folder, subject)
-    return Forgotten(plan, trained, confirm, str(folder), feedback, discarded, elsewhere)
+    return Forgotten(plan, trained, confirm, str(folder), discarded, elsewhere)
 
 
 def trained_on(folder: Path, subject: str, places: Iterable[Path]) -> list[TrainedOn]:

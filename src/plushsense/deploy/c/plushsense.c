@@ -20,22 +20,17 @@
 #define INPUT_BYTES 12u     /* offset, bias, multiplier and two shifts of one channel of the network */
 #define LOGIT_LIMIT 16384
 #define SPARE 4u            /* rows for new samples, before those under the taps move */
-#define RING 90u            /* words: see checksum() */
 #define WEIGHT_ZERO 128u    /* weights are stored with this added: some cores cannot load a signed byte */
 
-/* Not copied to where it is called: for the registers of a loop, or for the flash; or copied, for the same registers. */
+/* Not copied to where it is called: for the registers of a loop, or for the flash. */
 #if defined(__GNUC__)
 #define PLUSH_APART __attribute__((noinline)) PLUSH_CODE
 #define PLUSH_SMALL_APART __attribute__((noinline, cold))
-#define PLUSH_COPIED __inline__ __attribute__((always_inline))
 #define PLUSH_SMALL __attribute__((cold)) /* compiled for size */
-#define PLUSH_ALIGNED(p) (const uint8_t *)__builtin_assume_aligned(p, 4)
 #else
 #define PLUSH_APART PLUSH_CODE
 #define PLUSH_SMALL_APART
-#define PLUSH_COPIED
 #define PLUSH_SMALL
-#define PLUSH_ALIGNED(p) (p)
 #endif
 
 /* Where the code of a step, and its tables, are placed: nothing, or an attribute such as IRAM_ATTR and DRAM_ATTR. */
@@ -265,9 +260,9 @@ static uint32_t word_at(const uint8_t *p)
 
 /* ---- The model ------------------------------------------------------------------------------------------------- */
 
-/* CRC-32 of four bytes more, or of the lowest one of them. */
-PLUSH_COPIED
-static uint32_t checksum_of(uint32_t sum, uint32_t bytes)
+/* CRC-32, as zip and Ethernet have it, four bits at a time. */
+PLUSH_SMALL_APART
+static uint32_t checksum(const uint8_t *bytes, uint32_t n)
 {
     static const uint32_t table[16] = {
         UINT32_C(0x00000000), UINT32_C(0x1db71064), UINT32_C(0x3b6e20c8), UINT32_C(0x26d930ac),
@@ -275,59 +270,13 @@ static uint32_t checksum_of(uint32_t sum, uint32_t bytes)
         UINT32_C(0xedb88320), UINT32_C(0xf00f9344), UINT32_C(0xd6d6a3e8), UINT32_C(0xcb61b38c),
         UINT32_C(0x9b64c2b0), UINT32_C(0x86d3d2d4), UINT32_C(0xa00ae278), UINT32_C(0xbdbdf21c)
     };
+    uint32_t sum = UINT32_MAX;
 
-    for (; bytes > 0; bytes--) {
+    for (; n > 0; n--) {
+        sum ^= *bytes++;
         sum = (sum >> 4) ^ table[sum & 15u];
         sum = (sum >> 4) ^ table[sum & 15u];
     }
-    return sum;
-}
-
-/* CRC-32, as zip and Ethernet have it. Its polynomial P divides y^89 + y^88 + y^41 + y^36 + y^16 + y^13 + y^5 + 1, for y = x
- * and so for y = x^32, because P(y)^32 = P(y^32) where 1 + 1 = 0. So a word can be taken out of the bytes if it is added to
- * the words 1, 48, 53, 73, 76, 84 and 89 places after it: 17 instructions, where division takes 160 and a table of a
- * kilobyte 24. `past` holds the words that were taken out last, each twice, so that the 89 before any word stand in a row. */
-PLUSH_SMALL_APART
-static uint32_t checksum(const uint8_t *bytes, uint32_t n)
-{
-    const uint8_t *words;
-    uint32_t past[2 * RING], *at = past, sum = UINT32_MAX, word = 0, left;
-
-#define PLUSH_WORD(i)                                                                                           \
-    (word ^ le32(words + 4 * (i)) ^ at[(i) + RING - 48] ^ at[(i) + RING - 53] ^ at[(i) + RING - 73] ^           \
-     at[(i) + RING - 76] ^ at[(i) + RING - 84] ^ at[(i) + RING - 89])
-#define PLUSH_TAKE_OUT(i) at[i] = at[(i) + RING] = word = PLUSH_WORD(i)
-    memset(past, 0, sizeof past);
-    for (; n > 0 && (uintptr_t)bytes % 4u != 0; n--)
-        sum = checksum_of(sum ^ *bytes++, 1);
-    words = PLUSH_ALIGNED(bytes);
-    left = n / 4u;
-    if (left > 89u) {
-        word = sum;
-        sum = 0;
-    }
-    while (left >= 89u + 2u) {
-        const uint32_t *end = past + (left < 89u + RING ? (left - 89u) / 2u * 2u : RING);
-
-        left -= (uint32_t)(end - past);
-        for (at = past; at != end; at += 2, words += 8) {
-            PLUSH_TAKE_OUT(0);
-            PLUSH_TAKE_OUT(1);
-        }
-    }
-    for (; left > 0; left--, at++, words += 4) {
-        if (at == past + RING)
-            at = past;
-        PLUSH_TAKE_OUT(0);
-        if (left <= 89u) { /* it stays in */
-            sum = checksum_of(sum ^ word, 4);
-            at[0] = at[RING] = word = 0;
-        }
-    }
-#undef PLUSH_TAKE_OUT
-#undef PLUSH_WORD
-    for (n %= 4u; n > 0; n--)
-        sum = checksum_of(sum ^ *words++, 1);
     return ~sum;
 }
 

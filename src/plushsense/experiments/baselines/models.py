@@ -12,7 +12,6 @@ import pickle
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from plushsense.core.errors import BadInput, ConfigError, check_known, need
 from plushsense.experiments.baselines.score import UNSCALED, Contender, Pca, Reader
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
-from plushsense.windows.features import Scaler, statistics, statistics_in_order
+from plushsense.windows.features import statistics, statistics_in_order
 
 Floats = NDArray[np.float64]
 
@@ -330,75 +329,3 @@ def recurrent(names: Sequence[str], samples: int, spec: TrainSpec, vectors: Sequ
         fit = RecurrentFit(network, spec, samples)
         made.append(Contender(network.name, network.title, "windows", False, fit, key, samples))
     return made
-
-
-# Part of every job's id: increase it when a name comes to mean another program or other settings.
-ROCKETS_VERSION = 1
-EXTRA_ROCKETS = "rocket"
-
-# Title in tables, and name of the class in aeon, by name.
-ROCKETS: dict[str, tuple[str, str]] = {
-    "minirocket": ("MiniRocket", "MiniRocketClassifier"),
-    "multirocket-hydra": ("MultiRocket-Hydra", "MultiRocketHydraClassifier"),
-}
-# Number of random windows on which a rocket is run once to compile its kernels.
-_FIRST = 32
-
-
-@dataclass(frozen=True)
-class RocketFit:
-    """A function that fits a classifier of random convolutions (Dempster, Schmidt & Webb 2021, 2023).
-
-    Windows are scaled by channel. The kernels are compiled at their first run in a process (seconds to a minute);
-    `prepare` does this before the timing starts.
-    """
-
-    name: str
-    samples: int
-    seed: int
-
-    def __call__(self, train: WindowSet, validation: WindowSet, /) -> Reader:
-        """Fit the classifier to ``train``; ``validation`` is not used."""
-        enough_to_learn(train)
-        scaler = Scaler.fit(train.integers[:, :, -self.samples :])
-
-        def scaled(windows: WindowSet) -> NDArray[np.float32]:
-            return scaler.apply(windows.integers[:, :, -self.samples :])
-
-        model = _rocket(self.name, self.seed)
-        model.fit(scaled(train), train.y)
-        return FittedClassifier(model, scaled)
-
-    def prepare(self, train: WindowSet, /) -> None:
-        """Compile the kernels, once in each process."""
-        _compiled(self.name, train.integers.shape[1], min(self.samples, train.integers.shape[2]))
-
-
-def _rocket(name: str, seed: int) -> Any:
-    module = need("aeon.classification.convolution_based", extra=EXTRA_ROCKETS)
-    return getattr(module, ROCKETS[name][1])(random_state=seed, n_jobs=1)
-
-
-@lru_cache(maxsize=8)
-def _compiled(name: str, channels: int, samples: int) -> None:
-    """Run a rocket's kernels once in this process, on noise."""
-    x = np.random.default_rng(0).normal(size=(_FIRST, channels, samples)).astype(np.float32)
-    model = _rocket(name, 0)
-    model.fit(x, np.arange(_FIRST) % 2)
-    model.predict_proba(x[:2])
-
-
-def rockets(names: Sequence[str], samples: int, seed: int) -> list[Contender]:
-    """Return a contender for each name in `ROCKETS`; these classifiers of aeon use the samples of the windows.
-
-    Raises:
-        MissingExtraError: without aeon, or without PyTorch, which MultiRocket-Hydra needs.
-    """
-    library = f"aeon {need('aeon', extra=EXTRA_ROCKETS).__version__}" if names else ""
-    if "multirocket-hydra" in names:
-        need("torch", extra=EXTRA_ROCKETS)
-    key = {"version": ROCKETS_VERSION, "library": library, "samples": samples, "seed": seed}
-    return [
-        Contender(name, ROCKETS[name][0], "windows", False, RocketFit(name, samples, seed), dict(key), samples)
-        for name in names
-    ]

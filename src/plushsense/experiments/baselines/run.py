@@ -25,12 +25,10 @@ from plushsense.experiments.baselines.models import (
     BASELINES,
     DEFAULT_FEATURES,
     RECURRENT,
-    ROCKETS,
     TOO_LONG,
     classical,
     parse_recurrent,
     recurrent,
-    rockets,
 )
 from plushsense.experiments.baselines.score import UNSCALED, Contender, Fit, Pca, Reader, compare
 from plushsense.jobs.journal import job_id
@@ -50,13 +48,13 @@ SPLITS = ("leave-one-subject-out", "windows:5")
 TABLE, SHEET, PAGE, PICTURE = "baselines.json", "baselines.csv", "baselines.html", "baselines.png"
 
 NETWORK = "network"
-# By name: classical programs, recurrent networks, rockets (extra), and our own network.
-MODELS = (*BASELINES, *RECURRENT, *ROCKETS, NETWORK)
-# "quick" takes seconds per fold in all. "all" leaves out the rockets, whose package cannot be installed everywhere.
+# By name: classical programs, recurrent networks, and our own network.
+MODELS = (*BASELINES, *RECURRENT, NETWORK)
+# "quick" takes seconds per fold in all.
 SETS: dict[str, tuple[str, ...]] = {
     "quick": ("forest", "extra-trees", "knn", "rbf-svm", "tree"),
     "classical": tuple(BASELINES),
-    "all": (*BASELINES, *RECURRENT, NETWORK),
+    "all": MODELS,
 }
 # "yes" scales before PCA, "unscaled" after it, as MATLAB's Classification Learner does.
 PCA: dict[str, tuple[Pca, ...]] = {
@@ -169,7 +167,6 @@ def contenders(
     """
     spec, samples = config.training, arch.span
     made = classical([m for m in models if m in BASELINES], features, pca, samples, spec.seed)
-    made += rockets([m for m in models if m in ROCKETS], samples, spec.seed)
     recurrent_names = [m for m in models if _kind(m) in RECURRENT]
     if NETWORK in models or recurrent_names:
         need("torch", extra="train")

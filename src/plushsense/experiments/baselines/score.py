@@ -57,8 +57,7 @@ class Reader(Protocol):
 Fit = Callable[[WindowSet, WindowSet], Reader]
 """A function that fits a program to the training windows; it may use the second argument, the validation windows.
 
-It must be picklable and deterministic. It may have a method ``prepare(train)`` for work that is done once in each
-process, such as compiling; that method is not timed.
+It must be picklable and deterministic.
 """
 
 
@@ -191,9 +190,6 @@ def _work(windows: WindowSet, task: _Task, report: Report, /) -> Result:
     fit, fold = task.contender.fit, task.fold
     train, test = windows.take(fold.train), windows.take(fold.test)
     with _one_thread():
-        prepare = getattr(fit, "prepare", None)
-        if prepare is not None:
-            prepare(train)
         began = _clock()
         reader = fit(train, windows.take(fold.validation))
         train_s = _clock() - began

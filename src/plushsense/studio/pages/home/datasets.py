@@ -185,7 +185,6 @@ class ForgetDialog:
             rest = [
                 *([str(sessions)] if sessions.is_dir() else ()),
                 *(b.bundle for b in found.bundles),
-                *found.feedback,
                 *found.discarded,
                 *found.elsewhere,
                 *(str(p) for p in sorted((workspace.folder / BACKUPS).glob("*.zip"))),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from markupsafe import Markup
@@ -13,7 +13,6 @@ from plushsense.reports.table import Table
 from plushsense.studio.app.shell import AFFECT_SIGNS, Page, add_style, button, html, moment, on_change, tag
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import plain_name
-from plushsense.studio.pages.live.feedback import Feedback
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.state import EventSpan
 from plushsense.studio.widgets.elements import table_html
@@ -29,15 +28,10 @@ _PRINT = """
 """
 
 
-def log_rows(events: Sequence[EventSpan], marks: Mapping[int, tuple[str, str]]) -> list[dict[str, Any]]:
-    """Return one row for each event, with plain values for a file.
-
-    Args:
-        marks: of the events that were marked as wrong, number to person and right gesture.
-    """
+def log_rows(events: Sequence[EventSpan]) -> list[dict[str, Any]]:
+    """Return one row for each event, with plain values for a file."""
     rows = []
     for event in events:
-        person, right = marks.get(event.number, ("", ""))
         rows.append(
             {
                 "time": time.strftime("%Y-%m-%dT%H:%M:%S", time.localtime(event.at)),
@@ -50,9 +44,7 @@ def log_rows(events: Sequence[EventSpan], marks: Mapping[int, tuple[str, str]]) 
                 "eyes": event.eyes,
                 "sound": event.sound,
                 "really": "" if event.really is None else event.really or "nothing",
-                "marked_wrong": "yes" if event.number in marks else "",
-                "right": right,
-                "person": event.subject or person,
+                "person": event.subject,
                 "network": event.network,
                 "simulated": "yes" if event.simulated else "no",
             }
@@ -60,20 +52,18 @@ def log_rows(events: Sequence[EventSpan], marks: Mapping[int, tuple[str, str]]) 
     return rows
 
 
-def printed(words: Words, events: Sequence[EventSpan], marks: Mapping[int, tuple[str, str]]) -> Markup:
+def printed(words: Words, events: Sequence[EventSpan]) -> Markup:
     """Return the log as a page for printing, in the language of ``words``."""
     virtual = any(event.really is not None for event in events)
     head = [words(f"log.{key}") for key in ("time", "person", "gesture", "affect", "confidence", "lasted", "reaction")]
     head += [words("log.really")] if virtual else []
-    head.append(words("log.marked"))
     rows = []
     for event in events:
-        person, right = marks.get(event.number, ("", ""))
         reaction = [words(f"live.eyes_{event.eyes}")] if event.eyes else []
         reaction += [words.get(f"live.sound_{event.sound}", event.sound)] if event.sound else []
         row = [
             time.strftime("%H:%M:%S", time.localtime(event.at)),
-            event.subject or person,
+            event.subject,
             words.gesture(event.gesture) if event.gesture else words("live.some_gesture"),
             f"{AFFECT_SIGNS[event.affect]} {words.affect(event.affect)}",
             "" if event.confidence is None else f"{words.number(100.0 * event.confidence)} %",
@@ -82,8 +72,7 @@ def printed(words: Words, events: Sequence[EventSpan], marks: Mapping[int, tuple
         ]
         row += [words.gesture(event.really or words("log.nothing"))] if virtual and event.really is not None else []
         row += [""] if virtual and event.really is None else []
-        wrong = words("log.wrong_right", right=words.gesture(right)) if right else words("log.wrong")
-        rows.append([*row, wrong if event.number in marks else ""])
+        rows.append(row)
     networks = ", ".join(dict.fromkeys(event.network for event in events))
     about = (
         words("log.about", when=moment(events[0].session), network=networks) if events else words("live.events_none")
@@ -139,17 +128,14 @@ class LogButtons:
         for control in (self._save, self._print):
             control.set_enabled(n > 0)
 
-    def _marks(self) -> dict[int, tuple[str, str]]:
-        return self._page.workspace.part(Feedback).marks()
-
     def _download(self) -> None:
         events = self._events()
-        text = Table.from_rows("log", "", log_rows(events, self._marks())).csv()
+        text = Table.from_rows("log", "", log_rows(events)).csv()
         people = sorted({event.subject for event in events if event.subject})
         name = "-".join(["live", time.strftime("%Y-%m-%d-%H%M", time.localtime(events[0].session)), *people])
         ui.download.content(text, f"{plain_name(name, 'live')}.csv", "text/csv")
 
     def _open_print(self) -> None:
-        self._sheet.set_content(printed(self._page.words, self._events(), self._marks()))
+        self._sheet.set_content(printed(self._page.words, self._events()))
         # The browser prints what it has drawn, so wait until the table is there.
         ui.run_javascript("requestAnimationFrame(() => requestAnimationFrame(() => print()))")

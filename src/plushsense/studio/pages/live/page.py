@@ -16,11 +16,11 @@ from plushsense.live.reactions import reaction_names
 from plushsense.studio.app.shell import Page, button, named, on_change, query, query_path, tag
 from plushsense.studio.app.toys import Toys
 from plushsense.studio.app.workspace import VIRTUAL, Workspace
-from plushsense.studio.pages.live import clips_page, feedback_page, validation_page
-from plushsense.studio.pages.live.clips import Clips
+from plushsense.studio.pages.live import adapting_page, validation_page
 from plushsense.studio.pages.live.feed import PACE_S, PLOT_HZ, RATES_HZ, Feed, LiveView, follow
 from plushsense.studio.pages.live.log import LogButtons
 from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.signal_recording import SignalRecording
 from plushsense.studio.pages.live.state import LiveChoice
 from plushsense.studio.widgets.elements import style, summary
 
@@ -44,18 +44,17 @@ def show(page: Page) -> None:
 
     on_change(reader.changed, update_mark)
     update_mark()
-    view, people = LiveView(words, feed), feedback_page.PersonFields(page, reader)
+    view, people = LiveView(words, feed), adapting_page.PersonFields(page, reader)
     with view:
         _person_panel(page, reader)
-        feedback_page.show(page, reader, people)
+        adapting_page.show(page, people)
     with view.add_slot("log"):
         log = LogButtons(page, reader)
     follow(view, feed, reader)
-    clips_page.show(page, reader, people)
     validation_page.show(page, reader, people)
     log.add_sheet()
-    clips = page.workspace.part(Clips)
-    context.client.on_delete(reader.add_viewer(lambda: bool(clips.recording)))
+    recording = page.workspace.part(SignalRecording)
+    context.client.on_delete(reader.add_viewer(lambda: bool(recording.key)))
 
 
 def _person_panel(page: Page, reader: LiveReader) -> None:

@@ -370,7 +370,6 @@ class LiveReader:
                 event.affect,
                 event.gesture,
                 event.source,
-                named_s=None if event.gesture is None else zero + event.t_s,
                 at=time.time(),
                 network=self.choice.bundle.stem if self.choice.bundle is not None else "",
                 simulated=self.choice.simulated,
@@ -381,10 +380,10 @@ class LiveReader:
             self._events[span.number] = span
             self.now = replace(self.now, event=span)
         elif self.now.event is not None:
-            changed: dict[str, Any] = {"named_s": zero + event.t_s}
+            changed: dict[str, Any] = {}
             if event.kind == "ended":
-                changed = {"end_s": zero + event.since_s, "closed_s": zero + event.t_s}
-                changed["really"] = self._performed_in(self.now.event.begin_s, zero + event.t_s)
+                really = self._performed_in(self.now.event.begin_s, zero + event.t_s)
+                changed = {"end_s": zero + event.since_s, "really": really}
             elif event.gesture != self.now.event.gesture:
                 # From now on it is the probability of the gesture, not of the affect.
                 changed["confidence"] = None

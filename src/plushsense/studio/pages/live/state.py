@@ -57,7 +57,6 @@ class EventSpan:
         change: number of the latest change of this event; all changes of all events are numbered consecutively.
         in_stream: number of the event in the stream of the classifier, to which its reaction refers.
         end_s: time of its end, None while it lasts.
-        named_s, closed_s: times at which its gesture and its end were reported, None before that.
         confidence: highest probability of its gesture or, before it is named, of its affect; None without an answer.
         eyes, sound: the reaction of the toy; both "" while there is none.
         at: time of its first report, in seconds since 1970.
@@ -76,8 +75,6 @@ class EventSpan:
     gesture: str | None
     source: str
     end_s: float | None = None
-    named_s: float | None = None
-    closed_s: float | None = None
     confidence: float | None = None
     eyes: str = ""
     sound: str = ""

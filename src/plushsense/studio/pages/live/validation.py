@@ -1,7 +1,8 @@
 """Lead a person through the paper's live validation (section 4.6), and score it when it ends.
 
-The signals are kept as a clip (see `plushsense.studio.pages.live.clips`), so that a crash loses nothing; at the end its
-parts are labelled with the gestures that were prompted, and the result is written to ``validations/<subject>/``.
+The signals are recorded as a session (see `plushsense.studio.pages.live.signal_recording`), so that a crash loses
+nothing; at the end its parts are labelled with the gestures that were prompted, and the result is written to
+``validations/<subject>/``.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from plushsense.experiments.protocol.sittings import GestureTrial, Sitting
 from plushsense.models.bundle import Bundle
 from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
-from plushsense.studio.pages.live.clips import Clips
 from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.signal_recording import SignalRecording
 from plushsense.studio.pages.live.state import Performed
 from plushsense.windows.clock import row_times_us
 
@@ -76,7 +77,7 @@ class _Run:
     """A validation that is being led: the trials to make, and those that were made."""
 
     subject: str
-    clip: str
+    key: str
     plan: list[tuple[str, int]]
     bundle: Bundle
     engine: str
@@ -98,7 +99,7 @@ class Validation:
         self.status = ValidationStatus()
         self._workspace = workspace
         self._reader = workspace.part(LiveReader)
-        self._clips = workspace.part(Clips)
+        self._recording = workspace.part(SignalRecording)
         self._lock = threading.RLock()
         self._run: _Run | None = None
 
@@ -112,20 +113,20 @@ class Validation:
             noted: whether somebody notes the toy's own reactions with `react`.
 
         Raises:
-            ConfigError: if no toy is read, or a clip or validation is under way. DatasetError: as for `Clips.begin`.
+            ConfigError: if no toy is read, or a validation is under way. DatasetError: as for `SignalRecording.begin`.
         """
         reader = self._reader
         with self._lock:
             if self._run is not None:
                 raise ConfigError("A validation is under way: end it first.", reason="validation_running")
             bundle, device, choice = reader.bundle, reader.device, reader.choice
-            clip = self._clips.begin(reader, subject, _LONGEST_S)
+            key = self._recording.begin(reader, subject, _LONGEST_S)
             assert bundle is not None and device is not None
             labels = [g.label for g in bundle.gestures.gestures if not g.idle]
             plan = [(label, n) for label in labels for n in range(1, repetitions + 1)]
-            person = clip.partition("/")[0]
+            person = key.partition("/")[0]
             reactions: list[tuple[float, str]] | None = [] if noted else None
-            run = _Run(person, clip, plan, bundle, choice.engine, choice.simulated, tune_on, device, [], reactions)
+            run = _Run(person, key, plan, bundle, choice.engine, choice.simulated, tune_on, device, [], reactions)
             self._run = run
             self.status = ValidationStatus(total=len(plan), reactions=0 if noted else None, result=self.status.result)
             self._prompt(run, 0, 0.0, None)
@@ -139,10 +140,10 @@ class Validation:
             if run is None or not self.status.can_pause:
                 return
             if self.status.phase == "paused":
-                self._prompt(run, self.status.at, self._clips.recorded_s, None)
+                self._prompt(run, self.status.at, self._recording.recorded_s, None)
             else:
                 if self.status.phase == "after":
-                    self._next(run, self._clips.recorded_s, None)
+                    self._next(run, self._recording.recorded_s, None)
                 self.status = replace(self.status, phase="paused", left_s=0)
         self.changed.notify()
 
@@ -151,7 +152,7 @@ class Validation:
         with self._lock:
             run = self._run
             if run is not None and self.status.phase in ("countdown", "doing", "paused"):
-                self._next(run, self._clips.recorded_s, None)
+                self._next(run, self._recording.recorded_s, None)
         self.changed.notify()
 
     def react(self, affect: str) -> None:
@@ -159,7 +160,7 @@ class Validation:
         with self._lock:
             run = self._run
             if run is not None and run.reactions is not None and self.status.phase != "scoring":
-                run.reactions.append((self._clips.recorded_s, affect))
+                run.reactions.append((self._recording.recorded_s, affect))
                 self.status = replace(self.status, reactions=len(run.reactions))
         self.changed.notify()
 
@@ -193,11 +194,11 @@ class Validation:
             run, before = self._run, self.status
             if run is None or before.phase in ("", "scoring"):
                 return
-            if self._clips.recording != run.clip:
-                # Somebody ended the clip, or it reached its longest length.
+            if self._recording.key != run.key:
+                # It reached its longest length, or cannot be written.
                 self._finish(run)
             else:
-                self._advance(run, self._clips.recorded_s, frames[-1].device_ms)
+                self._advance(run, self._recording.recorded_s, frames[-1].device_ms)
             changed = self.status != before
         if changed:
             self.changed.notify()
@@ -233,7 +234,7 @@ class Validation:
             self.status = replace(self.status, phase="after", left_s=0, done=len(run.trials))
 
     def _made(self, run: _Run, now_s: float) -> Performed | None:
-        """Return the prompted gesture if the virtual person has begun it, with times since the begin of the clip."""
+        """Return the prompted gesture if the virtual person has begun it, with times in the recording."""
         made = [p for p in self._reader.performed(run.performed) if p.label == self.status.label]
         if not made:
             return None
@@ -274,8 +275,8 @@ class Validation:
         try:
             with contextlib.suppress(ValueError):
                 run.device.taps.remove(self._tap)
-            if self._clips.recording == run.clip:
-                self._clips.end()
+            self._recording.end()
+            failed = self._recording.failed
             if run.trials:
                 result = self._write(run)
         except PlushSenseError as cause:
@@ -289,11 +290,10 @@ class Validation:
         self.changed.notify()
 
     def _write(self, run: _Run) -> Path:
-        """Label the parts of the clip, score the trials and write the result; return its folder."""
-        clip = self._clips.get(run.clip)
-        frames = self._clips.rows(clip)
-        times_s = row_times_us(frames, clip.layout) / 1e6
-        self._clips.label_parts(run.clip, list(_parts(run.trials, times_s.tolist())))
+        """Label the parts of the recording, score the trials and write the result; return its folder."""
+        frames, layout = self._recording.read(run.key)
+        times_s = row_times_us(frames, layout) / 1e6
+        self._recording.label(run.key, list(_parts(run.trials, times_s.tolist())))
         home = self._workspace
         out = home.new(FOLDER, home.free_name(FOLDER, run.subject))
         tune_on = open_dataset(home.inside(run.tune_on)) if run.tune_on is not None else None
@@ -304,7 +304,7 @@ class Validation:
 
 
 def _parts(trials: list[GestureTrial], times_s: list[float]) -> Iterator[tuple[str, int, int]]:
-    """Yield the gesture of each trial with the first and the last row, exclusive, of its part of the clip."""
+    """Yield the gesture of each trial with the first and the last row, exclusive, of its part of the recording."""
     for trial in trials:
         first, last = np.searchsorted(times_s, (trial.start_s, trial.stop_s)).tolist()
         if last - first >= 2:

@@ -1,0 +1,127 @@
+"""Build the part of the live page that adapts the network to a person."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from nicegui import ui
+
+from plushsense.core.errors import BadInput, PlushSenseError
+from plushsense.recording.session import check_subject
+from plushsense.studio.app.shell import Page, button, named, on_change, tag
+from plushsense.studio.pages.live.adapting import Adapting, Improved
+from plushsense.studio.pages.live.reader import LiveReader
+from plushsense.studio.pages.live.validation import Validation
+
+
+def show(page: Page, people: PersonFields) -> None:
+    """Build the part, which is beside the current event."""
+    box = ui.element("div").props("role=group").classes("w-full column no-wrap ps-small-gap q-mt-sm")
+    with named(box, page.words("live.adapt_about")):
+        _AdaptingPanel(page, people)
+
+
+class PersonFields:
+    """The fields of a page for the code of the person who touches the toy; all of them hold the same text."""
+
+    def __init__(self, page: Page, reader: LiveReader) -> None:
+        self._page, self._reader = page, reader
+        self._fields: list[ui.input] = []
+        self.code = reader.subject
+
+    def add(self, name: str, on_change: Callable[[], None] = lambda: None) -> ui.input:
+        """Add a field; ``on_change`` is called when the text of any field has changed."""
+        words = self._page.words
+        field = tag(ui.input(words("live.person"), value=self.code, placeholder="S01").props("maxlength=16"), name)
+        self._fields.append(field)
+
+        def changed() -> None:
+            self.code = str(field.value or "").strip()
+            field.error = None
+            for other in self._fields:
+                other.set_value(field.value)
+            self._reader.subject = ""
+            # A code that is still being typed may be invalid.
+            with contextlib.suppress(BadInput):
+                self._reader.subject = check_subject(self.code)
+            on_change()
+
+        field.on_value_change(changed)
+        return field
+
+    def checked(self, field: ui.input) -> str:
+        """Return the code; if it is missing or invalid, say so beside ``field`` and return ""."""
+        text = ""
+        try:
+            text = check_subject(self.code)
+        except BadInput as refusal:
+            field.error = self._page.words.error(refusal) if self.code else self._page.words("live.person_first")
+            field.run_method("focus")
+        return text
+
+
+class _AdaptingPanel:
+    """Fields and buttons that adapt the network in use to recordings of a person, and take the former one back."""
+
+    def __init__(self, page: Page, people: PersonFields) -> None:
+        self._words, self._people = page.words, people
+        self._adapting = page.workspace.part(Adapting)
+        self._busy = False
+        words = page.words
+        ui.label(words("live.adapt_about")).classes("text-bold")
+        with ui.row().classes("w-full items-center ps-small-gap"):
+            self._person = people.add("adapt-person", self._update).style("flex: 1 1 9rem")
+            self._recordings = ui.select({}, label=words("live.adapt_from")).style("flex: 1 1 10rem; min-width: 0")
+            tag(self._recordings, "adapt-from")
+            self._adapt = button("adapt", words("live.adapt"), self._run, icon="auto_fix_high")
+        # Messages are displayed here, because the top of the page may be out of view.
+        self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))
+        on_change(self._adapting.changed, self._update)
+        on_change(page.workspace.part(Validation).changed, self._update)
+        self._update()
+
+    async def _run(self) -> None:
+        """Adapt the network, and say what changed, with a button to undo it."""
+        if self._busy or not (subject := self._people.checked(self._person)):
+            return
+        words, recordings = self._words, Path(str(self._recordings.value or ""))
+        self._busy = True
+        self._page.say(words("live.improving"))
+        self._update()
+        try:
+            with self._page.show_errors():
+                done = await asyncio.to_thread(self._adapting.adapt, subject, recordings)
+                own = done.personal
+                scores = {"n": own.before.recordings, "before": own.before.right, "after": own.after.right}
+                outcome = words(f"live.own_{own.refusal or 'gain'}", **scores)
+                if done.name:
+                    names = {"name": done.name, "before": done.before.stem, "subject": subject}
+                    message = f"{words('live.improved', **names)} {outcome}"
+                    self._page.say(message, "good", lambda: self._take_back(done))
+                else:
+                    self._page.say(f"{words('live.improve_refused')} {outcome}", "warning")
+        finally:
+            self._busy = False
+            self._update()
+
+    async def _take_back(self, done: Improved) -> None:
+        with self._page.show_errors():
+            await asyncio.to_thread(self._adapting.take_back, done)
+            self._page.say(self._words("live.taken_back", name=done.before.stem), "good")
+
+    def _update(self) -> None:
+        subject = self._people.code
+        sources: list[Path] = []
+        if subject:
+            # A code that is still being typed may be invalid.
+            with contextlib.suppress(PlushSenseError, OSError):
+                sources = self._adapting.sources(subject)
+        everything = self._words("live.adapt_all", subject=subject)
+        options = {str(p): p.name if p.name != subject else everything for p in sources}
+        if options != self._recordings.options:
+            self._recordings.set_options(options, value=next(iter(options), None))
+        self._adapt.set_enabled(bool(options) and not self._busy)
