@@ -21,10 +21,11 @@ def run(args: argparse.Namespace) -> int:
     config = settings(args, split=args.split, train_context=args.train_context, workers=args.workers)
     dataset = open_dataset(args.dataset)
     if args.save_windows:
+        from plushsense.core.sentences import join_names
         from plushsense.workflow.export import save_windows
 
         saved = save_windows(dataset, args.save_windows, config, warn=warn)
-        sizes = ", ".join(f"{n} {name}" for name, n in saved.windows.items())
+        sizes = join_names(f"{n} {name}" for name, n in saved.windows.items())
         emit(args, saved.to_dict(), [f"{saved.path}: windows: {sizes}; {saved.bytes:,} bytes"])
         return 0
     out = Path(args.out) if args.out else dataset.path / "evaluations" / name_of(config, dataset)
