@@ -75,7 +75,7 @@ class _AdaptingPanel:
         ui.label(words("live.adapt_about")).classes("text-bold")
         with ui.row().classes("w-full items-center ps-small-gap"):
             self._person = people.add("adapt-person", self._update).style("flex: 1 1 9rem")
-            self._recordings = ui.select({}, label=words("live.adapt_from")).style("flex: 1 1 10rem; min-width: 0")
+            self._recordings = ui.select({}, label=words("live.adapt_from")).style("flex: 1 1 15rem; min-width: 0")
             tag(self._recordings, "adapt-from")
             self._adapt = button("adapt", words("live.adapt"), self._run, icon="auto_fix_high")
         # Messages are displayed here, because the top of the page may be out of view.
