@@ -107,6 +107,17 @@ def answered(shares: dict[int, float], settings: EventSettings = SETTINGS, most:
 # 1. Smoothing
 
 
+def test_the_known_score_of_few_gestures() -> None:
+    logits = np.array([[30, -20, 7, 11]])
+    for idle, score in (
+        ([False] * 4, 30 - 7),
+        ([False, True, True, False], 30 + LOGIT_LIMIT),
+        ([False, True, True, True], 30 + LOGIT_LIMIT),
+        ([True] * 4, 0),
+    ):
+        assert known_score(logits, np.array(idle)).tolist() == [min(score, LOGIT_LIMIT)]
+
+
 def test_probabilities_and_the_known_score_are_smoothed_alike() -> None:
     machine = EventMachine(SETTINGS, 6000, SET)
     mean = None

@@ -183,10 +183,10 @@ def known_score(logits: Ints, idle: NDArray[np.bool_]) -> Ints:
     """Return how clearly the best gesture stands out (...,), from logits (..., K) in steps of 1/256.
 
     It is the highest logit of a gesture less the third highest, at most `LOGIT_LIMIT`. The second highest is often that
-    of a gesture of the same family. Classes of ``idle`` (K,) are left out. With fewer than three gestures, the third
-    counts as ``-LOGIT_LIMIT``.
+    of a gesture of the same family. Classes of ``idle`` (K,) are left out. Of fewer than three gestures, each missing
+    one counts as ``-LOGIT_LIMIT``, so that without any gesture the result is 0.
     """
-    lowest = np.full((*logits.shape[:-1], 2), -LOGIT_LIMIT, dtype=np.int64)
+    lowest = np.full((*logits.shape[:-1], 3), -LOGIT_LIMIT, dtype=np.int64)
     ranked = np.sort(np.concatenate([lowest, logits[..., ~idle]], axis=-1), axis=-1)
     return np.asarray(np.minimum(ranked[..., -1] - ranked[..., -3], LOGIT_LIMIT))
 
