@@ -44,6 +44,7 @@ GROUPS = tuple(
         "studio/test_train_scores.py",
         "test_pages.py test_questions.py",
         "tuning/test_gate.py",
+        "windows/test_units.py",
         "workflow/test_demo.py",
         "workflow/test_estimator.py workflow/test_exchange.py",
         "workflow/test_paper.py",
