@@ -35,7 +35,10 @@ _SUM_LIMIT = (1 << 31) - 1
 
 
 def deployable(arch: Arch) -> bool:
-    """Return whether a network can be deployed; `plushsense.deploy.quantize.refuse_undeployable` gives the reasons."""
+    """Return whether a network can run in integers; `plushsense.deploy.quantize.refuse_undeployable` gives the reasons.
+
+    In C only those with the padding ``stream`` run (`plushsense.runtime.image.refuse_image`).
+    """
     return arch.padding != "causal" and arch.norm != "layer"
 
 
