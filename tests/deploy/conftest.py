@@ -51,12 +51,6 @@ def plain_c_library(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -
 
 
 @pytest.fixture(scope="session")
-def window_libraries(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
-    """The library for window networks, as a PC and as small cores compile it."""
-    return [compiled(c_compiler, tmp_path_factory, "-DPLUSH_WINDOW", *plain) for plain in ((), ("-DPLUSH_PLAIN",))]
-
-
-@pytest.fixture(scope="session")
 def calibrated_library(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """The library for models whose sensors calibrate themselves."""
     return compiled(c_compiler, tmp_path_factory, "-DPLUSH_CALIBRATE")
@@ -69,16 +63,7 @@ def sanitized(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list
     return sorted(folder.glob("program*"))
 
 
-@pytest.fixture(scope="session")
-def sanitized_window(c_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """The same programs with the library for window networks."""
-    folder = built_once(
-        tmp_path_factory, "sanitized-window", lambda draft: _sanitize(c_compiler, draft, "-DPLUSH_WINDOW")
-    )
-    return sorted(folder.glob("program*"))
-
-
-def _sanitize(c_compiler: str, folder: Path, *defines: str) -> None:
+def _sanitize(c_compiler: str, folder: Path) -> None:
     # Where sums and differences wrap on purpose: modulo 2^32 they come out right. Anywhere else it is a fault.
     wrapping = (
         *("square", "surplus", "four_sums", "advance", "dense", "interpolate"),
@@ -99,7 +84,7 @@ def _sanitize(c_compiler: str, folder: Path, *defines: str) -> None:
                     f"-fsanitize-ignorelist={folder / 'wrapping'}",
                 ],
             ),
-        )[:: 2 if defines else 1]  # of another library, once by each compiler
+        )
     ):
         if shutil.which(cc) is None:
             continue
@@ -112,7 +97,6 @@ def _sanitize(c_compiler: str, folder: Path, *defines: str) -> None:
                 "-O1",
                 "-DALONE",
                 *flags,
-                *defines,
                 f"-I{C_FOLDER}",
                 str(TOY_C),
                 "-o",

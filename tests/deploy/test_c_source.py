@@ -40,7 +40,7 @@ def assert_a_step_is_placed(file: Path) -> None:
 
 
 @pytest.mark.parametrize("cc", ["gcc", "clang"])
-@pytest.mark.parametrize("plain", [[], ["-DPLUSH_PLAIN"], ["-DPLUSH_WINDOW"]], ids=["fast", "plain", "window"])
+@pytest.mark.parametrize("plain", [[], ["-DPLUSH_PLAIN"], ["-DPLUSH_CALIBRATE"]], ids=["fast", "plain", "calibrate"])
 def test_no_warning_and_three_functions_of_the_c_library(
     cc: str, plain: list[str], needs: Callable[..., None], tmp_path: Path
 ) -> None:
@@ -64,9 +64,8 @@ def test_no_warning_and_three_functions_of_the_c_library(
     ],
     ids=["cortex-m4", "cortex-m0", "lx106"],
 )
-@pytest.mark.parametrize("window", [[], ["-DPLUSH_WINDOW"]], ids=["stream", "window"])
 def test_small_cores_need_no_long_division(
-    cc: str, flags: list[str], also: set[str], window: list[str], needs: Callable[..., None], tmp_path: Path
+    cc: str, flags: list[str], also: set[str], needs: Callable[..., None], tmp_path: Path
 ) -> None:
     needs(cc)
     (tmp_path / "string.h").write_text(
@@ -75,13 +74,13 @@ def test_small_cores_need_no_long_division(
     )
     common = [cc, *flags, "-std=c99", "-ffreestanding", f"-I{tmp_path}", f"-I{C_FOLDER}"]
     for level in ("-O2", "-Os"):
-        words = [*common, level, *STRICT, *window, "-c", C_FOLDER / "plushsense.c", "-o", "plushsense.o"]
+        words = [*common, level, *STRICT, "-c", C_FOLDER / "plushsense.c", "-o", "plushsense.o"]
         subprocess.run(words, check=True, cwd=tmp_path)
         listed = subprocess.run(
             [cc.replace("gcc", "nm"), "-u", "plushsense.o"], check=True, cwd=tmp_path, capture_output=True, text=True
         )
         assert set(re.findall(r"U (\w+)", listed.stdout)) <= {"memcpy", "memset", "memcmp"} | also
-        if PLACED[0] in flags and (level == "-O2" or not window):
+        if PLACED[0] in flags:
             assert_a_step_is_placed(tmp_path / "plushsense.o")
     # No data that would have to be set up, and the size of a toy that exports speak of.
     sizes = subprocess.run(
@@ -91,12 +90,12 @@ def test_small_cores_need_no_long_division(
     (tmp_path / "size.c").write_text(
         f'#include "plushsense.h"\nchar fits[sizeof(plush_toy) <= {TOY_BYTES} ? 1 : -1];\n'
     )
-    subprocess.run([*common, *window, "-c", "size.c"], check=True, cwd=tmp_path)
+    subprocess.run([*common, "-c", "size.c"], check=True, cwd=tmp_path)
 
 
 def test_cppcheck(needs: Callable[..., None]) -> None:
     needs("cppcheck")
-    for define in ("-UPLUSH_PLAIN", "-DPLUSH_PLAIN", "-DPLUSH_WINDOW", "-DPLUSH_CALIBRATE"):
+    for define in ("-UPLUSH_PLAIN", "-DPLUSH_PLAIN", "-DPLUSH_CALIBRATE"):
         done = subprocess.run(
             [
                 "cppcheck",
@@ -141,12 +140,12 @@ def test_clang_tidy(needs: Callable[..., None]) -> None:
         "-bugprone-implicit-widening-of-multiplication-result",
         # Asks for memcpy_s, which nobody has.
         "-clang-analyzer-security.insecureAPI.DeprecatedOrUnsafeBufferHandling",
-        # That a window has two samples, and that the best class has a probability, is beyond the analyzer.
+        # That the best class has a probability is beyond the analyzer.
         "-clang-analyzer-core.DivideZero",
     ]
-    # The analyzer follows the paths of a program for 8 s: two of the five have all but two lines.
-    follow = [["-DPLUSH_WINDOW"], ["-DPLUSH_CALIBRATE", "-DPLUSH_PLAIN"]]
-    for defines in (["-UPLUSH_PLAIN"], ["-DPLUSH_PLAIN"], *follow, ["-DPLUSH_CALIBRATE"]):
+    # The analyzer follows the paths of a program for 8 s: two of the four have all but two lines.
+    follow = [["-UPLUSH_PLAIN"], ["-DPLUSH_CALIBRATE", "-DPLUSH_PLAIN"]]
+    for defines in (*follow, ["-DPLUSH_PLAIN"], ["-DPLUSH_CALIBRATE"]):
         chosen = checks if LONG or defines in follow else [*checks, "-clang-analyzer-*"]
         done = subprocess.run(
             [

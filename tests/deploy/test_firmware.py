@@ -66,31 +66,6 @@ def test_the_example_feels_what_the_computer_reads_of_its_lines(
 
 
 @pytest.mark.parametrize("board", BUILDS)
-def test_frames_are_taken_while_a_window_is_computed(tmp_path: Path, board: str, c_compiler: str) -> None:
-    """On these boards each look at the clock takes time, so that a window takes longer than the gap of 100 ms."""
-    bundle = bundle_of("accel-3", padding="mirror", window=60, step=40)
-    model = integer_model(bundle)
-    out = emit(model, bundle, tmp_path / "out", extras=[package]).folder
-    slow = ("LOOK_US=2500",)
-    sent, _ = play(BUILDS[board](out, tmp_path, *slow), seconds=8)
-    frames = frames_of(model.layout, sent)
-    between = np.diff(frames[:, 0])
-    # The board is held up once, for 37 ms; else a frame may come as late as the clock is looked at.
-    assert len(frames) > 770 and abs(np.median(between) - 10) <= 1 and sorted(between)[-2] <= 16
-    answers = answers_of(model, frames)
-    assert set(column(answers, "state")) == {0, 1} and answers[-1, 10] == 0, "no restart"
-    lines = play(BUILDS[board](out, tmp_path, *slow, "TELL_ANSWERS=1"), seconds=8)[0].decode().splitlines()
-    assert lines == told(answers, model)[: len(lines)] and len(lines) >= 17
-    frames, answers = read_golden(out / "golden", model.layout.n_channels, len(model.gestures))
-    frames, answers = frames[:600], answers[answers[:, 1] < 600]
-    before = np.concatenate([[0], np.maximum(0, np.diff(frames[:, 0]))])
-    rows = [format_line(model.layout, row[1:], row[0], d) for row, d in zip(frames.tolist(), before, strict=True)]
-    (tmp_path / "lines").write_bytes(b"".join(rows))
-    sent, _ = play(BUILDS[board](out, tmp_path, "SENSORS=2"), tmp_path / "lines", seconds=40)
-    assert sent.decode().splitlines() == told(answers, model)
-
-
-@pytest.mark.parametrize("board", BUILDS)
 @pytest.mark.parametrize("layout", ["accel-3", "plush-15", "phone-6"])
 def test_lines_that_come_in_are_felt_like_golden_frames(
     packages: Packages, tmp_path: Path, board: str, layout: str

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from plushsense.core.errors import BundleError
+from plushsense.core.errors import ArchError, BundleError
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.core.layouts import Channel, CsvFormat, Derived, Layout, load_layout
 from plushsense.models.arch import Arch, ConvLayer
@@ -21,8 +21,15 @@ from plushsense.runtime.decisions import Rules
 from plushsense.runtime.events import AFFECT_CODES, NO_GESTURE
 from plushsense.runtime.gate import JERK, LEVEL, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
-from plushsense.runtime.image import IntegerModel, grouped_weights, layout_check, memory_bytes
-from support.integers import any_network, models, plain_model
+from plushsense.runtime.image import (
+    IntegerModel,
+    grouped_weights,
+    image_check,
+    image_head,
+    layout_check,
+    memory_bytes,
+)
+from support.integers import any_network, models, plain_model, window_model
 
 
 class Reader:
@@ -43,19 +50,18 @@ class Reader:
 
 
 @settings(max_examples=25)
-@given(models(longest=300) | models(longest=300, window=True))
+@given(models(longest=300))
 def test_read_back(model: IntegerModel) -> None:
     """By the table of the module's docstring, and by nothing else."""
     image = model.to_bytes()
     network, layout, arch = model.network, model.layout, model.network.arch
     magic, version, zero, length, crc = struct.unpack_from("<4sHHII", image)
-    window = arch.padding == "mirror"
-    assert (magic, version, zero, length) == (b"PLSH", 7 if window else 6, 0, len(image))
+    assert (magic, version, zero, length) == (b"PLSH", 6, 0, len(image))
     assert crc == zlib.crc32(image[16:])
     r = Reader(image[16:])
     head = r.take("BBBBHHIIIIHH")
     assert head[:4] == (len(arch.layers), len(layout.channels), arch.channels, arch.classes)
-    assert head[4:7] == (arch.step, 0 if window else arch.pooled // arch.step, arch.span)
+    assert head[4:7] == (arch.step, arch.pooled // arch.step, arch.span)
     period, gap, units, smoothing, check = head[7:]
     assert period * 1000 == layout.period_us * units
     assert gap == layout.gap_ms * units
@@ -212,11 +218,18 @@ def test_counts_that_do_not_fit_their_bits() -> None:
     made((ConvLayer(2, 1, 1),), classes=255).to_bytes()
     with pytest.raises(BundleError, match="256 gestures: in the toy"):
         made((ConvLayer(2, 1, 1),), classes=256)
-    made((ConvLayer(2, 1, 1),), padding="mirror", window=65535, pool=None).to_bytes()
-    with pytest.raises(BundleError, match="window of 65536 samples: in the toy there may be at most 65535"):
-        made((ConvLayer(2, 1, 1),), padding="mirror", window=65536, pool=None)
     # As many filters as an architecture may have.
     made((ConvLayer(1, 1, 4096), ConvLayer(1, 1, 1))).to_bytes()
+
+
+def test_a_network_that_computes_windows_again_has_no_image() -> None:
+    again = "train --arch 5d2_4d3 --filters 6,5 --padding stream, and export that"
+    with pytest.raises(ArchError, match=f"has the padding 'mirror', .* at every step: {again}"):
+        window_model().to_bytes()
+    body = plain_model().to_bytes()[16:]
+    for version in (7, 9):
+        with pytest.raises(BundleError, match="that of a window network, .* train the network with --padding stream"):
+            image_check(image_head(body, version=version) + body)
 
 
 def test_the_layout_check_tells_other_channels() -> None:

@@ -36,17 +36,14 @@ EXHAUSTIVE = {
     "deploy/proof/test_verify.py::test_the_same_on_every_chip[vectors-6]",
     "deploy/proof/test_verify.py::test_without_smoothing_no_mutant_is_applied_that_cannot_show",
     "deploy/test_c_image.py::test_sanitizers_find_nothing_in_good_models",
-    "deploy/test_c_image.py::test_sanitizers_find_nothing_in_window_networks",
     "deploy/test_c_source.py::test_clang_tidy",
     "deploy/test_c_source.py::test_cppcheck",
     "deploy/test_c_source.py::test_no_warning_and_three_functions_of_the_c_library[plain-clang]",
     "deploy/test_c_source.py::test_no_warning_and_three_functions_of_the_c_library[plain-gcc]",
-    "deploy/test_c_source.py::test_no_warning_and_three_functions_of_the_c_library[window-clang]",
-    "deploy/test_c_window.py::test_mutants_of_the_window_are_caught",
+    "deploy/test_c_source.py::test_no_warning_and_three_functions_of_the_c_library[calibrate-clang]",
     "deploy/test_firmware.py::test_clang_agrees",
     "deploy/test_names.py::test_several_models_in_one_program_answer_as_alone[compiler1-cpp]",
     "deploy/test_profile.py::test_a_larger_network_costs_more_only_where_it_is_larger",
-    "deploy/test_profile.py::test_a_window_network_costs_its_window_at_every_step",
     "deploy/test_profile.py::test_counts[cortex-m0]",
     "deploy/test_profile.py::test_counts[cortex-m33]",
     "deploy/test_profile.py::test_counts[cortex-m4]",
@@ -132,10 +129,7 @@ EXHAUSTIVE = {
         f"deploy/proof/test_verify.py::test_faults_are_caught_on_every_chip[{chip}]"
         for chip in ("cortex-m0", "cortex-m33", "cortex-m4", "riscv32")
     ),
-    *(
-        f"deploy/test_c_source.py::test_small_cores_need_no_long_division[{form}]"
-        for form in ("stream-cortex-m4", "window-cortex-m4", "stream-lx106")
-    ),
+    *(f"deploy/test_c_source.py::test_small_cores_need_no_long_division[{form}]" for form in ("cortex-m4", "lx106")),
     *(
         f"faults/test_interrupted.py::test_given_again_it_does_what_it_does_undisturbed[{command}-full-0]"
         for command in ("adapt", "backup", "check", "export", "forget")

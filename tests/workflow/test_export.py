@@ -11,7 +11,6 @@ import pytest
 
 import plushsense as ps
 from plushsense.cli.main import main
-from plushsense.core.errors import ArchError
 from plushsense.core.gestures import load_gestures
 from plushsense.core.layouts import load_layout
 from plushsense.deploy.quantize import calibrated
@@ -80,7 +79,8 @@ def test_the_same_bundle_gives_the_same_files(tmp_path: Path, bundle: Bundle) ->
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"padding": "causal"}, "train 5d1_4d3 with --padding stream"),
+        ({"padding": "causal"}, "train --arch 5d1_4d3 --filters 4,6 --padding stream, and export that"),
+        ({"padding": "mirror"}, "train --arch 5d1_4d3 --filters 4,6 --padding stream, and export that"),
         ({"norm": "layer"}, "train 5d1_4d3 with --norm batch"),
     ],
 )
@@ -92,39 +92,6 @@ def test_what_cannot_be_deployed(
     told = capsys.readouterr().err
     assert said in told and told.count("\n") == 1
     assert not (tmp_path / "out").exists()
-
-
-def test_a_window_network(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The cost is said, the step can be chosen, and everything else is as of any export."""
-    x = np.random.default_rng(1).normal(scale=80, size=(9, 3, 60)).round().astype(np.int64)
-    calibrated(bundle_of(padding="mirror"), x).save(tmp_path / "m.plush")
-    out = tmp_path / "out"
-    assert main(["export", str(tmp_path / "m.plush"), str(out), "--step-s", "0.12"]) == 0
-    said = capsys.readouterr().out
-    # 48 samples instead of 12.
-    assert "120 ms, 7,488 MACs" in said
-    assert "computes its window of 48 samples again, 4 times the MACs of" in " ".join(said.split())
-    facts = json.loads((out / "export.json").read_text(encoding="utf-8"))
-    assert (facts["padding"], facts["times_streaming"], facts["step"], facts["span"]) == ("mirror", 4.0, 12, 48)
-    assert Bundle.load(out / "model.plush").arch.step == 12
-    text = (out / "README.md").read_text(encoding="utf-8")
-    assert "## A window network" in text and "4 times those of a streaming network" in text
-    assert "streaming network, which needs the library of its own export" in text
-    assert main(["info", str(out / "model.plush"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["macs_per_step"] == facts["macs_per_step"] == 7488
-
-
-def test_a_step_that_no_network_can_take(tmp_path: Path, bundle: Bundle) -> None:
-    with pytest.raises(ArchError, match="only a window network .* can take another step"):
-        ps.export(bundle, tmp_path / "out", step_s=0.1)
-    for step_s in (0.0, float("nan"), 61.0):
-        with pytest.raises(ArchError, match="accepted are more than 0"):
-            ps.export(bundle_of(padding="mirror"), tmp_path / "out", step_s=step_s)
-    with pytest.raises(ArchError, match=r"step is 60: accepted are whole numbers from 1 to 48 \(the window\)"):
-        ps.export(bundle_of(padding="mirror"), tmp_path / "out", step_s=0.6)
-    facts = ps.export(bundle, tmp_path / "stream").facts
-    assert facts["padding"] == "stream" and "times_streaming" not in facts
-    assert "window network, which needs" in (tmp_path / "stream" / "README.md").read_text(encoding="utf-8")
 
 
 def test_a_folder_is_no_bundle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

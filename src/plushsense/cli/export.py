@@ -36,17 +36,6 @@ def _conversion(entry: dict[str, Any]) -> str:
     return f"  {entry['file']:<17} {entry['bytes']:,} bytes{difference}"
 
 
-def _window(facts: dict[str, Any]) -> list[str]:
-    """Format the cost of a window network beside that of a streaming one."""
-    if "times_streaming" not in facts:
-        return []
-    text = (
-        f"every step computes its window of {facts['span']} samples again, {facts['times_streaming']:g} times the MACs "
-        f"of a streaming {facts['symbol']} (train --padding stream); plushsense profile shows how often it can run"
-    )
-    return textwrap.wrap(text, 118, initial_indent="  window network    ", subsequent_indent=" " * 20)
-
-
 def run(args: argparse.Namespace) -> int:
     from plushsense.workflow.export import export
 
@@ -54,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         return _patch(args)
     also = listed(args.also)
     package = {"name": args.name, "model_version": args.model_version, "url": args.url}
-    done = export(args.bundle, args.out, dataset=args.dataset, step_s=args.step_s, also=also, **package, warn=warn)
+    done = export(args.bundle, args.out, dataset=args.dataset, also=also, **package, warn=warn)
     facts = done.facts
     simulated = ["  SIMULATION: trained on a virtual toy, not on real touch"] if facts["simulated"] else []
     emit(
@@ -66,7 +55,6 @@ def run(args: argparse.Namespace) -> int:
             f"  model             {done.flash_bytes:,} bytes of flash, without the code (see plushsense profile)",
             f"  memory            {done.ram_bytes:,} bytes of RAM",
             f"  a step            {facts['step_ms']:g} ms, {facts['macs_per_step']:,} MACs",
-            *_window(facts),
             *(_conversion(entry) for entry in facts.get("conversions", {}).values()),
             f"  prove it          plushsense verify {args.out}",
         ],
@@ -83,8 +71,6 @@ def _patch(args: argparse.Namespace) -> int:
         if getattr(args, option):
             words = f"--{option.replace('_', '-')}"
             raise ConfigError(f"{words} is for a whole export: a patch holds no names or versions, so leave it out.")
-    if args.step_s is not None:
-        raise ConfigError("--step-s is for a whole export: a patch has the step of the export that it is for.")
     done = export_patch(args.bundle, args.out, export=args.patch_for, dataset=args.dataset, warn=warn)
     emit(args, done.to_dict(), [f"{done.path}: {done.bytes:,} bytes, for plush_patch on a toy with {args.patch_for}"])
     return 0
@@ -235,7 +221,7 @@ def format_profile(profile: Profile) -> list[str]:
 
 
 def _counts(profile: Profile) -> list[str]:
-    from plushsense.deploy.profile import steps_of
+    from plushsense.deploy.profile import STEPS
 
     costs = [c for c in profile.costs.values() if c.stages]
     if not costs:
@@ -250,19 +236,16 @@ def _counts(profile: Profile) -> list[str]:
         ["plush_begin, once", *(f"{c.begin:,}" for c in costs)],
         ["network, for each MAC", *(f"{c.stages['network'] / profile.arch.macs_per_step:.2f}" for c in costs)],
     ]
-    arch, window, steps = profile.arch, profile.window_instructions, steps_of(profile.facts)
+    arch, window = profile.arch, profile.window_instructions
     again = (
         f"Recomputing all {arch.span} samples of the span at every step takes {arch.macs_per_window:,} MACs, "
         f"{arch.macs_per_window / arch.macs_per_step:.0f} times as many; with the same instructions for each MAC about "
         + ", ".join(f"{window[c.target] / 1e6:.1f} M on {c.target}" for c in costs)
         + " (estimate)."
     )
-    if arch.padding != "stream":
-        times = profile.facts["times_streaming"]
-        again = f"Every step computes {arch.span} samples again, {times:g} times the MACs of a streaming {arch.symbol}."
     return [
         "",
-        f"Instructions, counted (mean of {steps} steps; frames come up to a fifth of a period early or late)",
+        f"Instructions, counted (mean of {STEPS} steps; frames come up to a fifth of a period early or late)",
         table(["", *(c.target for c in costs)], rows),
         *textwrap.wrap(again, 118),
     ]
@@ -321,22 +304,11 @@ def _times(profile: Profile) -> list[str]:
             _two_digits(e.flash_ms) if e.flash_ms else "-",
             _two_digits(e.call_ms),
             e.answer,
-            " to ".join(map(_two_digits, e.largest_rate_hz)),
         ]
         for e in profile.estimates.values()
     ]
     head = ["chip", "MHz", "counted on", "cycles", "ms a step", "flash, up to", "longest call"]
     head += [f"fits {1000 / profile.step_ms:g} Hz"]
-    notes: list[str] = []
-    if profile.arch.padding == "stream":
-        rows = [row[:-1] for row in rows]
-    else:
-        head.append("largest rate, Hz")
-        notes = textwrap.wrap(
-            "Largest rate of a window network: the first surely fits, by the upper bound of the time; above the second "
-            "none does. plushsense export --step-s sets the rate, with the same weights.",
-            118,
-        )
     why: dict[str, list[str]] = {}
     for e in profile.estimates.values():
         core = e.core
@@ -351,7 +323,6 @@ def _times(profile: Profile) -> list[str]:
             "caller of plush_push is busy, while interrupts are served. " + FETCHING,
             118,
         ),
-        *notes,
         *_energy(profile),
         "Where the bounds come from:",
         *(line for words, names in why.items() for line in _wrapped(f"{', '.join(names)}: {words}.")),

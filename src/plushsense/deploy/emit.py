@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
@@ -16,7 +15,6 @@ from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.files import new_folder, read_bytes
 from plushsense.core.templates import fill_text
 from plushsense.deploy.golden import write_golden
-from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.image import HEAD_BYTES, IntegerModel, image_check, image_head, layout_check, memory_bytes
 
@@ -197,37 +195,18 @@ def code_files(model: IntegerModel, bundle: Bundle) -> dict[str, bytes]:
     image = model.to_bytes()
     facts = facts_of(model, bundle, image)
     return {
-        **{
-            name: library_text(name, window=model.is_window, calibrate=bool(model.layout.self_calibration)).encode()
-            for name in LIBRARY
-        },
+        **{name: library_text(name, calibrate=bool(model.layout.self_calibration)).encode() for name in LIBRARY},
         MODEL[0]: _header(facts).encode(),
         MODEL[1]: _source(model, facts["title"]).encode(),
         IMAGE: image,
     }
 
 
-def library_text(name: str, *, window: bool, calibrate: bool = False) -> str:
-    """Return a file of the C library with the code for window networks, or else with that for streaming ones.
-
-    With ``calibrate``, it has the code for sensors that calibrate themselves.
-    """
+def library_text(name: str, *, calibrate: bool = False) -> str:
+    """Return a file of the C library; ``calibrate``: with the code for sensors that calibrate themselves."""
     text = (files("plushsense.deploy") / "c" / name).read_text(encoding="utf-8")
-    # PLUSH_WINDOW first: it also stands within PLUSH_CALIBRATE.
-    for macro, defined in (("PLUSH_WINDOW", window), ("PLUSH_CALIBRATE", calibrate)):
-        parts = rf"#if(n?)def {macro}\b[^\n]*\n(.*?)(?:#else\n(.*?))?#endif /\* {macro} \*/\n"
-        text = re.sub(parts, partial(_compiled, defined), text, flags=re.S)
-    return text
-
-
-def _compiled(defined: bool, found: re.Match[str]) -> str:
-    """Return what is compiled with, or without, a macro; with an alternative or none."""
-    return (found[2] if defined != bool(found[1]) else found[3]) or ""
-
-
-def times_streaming(arch: Arch) -> float:
-    """Return how many times the MACs of a step are those of a streaming network with the same symbol and filters."""
-    return round(arch.macs_per_step / replace(arch, padding="stream", pool=None).macs_per_step, 1)
+    parts = r"#ifdef PLUSH_CALIBRATE\b[^\n]*\n(.*?)(?:#else\n(.*?))?#endif /\* PLUSH_CALIBRATE \*/\n"
+    return re.sub(parts, lambda found: (found[1] if calibrate else found[2]) or "", text, flags=re.S)
 
 
 def facts_of(model: IntegerModel, bundle: Bundle, image: bytes) -> dict[str, Any]:
@@ -263,7 +242,6 @@ def facts_of(model: IntegerModel, bundle: Bundle, image: bytes) -> dict[str, Any
         "macs_per_step": arch.macs_per_step,
         "macs_per_window": arch.macs_per_window,
         "padding": arch.padding,
-        **({"times_streaming": times_streaming(arch)} if model.is_window else {}),
         "model_bytes": len(image),
         "model_id": image_check(image),
         "model_version": model_version if _VERSION.fullmatch(model_version) else code_version,

@@ -290,7 +290,6 @@ def firmware(layout: Layout, scaler: Scaler, facts: Mapping[str, Any]) -> dict[s
         "warming_s": f"{facts['span'] * layout.period_us / 1e6:.2g}",
         "decimal": any(f != (1, 0) for f in formats),
         "delay_only": DEVICE_MS not in layout.wire,
-        "window": "times_streaming" in facts,
         "fields": textwrap.fill(c_comment(" ".join(layout.wire)), 110, initial_indent=indent, subsequent_indent=indent),
         "line_bytes": _line_bytes(layout, formats),
         "wire": [names.get(field, field.upper()) for field in layout.wire],

@@ -32,7 +32,7 @@ PAPER_ASSUMES = (
 )
 OURS_ASSUMES = (
     "the instructions of our C for one step are counted on an emulator, with everything from frame to event",
-    "each decision computes the new samples only, with the state of the layers kept; of a window network, all samples",
+    "each decision computes the new samples only, with the state of the layers kept",
     "weights and activations have 8 bits, sums 32",
     "cycles per instruction lie between two bounds, of which the upper one adds waiting for the flash",
     "the instructions are those of lx106, a sibling of the ESP32's core: rather too many",

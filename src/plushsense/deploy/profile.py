@@ -49,7 +49,6 @@ class Core:
     ma: tuple[float, float]
     power: str
     flash_mb_s: float | None = None
-    cache_kb: int = 0
     model_in_flash: bool = True
 
 
@@ -103,11 +102,6 @@ class Estimate:
         return f"no, it would use {float(low):g} % of the core or more"
 
     @property
-    def largest_rate_hz(self) -> tuple[float, float]:
-        """Largest rates of steps: one that fits by the upper bound, and one by the lower bound."""
-        return 1000 / self.high_ms, 1000 / self.low_ms
-
-    @property
     def verdict(self) -> str:
         """Verdict as text, with the rate of steps."""
         return f"fits {1000 / self.step_ms:g} Hz: {self.answer}"
@@ -141,8 +135,7 @@ def estimate(core: Core, cost: Cost, arch: Arch, step_ms: float) -> Estimate | N
     """Estimate the time of a step on a core from its counts; None if there are none.
 
     A serial flash adds fetching what runs and is read (`Cost.running_bytes`): once for each frame of a step, as other
-    code may run between two of them. A window network computes its window in one call, which fetches everything once if
-    the cache is large enough, else for each sample of the window.
+    code may run between two of them.
     """
     if cost.step is None or cost.call_bound is None:
         return None
@@ -151,14 +144,12 @@ def estimate(core: Core, cost: Cost, arch: Arch, step_ms: float) -> Estimate | N
     if core.flash_mb_s is not None:
         running = cost.running_bytes(with_model=core.model_in_flash)
         once = running / core.flash_mb_s / 1000
-        if arch.padding != "stream" and running > core.cache_kb * 1024:
-            once *= arch.span
-        flash = once if arch.padding != "stream" else once * arch.step
+        flash = once * arch.step
     call = cost.call_bound * core.cycles_high / core.mhz / 1000 + once
     return Estimate(core, cost.step, step_ms, low, high, flash, call)
 
 
-STEPS, WINDOW_STEPS = 50, 5  # number of decisions whose instructions are counted; of window networks
+STEPS = 50  # number of decisions whose instructions are counted
 _STRESS = 100  # frames
 STAGES = ("health", "inputs", "gate", "network", "dense", "decision", "events", "pooling")
 _HEAP = ("malloc", "calloc", "realloc", "free", "reallocarray", "aligned_alloc", "sbrk", "_sbrk", "_Znw", "_Zna")
@@ -182,7 +173,7 @@ _SECTIONS["others"] = tuple(f"{kind}.unlikely.{name}" for name in _OTHERS.split(
 class Cost:
     """Cost on one target in instructions and bytes; counts are None if the target does not count (the host).
 
-    ``step`` is the mean over `steps_of` decisions with frames up to a fifth of a period early or late, ``step_most``
+    ``step`` is the mean over `STEPS` decisions with frames up to a fifth of a period early or late, ``step_most``
     their maximum, ``even`` the mean with even time stamps; ``gap`` is a call that bridges the longest gap.
     ``call_most`` is the longest call of ``plush_push`` that was seen, also with readings at the ends of their ranges,
     ``call_bound`` a bound of it (`_bound`). ``stages`` add up to ``step``: ``clock`` (with the check of values) is the
@@ -323,11 +314,6 @@ def count(
         )
 
 
-def steps_of(facts: Mapping[str, Any]) -> int:
-    """Return the number of decisions that are counted for an export."""
-    return STEPS if facts.get("padding", "stream") == "stream" else WINDOW_STEPS
-
-
 def _mean(counts: Ints) -> int:
     return round(float(counts.mean()))
 
@@ -361,11 +347,11 @@ def _streams(folder: Path, facts: Mapping[str, Any]) -> tuple[Ints, Ints, Ints]:
     clean = frames[6 : 6 + span, 1:]
     if len(clean) < span:
         raise BadInput(f"'{folder / GOLDEN}' holds too few frames: export the model again.")
-    n = span + steps_of(facts) * step + max(0, step - gap_ms * 1000 // period_us)
+    n = span + STEPS * step + max(0, step - gap_ms * 1000 // period_us)
     values = np.resize(clean, (n, clean.shape[1]))
     at_us = 1_000_000 + np.arange(n) * period_us
     jitter = np.random.default_rng(5).integers(-period_us // 5, period_us // 5 + 1, n)
-    jitter[[0, span - 1, *range(span + steps_of(facts) * step - 1, n)]] = 0
+    jitter[[0, span - 1, *range(span + STEPS * step - 1, n)]] = 0
     even = np.column_stack([at_us // 1000, values])
     jittered = np.column_stack([(at_us + jitter) // 1000, values])
     last = np.concatenate([[jittered[-1, 0] + gap_ms], values[0]])
@@ -390,7 +376,7 @@ def _whole(program: Program, facts: Mapping[str, Any]) -> tuple[list[int], Ints,
     table = numbers[7:].reshape(-1, 3)
     first = int(np.flatnonzero(table[:, 2] == 2)[0])
     even, jittered = (part[part[:, 2] == 1][1:] for part in (table[:first], table[first + 1 : -1]))
-    n = steps_of(facts)
+    n = STEPS
     if (len(even), len(jittered)) != (n, n + 1):
         raise ProgramError(
             f"The C in the export gave {len(even)} answers on {program.target.name} where {n} steps of {facts['step']} "
@@ -469,9 +455,7 @@ class Profile:
     def macs_by_layer(self) -> dict[str, int]:
         """Multiply-accumulates of a step by layer; the dense layer is computed once per step."""
         names = (f"layer {n}" for n in range(1, len(self.arch.layers) + 1))
-        positions = [self.arch.step] * len(self.arch.layers) if self.arch.padding == "stream" else self.arch.positions
-        each = zip(names, self.arch.macs_per_position, positions, strict=True)
-        macs = {name: m * n for name, m, n in each}
+        macs = {name: m * self.arch.step for name, m in zip(names, self.arch.macs_per_position, strict=True)}
         return macs | {"dense": self.arch.classes * self.arch.features}
 
     @property
@@ -492,7 +476,7 @@ class Profile:
             "optimise": self.optimise,
             "step": self.arch.step,
             "step_ms": self.step_ms,
-            "decisions_counted": steps_of(self.facts),
+            "decisions_counted": STEPS,
             "instructions_per_step": {name: c.step for name, c in counted.items()},
             "network_instructions_per_step": {name: c.stages["network"] for name, c in counted.items()},
             "macs_per_step": self.arch.macs_per_step,
@@ -501,7 +485,6 @@ class Profile:
             "flash_bytes": {name: c.flash_bytes for name, c in self.costs.items()},
             "ram_bytes": {name: c.ram_bytes for name, c in self.costs.items()},
             "estimated_ms": {name: e.to_dict() for name, e in self.estimates.items()},
-            "largest_rate_hz": {name: [round(r, 2) for r in e.largest_rate_hz] for name, e in self.estimates.items()},
             "estimated_window_instructions": self.window_instructions,
             "targets": {name: c.to_dict() for name, c in self.costs.items()},
             "missing": {name: list(packages) for name, packages in self.missing.items()},

@@ -124,11 +124,11 @@ def calibrate(network: Network, x: NDArray[np.floating[Any]]) -> Ranges:
 
 
 def refuse_undeployable(arch: Arch) -> None:
-    """Raise ArchError for a network that cannot be deployed, with the reason and the option to train it with."""
+    """Raise ArchError for a network that cannot run in integers, with the reason and the option to train it with."""
     if arch.padding == "causal":
         raise ArchError(
             f"{arch.title} has the padding '{arch.padding}', whose zeros cannot be folded with the normalisation: "
-            f"train {arch.symbol} with --padding stream, or mirror for a window network.",
+            f"train {arch.symbol} with --padding stream.",
             reason="arch_padding",
             padding=arch.padding,
         )

@@ -3,9 +3,8 @@
 All numbers are little-endian. Head (16 bytes): ``PLSH``, u16 version, u16 0, u32 length of the whole image, u32 CRC-32
 of everything after the head. The following sections come in this order:
 
-- u8 layers, u8 measured channels, u8 inputs, u8 classes, u16 step, u16 pooled steps (0 in a window network, with the
-  padding ``mirror``), u32 span (samples), u32 period and u32 gap in clock units, u32 clock units per millisecond, u16
-  smoothing weight, u16 layout checksum (`layout_check`)
+- u8 layers, u8 measured channels, u8 inputs, u8 classes, u16 step, u16 pooled steps, u32 span (samples), u32 period and
+  u32 gap in clock units, u32 clock units per millisecond, u16 smoothing weight, u16 layout checksum (`layout_check`)
 - for each measured channel: i32 lowest and i32 highest valid value, i32 zero
 - for each input: u8 kind (0 channel, 1 magnitude, 2 gravity), u8 n, u8 shift of the running mean (else 0), n × u8
   measured channels
@@ -28,9 +27,8 @@ of everything after the head. The following sections come in this order:
   u8 baseline, u8 noise, u32 floor; for each rule: u8 terms, u8 affect, u8 gesture, u8 within, u16 deaf; then for each
   of its terms: u8 signal, i8 sign, u8 times, u8 0, u32 threshold
 
-Images of window networks have a version of their own, because the C library of a streaming network cannot run them, nor
-the other way round. So have those with a self-calibration (`plushsense.windows.calibration`), whose code is compiled
-for such models only.
+Images with a self-calibration (`plushsense.windows.calibration`) have a version of their own, because its code is
+compiled for such models only. Networks that compute a window again at every step (padding ``mirror``) have no image.
 
 A patch replaces the dense layer of one image. Its head is that of an image with ``PLPT`` for ``PLSH``; then come the
 u32 CRC-32 in the head of that image, and the two sections of the new dense layer as in an image.
@@ -51,9 +49,10 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import BundleError
+from plushsense.core.errors import ArchError, BundleError
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import ACCELERATION, Layout
+from plushsense.models.arch import Arch
 from plushsense.runtime.decisions import Rules
 from plushsense.runtime.events import AFFECT_CODES
 from plushsense.runtime.fixed import PROBABILITY_BITS, LogitScale, Requantize
@@ -65,8 +64,8 @@ MAGIC = b"PLSH"
 PATCH_MAGIC = b"PLPT"
 # 2: settings of events, gate and health; 3: zeros and the vector layer; 4: another known score; 6: aligned weights
 IMAGE_VERSION = 6
-WINDOW_IMAGE_VERSION = 7  # of window networks; otherwise as 6
-_CALIBRATED = 2  # added to the version of a model with a self-calibration
+CALIBRATED_IMAGE_VERSION = 8  # of a model with a self-calibration
+_WINDOW_VERSIONS = (7, 9)  # once of networks that computed a window again at every step
 _OTHER_SENSOR = 128  # added to the shift of a sensor that is no accelerometer
 SENSOR_BYTES = 200  # of the state of a sensor that calibrates itself
 HEAD_BYTES = 16
@@ -116,10 +115,6 @@ class IntegerModel:
                     f"Layer {n} of {arch.title} remembers {layer.reach + 1} samples: in the toy there may be at most "
                     f"{MOST_ROWS}, so take a shorter kernel or a smaller dilation."
                 )
-        if self.is_window and arch.window > MOST_ROWS:
-            raise BundleError(
-                f"{arch.title} has a window of {arch.window} samples: in the toy there may be at most {MOST_ROWS}."
-            )
         if arch.vector is not None and arch.vector.kernel > MOST_TAPS:
             raise BundleError(
                 f"The vector layer of {arch.title} has kernels of {arch.vector.kernel} taps: in the toy there may be "
@@ -150,21 +145,14 @@ class IntegerModel:
                 raise BundleError(f"The gesture {gesture.label!r} has a character that the toy cannot keep: rename it.")
 
     @property
-    def is_window(self) -> bool:
-        """Whether every step computes the whole window again (padding ``mirror``)."""
-        return self.network.arch.padding != "stream"
-
-    @property
     def image_version(self) -> int:
         """Version of the image, and of a patch of it."""
-        version = WINDOW_IMAGE_VERSION if self.is_window else IMAGE_VERSION
-        return version + _CALIBRATED if self.layout.self_calibration else version
+        return CALIBRATED_IMAGE_VERSION if self.layout.self_calibration else IMAGE_VERSION
 
     @property
     def pooled_steps(self) -> int:
-        """Number of steps of which the pooling keeps a sum; 0 for a window network."""
-        arch = self.network.arch
-        return 0 if self.is_window else arch.pooled // arch.step
+        """Number of steps of which the pooling keeps a sum."""
+        return self.network.arch.pooled // self.network.arch.step
 
     @property
     def _units_per_ms(self) -> int:
@@ -172,8 +160,13 @@ class IntegerModel:
         return 1000 // math.gcd(1000, self.layout.period_us)
 
     def sections(self) -> list[tuple[str, bytes]]:
-        """Return the sections after the head as pairs of description and bytes."""
+        """Return the sections after the head as pairs of description and bytes.
+
+        Raises:
+            ArchError: for a network that has no C (`refuse_image`).
+        """
         arch, layout = self.network.arch, self.layout
+        refuse_image(arch)
         units_per_ms = self._units_per_ms
         sections = [
             (
@@ -288,6 +281,18 @@ def _rules(rules: Rules) -> list[tuple[str, bytes]]:
     return sections
 
 
+def refuse_image(arch: Arch) -> None:
+    """Raise ArchError for a network that has no image, and no C, with the option to train it with."""
+    if arch.padding != "stream":
+        raise ArchError(
+            f"{arch.title} has the padding '{arch.padding}', with which a toy would compute the whole window again at "
+            f"every step: train --arch {arch.symbol} --filters {','.join(map(str, arch.filters))} --padding stream, "
+            "and export that.",
+            reason="arch_padding",
+            padding=arch.padding,
+        )
+
+
 def layout_check(layout: Layout) -> int:
     """Return a 16-bit checksum of names, units and steps of the measured channels, in order."""
     channels = json.dumps([[c.name, c.unit, c.step] for c in layout.channels])
@@ -305,7 +310,12 @@ def image_check(image: bytes) -> int:
     Raises:
         BundleError: for bytes that are no image of this version.
     """
-    versions = [v + more for v in (IMAGE_VERSION, WINDOW_IMAGE_VERSION) for more in (0, _CALIBRATED)]
+    if image[:6] in [MAGIC + struct.pack("<H", v) for v in _WINDOW_VERSIONS]:
+        raise BundleError(
+            "The image is that of a window network, which has no C any more: train the network with --padding stream "
+            "and export it."
+        )
+    versions = (IMAGE_VERSION, CALIBRATED_IMAGE_VERSION)
     if image[:HEAD_BYTES] not in [image_head(image[HEAD_BYTES:], version=v) for v in versions]:
         raise BundleError("The image is damaged, or of another version of PlushSense: export the model again.")
     return int(struct.unpack_from("<I", image, HEAD_BYTES - 4)[0])
@@ -341,16 +351,13 @@ def memory_bytes(model: IntegerModel) -> int:
     if arch.vector is not None:
         pieces.append(0 if gate.rules else 4 * arch.channels)  # inputs
         pieces += [6 * arch.vector.vectors * arch.vector.kernel, 12 * arch.vector.filters]  # axes, horizontal parts
-    for n, (layer, read) in enumerate(zip(arch.layers, arch.inputs, strict=True)):
+    for layer, read in zip(arch.layers, arch.inputs, strict=True):
         dilation = layer.dilation if layer.kernel > 1 else 1
-        # A window network remembers the inputs of the window, and of the other layers only what is read again.
-        rows = arch.window if n == 0 else min(layer.reach + 1, arch.window)
-        pieces.append((rows if model.is_window else dilation * (layer.kernel + SPARE)) * _filled(read))
+        pieces.append(dilation * (layer.kernel + SPARE) * _filled(read))
         pieces.append(4 * dilation)  # sums under the taps
     pieces.append(2 * features * model.pooled_steps)
     pieces += [4 * features, 4 * arch.classes, 4 * arch.classes + 4]  # sums, logits, smoothed probabilities and known
-    # Which channels are valid, and the newest features: of one position or two.
-    pieces += [channels, features if model.is_window else 2 * features]
+    pieces += [channels, 2 * features]  # which channels are valid, and the newest features of two positions
     health = model.rules.health
     if health.low or health.still_ms:
         pieces.append(4 * channels)  # the frame before

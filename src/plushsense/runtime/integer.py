@@ -1,9 +1,9 @@
 """Integer network: 8-bit weights and activations, 32-bit sums, fixed-point scales.
 
 This module is the specification of a deployed network; the C in the toy gives the same results bit for bit. Networks
-with the padding ``stream`` run sample by sample. With the padding ``mirror``, every step computes the whole window
-again: each layer reads 8-bit activations, reflected before the first. Batch normalisation is folded into the following
-layer. Sums are computed in float64, which is fast and represents all possible sums exactly.
+with the padding ``stream`` run sample by sample. With the padding ``mirror``, for which there is no C, every step
+computes the whole window again: each layer reads 8-bit activations, reflected before the first. Batch normalisation is
+folded into the following layer. Sums are computed in float64, which is fast and represents all possible sums exactly.
 """
 
 from __future__ import annotations
@@ -35,7 +35,10 @@ _SUM_LIMIT = (1 << 31) - 1
 
 
 def deployable(arch: Arch) -> bool:
-    """Return whether a network can be deployed; `plushsense.deploy.quantize.refuse_undeployable` gives the reasons."""
+    """Return whether a network can run in integers; `plushsense.deploy.quantize.refuse_undeployable` gives the reasons.
+
+    In C only those with the padding ``stream`` run (`plushsense.runtime.image.refuse_image`).
+    """
     return arch.padding != "causal" and arch.norm != "layer"
 
 

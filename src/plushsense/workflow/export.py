@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.errors import ArchError, BadInput, BundleError, ConfigError, python_warning
+from plushsense.core.errors import BadInput, BundleError, ConfigError, python_warning
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
 from plushsense.core.sentences import Sentence, plural
@@ -25,7 +25,7 @@ from plushsense.deploy.package import package
 from plushsense.deploy.quantize import calibrated, integer_model, refuse_undeployable
 from plushsense.evaluation.crossval import fold_windows
 from plushsense.models.bundle import Bundle, is_training_content
-from plushsense.runtime.image import image_check, patch_bytes
+from plushsense.runtime.image import image_check, patch_bytes, refuse_image
 from plushsense.scoring.splits import parse_split
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
@@ -118,7 +118,6 @@ def export(
     out: str | os.PathLike[str],
     *,
     dataset: Dataset | str | os.PathLike[str] | None = None,
-    step_s: float | None = None,
     also: Sequence[str] = (),
     name: str = "",
     model_version: str = "",
@@ -128,11 +127,9 @@ def export(
     """Write the files that a toy needs to run a bundle's network: C99, the model as data, golden vectors, packages.
 
     Args:
-        bundle: a bundle with the padding ``stream`` or ``mirror``, and batch normalisation or none. With ``mirror`` it
-            becomes a window network, which computes the whole window again at every step.
+        bundle: a bundle with the padding ``stream``, and batch normalisation or none.
         out: a new or empty folder.
         dataset: the data set of the training, to calibrate on; required if the bundle has no calibration.
-        step_s: seconds from one decision of a window network to the next; by default those of the bundle.
         also: formats for other runtimes (`plushsense.deploy.convert.CONVERTERS`), such as ``onnx``.
         name: prefix of all names in the C code, its files and packages, so that several exports link into one program.
         model_version: version of the model, for the manifests and the C code; by default that in the bundle, or that
@@ -141,8 +138,7 @@ def export(
         warn: called with a sentence for everything unusual.
 
     Raises:
-        ArchError: for a network that cannot be deployed; the message suggests the nearest one that can. Also for a
-            ``step_s`` longer than the window, or for a streaming network, whose pooling is made for its own step.
+        ArchError: for a network that has no C; the message suggests the nearest one that has.
         BundleError: for a bundle without calibration, or a conversion whose output differs from the network's.
         ConfigError, MissingExtraError: for an unknown format, or one whose package is not installed; for a name,
             version or address that is not accepted.
@@ -152,8 +148,7 @@ def export(
     if url:
         check_page(url)
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
-    if step_s is not None:
-        given = _with_step(given, step_s)
+    refuse_image(given.arch)
     windows = None
     if dataset is not None:
         dataset = as_dataset(dataset)
@@ -181,18 +176,6 @@ def export(
     for other in also:
         check_format(other)
     return emit(model, given, Path(out), extras=[converted, package], name=name)
-
-
-def _with_step(bundle: Bundle, step_s: float) -> Bundle:
-    arch = bundle.arch
-    if arch.padding == "stream":
-        raise ArchError(
-            f"{arch.title} is a streaming network, whose pooling has steps of {arch.step} samples: only a window "
-            "network (padding mirror) can take another step, so leave it out."
-        )
-    if not 0.0 < step_s <= 60.0:
-        raise ArchError(f"The step is {step_s:g} s: accepted are more than 0, and at most the window of the network.")
-    return replace(bundle, arch=replace(arch, step=bundle.layout.samples(step_s)))
 
 
 @dataclass(frozen=True)

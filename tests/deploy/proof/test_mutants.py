@@ -15,10 +15,10 @@ from support.exports import bundle_of
 
 
 def test_the_texts_of_the_mutants_occur_in_the_c(small: Path) -> None:
-    source = library_text("plushsense.c", window=False)
+    source = library_text("plushsense.c")
     found = mutants_of((small / "plush_model.bin").read_bytes(), source)
     assert len({f.name for f in found}) == len(found)
-    assert len(found) == len([m for m in source_mutants() if m.when != "vectors" and m.library != "window"]) + 10
+    assert len(found) == len([m for m in source_mutants() if m.when != "vectors"]) + 10
     for mutant in found:
         assert (mutant.image is None) != (mutant.source is None)
         assert mutant.source != source
@@ -36,7 +36,7 @@ def test_the_texts_of_the_mutants_occur_in_the_c(small: Path) -> None:
 def test_the_weight_that_is_changed_is_the_largest_of_a_filter(layout: str, symbol: str) -> None:
     model = integer_model(bundle_of(layout, symbol))
     image = np.frombuffer(model.to_bytes(), dtype=np.uint8).astype(int)
-    found = {m.name: m for m in mutants_of(model.to_bytes(), library_text("plushsense.c", window=False))}
+    found = {m.name: m for m in mutants_of(model.to_bytes(), library_text("plushsense.c"))}
     parts = {f"layer {n}": layer.weights for n, layer in enumerate(model.network.layers, 1)}
     for name, weights in (parts | {"the dense layer": model.network.dense.weights}).items():
         changed = np.frombuffer(found[f"one weight of {name} by one"].image or b"", dtype=np.uint8).astype(int)

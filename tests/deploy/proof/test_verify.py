@@ -205,7 +205,7 @@ def test_every_fault_is_caught_on_the_host(
     assert [f.name for f in done.mutants if not f.caught] == [] and done.passed
     kinds = {"weight", "shift", "index", "rounding", "clamp", "rule", "constant", "patch", *RULES}
     assert {f.kind for f in done.mutants} == kinds
-    every = len([m for m in source_mutants() if m.when != "vectors" and m.library != "window"]) + 10
+    every = len([m for m in source_mutants() if m.when != "vectors"]) + 10
     assert len(done.mutants) == (len(kinds) if each == "kind" else every)
     # By an answer, not because the toy would not begin or crashed.
     assert all("should be" in (f.first or "") and "plush_begin" not in (f.first or "") for f in done.mutants)
@@ -381,7 +381,7 @@ def test_without_smoothing_no_mutant_is_applied_that_cannot_show(c_compiler: str
     bundle = replace(bundle_of("plush-15", "9d1_5d2", "4,6"), decision={"smoothing_s": 0})
     export = Export(exported(tmp_path / "out", bundle))
     applied = mutants_of(export.image, export.source.decode("latin-1"))
-    assert len(applied) == len([m for m in source_mutants() if m.when != "vectors" and m.library != "window"]) + 9
+    assert len(applied) == len([m for m in source_mutants() if m.when != "vectors"]) + 9
     done = verify(export, ["host"], only=plainly, mutants=lambda mutant: mutant.kind not in RULES)
     assert done.passed and len(done.mutants) == sum(mutant.kind not in RULES for mutant in applied)
     assert all("should be" in (f.first or "") and "plush_begin" not in (f.first or "") for f in done.mutants)

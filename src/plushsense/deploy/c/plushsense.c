@@ -376,11 +376,7 @@ PLUSH_SMALL static int read_head(plush_toy *toy, source *from)
     toy->layout = (uint16_t)le16(p + 26);
     toy->ranges = next_bytes(from, RANGE_BYTES * toy->channels);
     if (toy->layers == 0 || toy->layers > PLUSH_MAX_LAYERS || toy->channels == 0 || toy->inputs == 0 ||
-#ifdef PLUSH_WINDOW
-        toy->classes == 0 || toy->step == 0 || toy->step > MOST_STEP || toy->blocks != 0 || toy->period == 0 ||
-#else
         toy->classes == 0 || toy->step == 0 || toy->step > MOST_STEP || toy->blocks == 0 || toy->period == 0 ||
-#endif /* PLUSH_WINDOW */
         toy->period > MOST_UNITS || toy->gap == 0 || toy->gap > MOST_UNITS || toy->units_per_ms == 0 ||
         toy->smoothing == 0 || toy->smoothing > PLUSH_ONE || toy->ranges == NULL)
         return 0;
@@ -545,11 +541,7 @@ PLUSH_SMALL static int read_layer(plush_layer *layer, uint32_t channels, source 
         return 0;
     layer->groups = (uint16_t)(row / GROUP);
     layer->filters = (uint16_t)filters;
-#ifdef PLUSH_WINDOW
-    layer->rows = (uint16_t)rows;
-#else
     layer->row = layer->kernel;
-#endif /* PLUSH_WINDOW */
     layer->weights = next_bytes(from, layer->kernel * row * fill_up(filters));
     return 1;
 }
@@ -674,11 +666,7 @@ PLUSH_SMALL static int read_gate_plan(plush_toy *toy, source *from)
 PLUSH_SMALL static int read_model(plush_toy *toy, const uint8_t *model)
 {
     source from;
-#ifdef PLUSH_WINDOW
-    uint32_t i;
-#else
     uint32_t span, i;
-#endif /* PLUSH_WINDOW */
 
     from.at = model + HEAD_BYTES;
     from.left = word_at(model + 8) - HEAD_BYTES;
@@ -689,21 +677,6 @@ PLUSH_SMALL static int read_model(plush_toy *toy, const uint8_t *model)
     if (!read_head(toy, &from) || !read_input_plan(toy, &from) || !read_vectors(toy, &from))
         return 0;
 #endif /* PLUSH_CALIBRATE */
-#ifdef PLUSH_WINDOW
-    if (toy->vectors != 0 || toy->span < 2 || toy->span > MOST_ROWS)
-        return 0;
-    for (i = 0; i < toy->layers; i++) {
-        plush_layer *layer = &toy->layer[i];
-
-        if (!read_layer(layer, toy->features, &from))
-            return 0;
-        toy->features = layer->filters;
-        if (i == 0 || layer->rows > toy->span)
-            layer->rows = (uint16_t)toy->span;
-    }
-    return read_dense_and_names(toy, &from) && read_event_plan(toy, &from) && read_health_plan(toy, &from) &&
-           read_gate_plan(toy, &from) && from.left == 0;
-#else
     span = (uint32_t)toy->step * toy->blocks + (toy->vectors != 0 ? toy->vector_taps - 1u : 0u);
     for (i = 0; i < toy->layers; i++) {
         if (!read_layer(&toy->layer[i], toy->features, &from))
@@ -713,7 +686,6 @@ PLUSH_SMALL static int read_model(plush_toy *toy, const uint8_t *model)
     }
     return toy->span == span && read_dense_and_names(toy, &from) && read_event_plan(toy, &from) &&
            read_health_plan(toy, &from) && read_gate_plan(toy, &from) && from.left == 0;
-#endif /* PLUSH_WINDOW */
 }
 
 /* A piece of the memory; only reckoned while there is none. */
@@ -736,14 +708,12 @@ PLUSH_SMALL static int has_gate(const plush_toy *toy)
     return toy->gate_rules != 0;
 }
 
-#ifndef PLUSH_WINDOW
 /* How many rows a phase has room for. */
 static uint32_t phase_rows(const plush_layer *layer)
 {
     return layer->kernel + SPARE;
 }
 
-#endif /* PLUSH_WINDOW */
 /* Hands out the memory of a model that was read. Returns the bytes of it. */
 PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 {
@@ -759,16 +729,10 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
     for (i = 0; i < toy->layers; i++) {
         plush_layer *layer = &toy->layer[i];
 
-#ifdef PLUSH_WINDOW
-        layer->ring = (uint32_t *)take(memory, &used, (uint32_t)layer->rows * layer->groups * GROUP);
-#else
         layer->ring = (uint32_t *)take(memory, &used, layer->dilation * phase_rows(layer) * layer->groups * GROUP);
-#endif /* PLUSH_WINDOW */
         layer->tap_sums = (uint32_t *)take(memory, &used, UINT32_C(4) * layer->dilation);
     }
-#ifndef PLUSH_WINDOW
     toy->sums = (uint16_t *)take(memory, &used, UINT32_C(2) * toy->features * toy->blocks);
-#endif /* PLUSH_WINDOW */
     toy->total = (uint32_t *)take(memory, &used, 4u * toy->features);
     toy->logits = (int32_t *)take(memory, &used, 4u * toy->classes);
     toy->smooth = (int32_t *)take(memory, &used, 4u * (toy->classes + 1u));
@@ -783,11 +747,7 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         toy->gate_bytes = (uint16_t)(used - start);
     }
     toy->valid = (uint8_t *)take(memory, &used, toy->channels);
-#ifdef PLUSH_WINDOW
-    toy->top = (uint8_t *)take(memory, &used, toy->features);
-#else
     toy->top = (uint8_t *)take(memory, &used, 2u * toy->features);
-#endif /* PLUSH_WINDOW */
     toy->memory_bytes = used; /* what a restart forgets: health has its own rules */
     toy->last = (int32_t *)take(memory, &used, last_matters(toy) ? 4u * toy->channels : 0);
 #ifdef PLUSH_CALIBRATE
@@ -839,7 +799,6 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         PLUSH_TWO_FILTERS(s0, s1);                                                                         \
         PLUSH_TWO_FILTERS(s2, s3);                                                                         \
     } while (0)
-#ifndef PLUSH_WINDOW
 #define PLUSH_PAIR                                                                                         \
     do {                                                                                                   \
         uint32_t a, b, c, d, e, f;                                                                         \
@@ -853,7 +812,6 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
                          : [c] "r"(c), [d] "r"(d), [e] "r"(e), [f] "r"(f)                                  \
                          : "memory");                                                                      \
     } while (0)
-#endif /* PLUSH_WINDOW */
 
 #elif defined(__SSE2__) && !defined(PLUSH_PLAIN)
 
@@ -914,7 +872,6 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         x += 4;           \
         w += 16;          \
     } while (0)
-#ifndef PLUSH_WINDOW
 #if !defined(__thumb__) || defined(__thumb2__)
 /* Four loads, then two products, then two sums: in a pipeline, what was loaded or multiplied is there one or two cycles
  * later. */
@@ -947,7 +904,6 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
         w += 16;                  \
     } while (0)
 #endif
-#endif /* PLUSH_WINDOW */
 
 #endif
 
@@ -976,66 +932,6 @@ PLUSH_SMALL static uint32_t share_out(plush_toy *toy, uint8_t *memory)
 
 /* ---- The network ----------------------------------------------------------------------------------------------- */
 
-#ifdef PLUSH_WINDOW
-/* Room for a new sample. */
-PLUSH_CODE
-static uint8_t *next_row(plush_layer *layer)
-{
-    layer->newest = (uint16_t)(layer->newest + 1u < layer->rows ? layer->newest + 1u : 0u);
-    return (uint8_t *)(layer->ring + (uint32_t)layer->newest * layer->groups);
-}
-
-/* Where the taps of a position lie on the window: the first one at `at`, the next one `by` further. Before the first
- * sample and after the last, they turn around. */
-typedef struct {
-    int32_t at, by;
-    int32_t last;  /* sample of the window */
-    int32_t first; /* row of the ring, for sample 0 of the window */
-} taps_on;
-
-/* The taps of the next position of a layer that can read `made` samples of a window of `span`. */
-PLUSH_CODE
-static taps_on next_taps(const plush_layer *layer, uint32_t made, uint32_t span)
-{
-    uint32_t reach = (layer->kernel - 1u) * (uint32_t)layer->dilation, around = 2u * (span - 1u), before;
-    taps_on taps;
-
-    taps.by = layer->dilation;
-    taps.last = (int32_t)span - 1;
-    taps.first = (int32_t)layer->newest + 1 - (int32_t)made;
-    if (layer->done >= reach) {
-        taps.at = (int32_t)(layer->done - reach);
-        return taps;
-    }
-    before = reach - layer->done;
-    if (before >= span)
-        before %= around;
-    if (before >= span) {
-        taps.at = (int32_t)(around - before);
-    } else {
-        taps.at = (int32_t)before;
-        taps.by = -taps.by;
-    }
-    return taps;
-}
-
-PLUSH_CODE
-static const uint32_t *row_under(const plush_layer *layer, int32_t at, int32_t first)
-{
-    return layer->ring + (uint32_t)(at + first < 0 ? at + first + layer->rows : at + first) * layer->groups;
-}
-
-PLUSH_CODE
-static void go_on(taps_on *taps)
-{
-    taps->at += taps->by;
-    while (taps->at < 0 || taps->at > taps->last) {
-        taps->at = taps->at < 0 ? -taps->at : 2 * taps->last - taps->at;
-        taps->by = -taps->by;
-    }
-}
-
-#else
 /* The newest row under these taps. */
 PLUSH_CODE
 static uint32_t *newest_row(const plush_layer *layer, uint32_t *taps)
@@ -1069,7 +965,6 @@ static uint8_t *next_row(plush_layer *layer)
     return (uint8_t *)newest_row(layer, layer->taps[0]);
 }
 
-#endif /* PLUSH_WINDOW */
 /* The sum of all bytes of a row. */
 PLUSH_CODE
 static uint32_t row_sum(const plush_layer *layer, const uint32_t *row)
@@ -1083,26 +978,6 @@ static uint32_t row_sum(const plush_layer *layer, const uint32_t *row)
 
 /* What every weight's + 128 adds to the sums of a position: 128 times all activations under the taps. Their sum is that
  * of `dilation` samples ago, less the row that has left, plus the one that has come. */
-#ifdef PLUSH_WINDOW
-PLUSH_CODE
-static uint32_t surplus(plush_layer *layer, taps_on taps)
-{
-    uint32_t *kept = &layer->tap_sums[layer->phase], sum = 0;
-    const uint32_t *first = row_under(layer, taps.at, taps.first);
-
-    if (layer->done < layer->dilation) {
-        uint32_t n;
-
-        for (n = layer->kernel; n > 0; n--, go_on(&taps))
-            sum += row_sum(layer, row_under(layer, taps.at, taps.first));
-    } else {
-        sum = *kept + row_sum(layer, row_under(layer, layer->done, taps.first));
-    }
-    *kept = sum - row_sum(layer, first);
-    layer->phase = (uint16_t)(layer->phase + 1u < layer->dilation ? layer->phase + 1u : 0u);
-    return sum * WEIGHT_ZERO;
-}
-#else
 PLUSH_CODE
 static uint32_t surplus(plush_layer *layer, uint32_t back)
 {
@@ -1112,28 +987,10 @@ static uint32_t surplus(plush_layer *layer, uint32_t back)
     layer->tap_sums[phase] = sum - row_sum(layer, layer->taps[back]);
     return sum * WEIGHT_ZERO;
 }
-#endif /* PLUSH_WINDOW */
 
 /* The sums of four filters at one position, of activations times (weight + 128), modulo 2^32. By itself, so that its loop
  * has all registers. */
 PLUSH_APART
-#ifdef PLUSH_WINDOW
-static void four_sums(const plush_layer *layer, taps_on on, const uint8_t *w, uint32_t sum[GROUP])
-{
-    uint32_t taps = layer->kernel;
-    PLUSH_SUMS;
-
-    do {
-        const uint8_t *x = (const uint8_t *)row_under(layer, on.at, on.first), *end = x + layer->groups * GROUP;
-
-        do
-            PLUSH_ALONE;
-        while (x != end);
-        go_on(&on);
-    } while (--taps != 0);
-    PLUSH_GIVE;
-}
-#else
 static void four_sums(const uint8_t *x, const uint8_t *end, const uint8_t *w, uint32_t sum[GROUP])
 {
     PLUSH_SUMS;
@@ -1187,7 +1044,6 @@ static void pair_sums(const uint8_t *x, const uint8_t *y, uint32_t size, const u
     four_sums(y, y + size, w, sum + GROUP);
 #endif
 }
-#endif /* PLUSH_WINDOW */
 
 /* ReLU, and a sum to 8 bits. */
 PLUSH_CODE
@@ -1201,22 +1057,6 @@ static uint32_t requantize(int32_t sum, uint32_t times, uint32_t before, uint32_
     return t;
 }
 
-#ifdef PLUSH_WINDOW
-/* One new position of a layer, (filters) activations. */
-PLUSH_CODE
-static void advance(plush_layer *layer, taps_on taps, uint8_t *out)
-{
-    const uint8_t *weights = layer->weights, *scale = layer->scales;
-    uint32_t size = (uint32_t)layer->kernel * layer->groups * GROUP * GROUP, extra = surplus(layer, taps), sum[GROUP], f, i;
-
-    layer->done++;
-    for (f = 0; f < layer->filters; f += GROUP, weights += size) {
-        four_sums(layer, taps, weights, sum);
-        for (i = 0; i < GROUP && f + i < layer->filters; i++, scale += SCALE_BYTES)
-            out[f + i] = (uint8_t)requantize(as_signed(sum[i] + le32(scale) - extra), le16(scale + 4), scale[6], scale[7]);
-    }
-}
-#else
 /* A new position of a layer, (filters) activations, or two: then `before` are those of the older one. */
 PLUSH_CODE
 static void advance(plush_layer *layer, int two, uint8_t *newest, uint8_t *before)
@@ -1241,41 +1081,7 @@ static void advance(plush_layer *layer, int two, uint8_t *newest, uint8_t *befor
         }
     }
 }
-#endif /* PLUSH_WINDOW */
 
-#ifdef PLUSH_WINDOW
-/* One new sample, whose quantized inputs are in the first ring. When a step is complete, all of the window goes through
- * all layers into the pooling again: the last layer position by position, and those below as far as it needs them, so
- * that a layer remembers no more than what lies under its taps. */
-PLUSH_APART
-static void network_sample(plush_toy *toy)
-{
-    plush_layer *last = &toy->layer[toy->layers - 1u], *layer = last;
-    uint32_t f;
-
-    if (toy->filled + 1u < toy->step || toy->warm + 1u < toy->span)
-        return;
-    memset(toy->total, 0, 4u * toy->features);
-    for (f = 0; f < toy->layers; f++)
-        toy->layer[f].done = toy->layer[f].phase = 0;
-    while (last->done < toy->span) {
-        uint32_t made = layer == toy->layer ? toy->span : layer[-1].done;
-
-        if (made <= layer->done || made < layer->rows) {
-            layer--;
-        } else if (layer != last) {
-            advance(layer, next_taps(layer, made, toy->span), next_row(layer + 1));
-            layer++;
-        } else {
-            advance(layer, next_taps(layer, made, toy->span), toy->top);
-            for (f = 0; f < toy->features; f++)
-                toy->total[f] += toy->top[f];
-            if (toy->on_position != NULL)
-                toy->on_position(toy, toy->user);
-        }
-    }
-}
-#else
 /* One new sample, whose quantized inputs are in the first ring. It waits for the next one, and both go through all layers
  * into the pooling together; one alone only when the step ends with it. */
 PLUSH_APART
@@ -1308,7 +1114,6 @@ static void network_sample(plush_toy *toy)
         toy->total[f] += v;
     }
 }
-#endif /* PLUSH_WINDOW */
 
 /* ---- From pooled sums to an answer ----------------------------------------------------------------------------- */
 
@@ -1672,11 +1477,9 @@ static void event_step(plush_toy *toy, uint32_t best, uint32_t ms)
 PLUSH_SMALL_APART PLUSH_CODE
 static void answer(plush_toy *toy, uint32_t ms)
 {
-#ifndef PLUSH_WINDOW
     uint16_t *sums;
     uint32_t f;
 
-#endif /* PLUSH_WINDOW */
     toy->answer.ms = ms;
     if (toy->warm >= toy->span) {
         toy->answer.state = PLUSH_TRACKING;
@@ -1686,14 +1489,12 @@ static void answer(plush_toy *toy, uint32_t ms)
         blind_step(toy, ms);
     }
     toy->filled = 0;
-#ifndef PLUSH_WINDOW
     toy->block = (uint16_t)(toy->block + 1u < toy->blocks ? toy->block + 1u : 0u);
     sums = toy->sums + (uint32_t)toy->block * toy->features;
     for (f = 0; f < toy->features; f++) {
         toy->total[f] -= sums[f];
         sums[f] = 0;
     }
-#endif /* PLUSH_WINDOW */
     toy->answers++;
     if (toy->on_answer != NULL)
         toy->on_answer(toy, toy->user);
@@ -2474,9 +2275,7 @@ PLUSH_SMALL static void forget(plush_toy *toy)
     uint32_t phase;
 
     memset(toy->memory, 0, toy->memory_bytes);
-#ifndef PLUSH_WINDOW
     toy->waiting = 0;
-#endif /* PLUSH_WINDOW */
     toy->heard = toy->running = 0;
     toy->block = toy->gate_deaf = 0;
     toy->gate_seen = toy->gate_newest = toy->gate_doubt = 0;

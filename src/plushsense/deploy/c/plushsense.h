@@ -43,17 +43,9 @@ extern "C" {
 #endif
 
 #ifdef PLUSH_CALIBRATE /* models whose sensors find their offset and scale themselves */
-#ifdef PLUSH_WINDOW
-#define PLUSH_IMAGE_VERSION 9
-#else
 #define PLUSH_IMAGE_VERSION 8
-#endif /* PLUSH_WINDOW */
-#else
-#ifdef PLUSH_WINDOW
-#define PLUSH_IMAGE_VERSION 7 /* of window networks, which compute the whole window again at every step */
 #else
 #define PLUSH_IMAGE_VERSION 6
-#endif /* PLUSH_WINDOW */
 #endif /* PLUSH_CALIBRATE */
 #define PLUSH_MAX_LAYERS 4
 #define PLUSH_ONE 32768 /* a confidence or probability of 1 */
@@ -140,18 +132,10 @@ typedef struct {
     uint16_t filters;
     uint16_t groups;        /* of 4 channels that it reads */
     uint16_t dilation;
-#ifdef PLUSH_WINDOW
-    uint16_t phase;         /* the next of tap_sums */
-    uint16_t rows;          /* samples that it remembers */
-    uint16_t newest;        /* row of the newest sample */
-    uint16_t done;          /* positions of the window that are computed */
-    uint32_t *ring;         /* rows x groups x 4 activations */
-#else
     uint16_t phase;         /* of the newest sample: samples `dilation` apart have the same one */
     uint32_t row;           /* of the newest sample in its phase */
     uint32_t *ring;         /* dilation x rows x groups x 4 activations */
     uint32_t *taps[2];      /* the oldest row under the taps of the newest sample, and of the one before */
-#endif /* PLUSH_WINDOW */
     const uint8_t *scales;  /* of each filter: bias, multiplier, shifts */
     const uint8_t *weights;
     uint32_t *tap_sums;     /* for each of the next `dilation` samples: sum of the activations already under its taps */
@@ -207,11 +191,6 @@ typedef struct plush_toy {
      * (plush_push, plush_silence, plush_restart, plush_begin, plush_swap, plush_patch). A step's event comes before its answer. */
     void (*on_answer)(const struct plush_toy *toy, void *user);
     void (*on_event)(const struct plush_toy *toy, void *user);
-#ifdef PLUSH_WINDOW
-    /* Called many times while a step computes its window, by the same rules; may be NULL. Readings that are due meanwhile
-     * can be taken here and kept with their times, to be pushed when plush_push() has returned. */
-    void (*on_position)(const struct plush_toy *toy, void *user);
-#endif /* PLUSH_WINDOW */
     void *user;
 
     /* The model, as it was read. `channels` and `layout` may be read, too: `layout` stands for the names, units, steps
@@ -269,15 +248,11 @@ typedef struct plush_toy {
     /* Pooling and smoothing. */
     uint16_t filled, block;
     uint8_t *top;            /* the last layer's newest activations */
-#ifndef PLUSH_WINDOW
     uint16_t *sums;          /* blocks x features */
-#endif /* PLUSH_WINDOW */
     uint32_t *total;         /* of each feature: its sum over all blocks */
     uint32_t warm;           /* samples, up to the span */
     uint8_t started;         /* the smoothing has begun */
-#ifndef PLUSH_WINDOW
     uint8_t waiting;         /* the newest sample is computed together with the next one */
-#endif /* PLUSH_WINDOW */
     int32_t *logits;         /* of each class, in steps of 1/256 */
     int32_t *smooth;         /* of each class: probability in steps of 2^-27; after them the highest logit in 2^-20 */
 

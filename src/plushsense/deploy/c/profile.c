@@ -172,7 +172,6 @@ static void count_stages(const int32_t *row, const int32_t *end)
             gate_sample(&toy, (uint32_t)row[0]);
             gate += since(then);
         }
-        toy.filled = (uint16_t)samples; /* a window network computes when the step is complete */
         then = target_instructions();
         network_sample(&toy);
         network += since(then);
@@ -275,7 +274,7 @@ static uint32_t slack_of_sample(void)
 static void count_parts(void)
 {
     uint32_t samples = (toy.gap + toy.period - 1) / toy.period, together = samples, round, i, then, of[MOST_AT_ONCE];
-    uint32_t rounds = toy.blocks == 0 ? 4u * toy.step : 40u * toy.step; /* a window network takes long */
+    uint32_t rounds = 40u * toy.step;
     int32_t values[PLUSH_MODEL_CHANNELS];
 
     if (together > MOST_AT_ONCE)

@@ -99,7 +99,7 @@ def refuse_window(arch: Arch, format_name: str) -> None:
     if arch.padding != "stream":
         raise ArchError(
             f"{arch.title} has the padding '{arch.padding}', which PlushSense does not write to {format_name}: take "
-            f"the C of plushsense export, onnx, onnx-int8 or tflite, or train {arch.symbol} with --padding stream."
+            f"onnx, onnx-int8 or tflite, or train {arch.symbol} with --padding stream."
         )
 
 

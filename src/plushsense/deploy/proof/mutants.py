@@ -28,18 +28,16 @@ RULES: tuple[Kind, ...] = ("event", "gate", "health")  # kinds that the test sce
 class SourceMutant:
     """A replacement of text in plushsense.c.
 
-    ``name`` describes the error, ``when`` the models it affects, ``library`` that for which it is: for streaming
-    networks, for window networks, or both.
+    ``name`` describes the error, ``when`` the models it affects.
     """
 
     kind: Kind
     name: str
     find: str
     replace: str
-    when: Literal[
-        "always", "dilated", "magnitude", "paired", "ranged", "reaching", "smoothed", "stepped", "ties", "vectors"
-    ] = "always"
-    library: Literal["both", "stream", "window"] = "both"
+    when: Literal["always", "dilated", "magnitude", "paired", "ranged", "smoothed", "stepped", "ties", "vectors"] = (
+        "always"
+    )
 
 
 @cache
@@ -96,8 +94,6 @@ def mutants_of(image: bytes, source: str) -> list[Mutant]:
         "always": True,
         "dilated": any(layer.dilation > 1 for layer in at.layers),
         "magnitude": at.magnitudes,
-        # With kernels of one tap, nothing is reflected.
-        "reaching": any(layer.index.shape[2] > 1 for layer in at.layers),
         "vectors": bool(at.vectors),
         "ranged": bool(ranged),
         # With a step of one sample, every sample has an answer, and none waits for the next.
@@ -108,10 +104,7 @@ def mutants_of(image: bytes, source: str) -> list[Mutant]:
         # With smaller time units, ties are rare.
         "ties": at.units_per_ms <= 10,
     }
-    library = "window" if at.pooled_steps == 0 else "stream"
     for mutant in source_mutants():
-        if mutant.library not in ("both", library):
-            continue
         if source.count(mutant.find) != 1:
             raise BadInput(
                 f"The mutant '{mutant.name}' cannot be applied: its text ({mutant.find.strip()!r}) occurs "
@@ -156,9 +149,7 @@ class _ImageOffsets:
     """Offsets and settings in an image; `plushsense.runtime.image` defines the format."""
 
     def __init__(self, image: bytes) -> None:
-        count, channels, inputs, classes, self.step, self.pooled_steps = struct.unpack_from(
-            "<BBBBHH", image, HEAD_BYTES
-        )
+        count, channels, inputs, classes, self.step = struct.unpack_from("<BBBBH", image, HEAD_BYTES)
         (self.units_per_ms,) = struct.unpack_from("<I", image, HEAD_BYTES + 20)
         (self.smoothing,) = struct.unpack_from("<H", image, HEAD_BYTES + _SMOOTHING_AT)
         at = HEAD_BYTES + _FIXED_BYTES

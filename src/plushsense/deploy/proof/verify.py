@@ -396,8 +396,8 @@ class _Runner:
             (copy / IMAGE).write_bytes(mutant.image)
         if mutant.source is not None:
             (copy / LIBRARY[1]).write_text(mutant.source, _ENCODING)
-        # On the host compiling a streaming network takes longer than running it.
-        optimise = "-O0" if setting.target == "host" and not self.export.model.is_window else "-O2"
+        # On the host compiling takes longer than running.
+        optimise = "-O0" if setting.target == "host" else "-O2"
         plain = replace(setting, optimise=optimise, flags=("-std=c99",), image=mutant.image is not None)
         streams = streams[: 1 if mutant.image is not None else None]
         # Scenarios are most likely to detect mutants of the rules.

@@ -105,9 +105,6 @@ def show_facts(page: Page, export: ExportFacts, made: StudioJob | None) -> None:
             notice(words("shell.simulation"))
         for warning in made.warnings if made else ():
             notice(words.sentence(warning))
-        if "times_streaming" in export.facts:
-            times = words.significant(export.facts["times_streaming"], 2)
-            notice(words("export.window_network", n=export.facts["span"], times=times))
         text(words("export.hand_over"))
         download = ui.link(words("export.download"), download_address(EXPORTS, export.name)).classes("ps-link")
         tag(download.props("download"), "download")
