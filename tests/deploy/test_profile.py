@@ -81,8 +81,8 @@ def test_the_networks_of_the_issue_stay_within_their_limits(
         assert cost.ram_bytes + (cost.stack_push or 0) <= 6 * 1024
         assert cost.call_most and cost.call_bound and cost.call_most <= cost.call_bound < 1.3 * cost.call_most
         assert cost.begin is not None
-        # RV32 takes more, see docs/deploy.md.
-        assert cost.begin < 50_000 or symbol != "14d1_19d2_19d4" or name == "riscv32"
+        # A millisecond at 160 MHz, once: most of it is the CRC of the image, by a table of 64 bytes.
+        assert cost.begin < 160_000 or symbol != "14d1_19d2_19d4"
     assert all(e.fits == "yes" for e in found.estimates.values())
 
 
