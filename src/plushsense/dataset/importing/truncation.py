@@ -158,7 +158,7 @@ def truncation_marks(
     one, or was changed since.
 
     Args:
-        recordings: recordings of the data set; those with a trim in ``states``, also an undone one, are left as they are.
+        recordings: recordings of the data set; those with a trim in ``states``, or an undone one, stay as they are.
         origin: the source of each file of the data set.
     """
     by_name: dict[str, list[Choice]] = {}
