@@ -57,7 +57,9 @@ def test_the_command_trains_nothing_and_its_file_is_evaluated_on_its_own_sets(
     sizes = json.loads(capsys.readouterr().out)["windows"]
     assert main(["import", file, str(tmp_path / "DS")]) == 0
     capsys.readouterr()
-    assert main(["evaluate", str(tmp_path / "DS"), "--split", "saved", "--save-windows", file, *words[2:]]) == 0
+    assert (
+        main(["evaluate", str(tmp_path / "DS"), "--split", "saved", "--save-windows", file, "--force", *words[2:]]) == 0
+    )
     assert ", ".join(f"{n} {name}" for name, n in sizes.items()) in capsys.readouterr().out
 
 
@@ -71,6 +73,14 @@ def test_the_command_trains_nothing_and_its_file_is_evaluated_on_its_own_sets(
 def test_what_cannot_be_saved(dataset: Dataset, tmp_path: Path, split: str, name: str, error: str) -> None:
     with pytest.raises(ConfigError, match=error):
         save_windows(dataset, tmp_path / name, split=split, context="rows")
+
+
+def test_an_existing_file_is_kept_unless_forced(dataset: Dataset, tmp_path: Path) -> None:
+    (path := tmp_path / "w.mat").write_text("of somebody else")
+    with pytest.raises(ConfigError, match="exists already"):
+        save_windows(dataset, path, split="windows:file-order", context="rows")
+    assert path.read_text() == "of somebody else"
+    assert save_windows(dataset, path, split="windows:file-order", context="rows", overwrite=True).bytes > 1000
 
 
 def folded(*names: str) -> Any:

@@ -24,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
         from plushsense.core.sentences import join_names
         from plushsense.workflow.export import save_windows
 
-        saved = save_windows(dataset, args.save_windows, config, warn=warn)
+        saved = save_windows(dataset, args.save_windows, config, overwrite=args.force, warn=warn)
         sizes = join_names(f"{n} {name}" for name, n in saved.windows.items())
         emit(args, saved.to_dict(), [f"{saved.path}: windows: {sizes}; {saved.bytes:,} bytes"])
         return 0

@@ -7,7 +7,7 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -87,7 +87,8 @@ class MarkState:
     """State of a recording or a stream after all its marks.
 
     ``accepted`` holds the checks whose findings are accepted; ``how`` is that of the current trim. ``stretches`` of a
-    stream are ordered and do not overlap. ``gesture`` is "" if it is the recorded one.
+    stream are ordered and do not overlap. ``gesture`` is "" if it is the recorded one. ``trim_by`` and ``gesture_by``
+    name who decided last on the trim and on the gesture, also to undo them; "" if nobody did.
     """
 
     excluded: bool = False
@@ -97,6 +98,8 @@ class MarkState:
     how: str = ""
     stretches: tuple[LabelledStretch, ...] = ()
     gesture: str = ""
+    trim_by: str = field(default="", compare=False)
+    gesture_by: str = field(default="", compare=False)
 
     @property
     def trimmed(self) -> bool:
@@ -347,15 +350,15 @@ def apply_mark(now: MarkState, mark: Mark) -> MarkState:
     """Return the state of a recording after ``mark``, from its state ``now``."""
     match mark.action:
         case "trim":
-            return replace(now, start=mark.start, stop=mark.stop, how=mark.how)
+            return replace(now, start=mark.start, stop=mark.stop, how=mark.how, trim_by=mark.who)
         case "untrim":
-            return replace(now, start=0, stop=-1, how="")
+            return replace(now, start=0, stop=-1, how="", trim_by=mark.who)
         case "exclude":
             return replace(now, excluded=True)
         case "include":
             return replace(now, excluded=False)
         case "relabel":
-            return replace(now, gesture=mark.gesture)
+            return replace(now, gesture=mark.gesture, gesture_by=mark.who)
         case "accept":
             return replace(now, accepted=now.accepted | {mark.check})
         case "label" | "unlabel":

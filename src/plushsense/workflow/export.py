@@ -197,6 +197,7 @@ def save_windows(
     config: RunConfig | None = None,
     *,
     split: str | None = None,
+    overwrite: bool = False,
     warn: Warn = python_warning,
     **settings: Any,
 ) -> SavedWindows:
@@ -209,9 +210,10 @@ def save_windows(
     Args:
         config, settings: as for `api.evaluate`.
         split: a split with one fold, such as "windows:file-order" or "recordings:holdout".
+        overwrite: replace an existing file.
 
     Raises:
-        ConfigError: for a split with several folds, or a file that does not end in .mat.
+        ConfigError: for a split with several folds, a file that does not end in .mat, or one that exists already.
         BadInput: for a split that cannot be made, or a file that cannot be written.
         MissingExtraError: if SciPy is not installed.
     """
@@ -220,6 +222,8 @@ def save_windows(
     division = parse_split(split or config.evaluation.split)
     if path.suffix != ".mat":
         raise ConfigError(f"'{path}' is no name of a MATLAB file: give one that ends in .mat.")
+    if path.exists() and not overwrite:
+        raise ConfigError(f"'{path}' exists already: give the name of a new file, or replace it with --force.")
     gestures = classes_for(dataset, config.evaluation.classes, config.scored_on.context, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     windows = windows_for(dataset, network, config.scored_on, gestures, warn)

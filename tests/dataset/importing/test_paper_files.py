@@ -205,6 +205,24 @@ def test_a_correction_after_the_import_reaches_the_data_set(labelled: Path, tmp_
     assert (labels[first.name], labels[other.name]) == ("Tail tap 2", "Back stroke 1"), "a person's mark stays"
 
 
+def test_later_moves_reach_the_data_set_until_a_person_decides(labelled: Path, tmp_path: Path) -> None:
+    folder = labelled / scripts.LABELLED
+    name = min((folder / "Tail pull").glob("*.csv")).name
+    imported(labelled, tmp_path / "DS")
+
+    def label() -> str:
+        done = import_recordings(labelled, tmp_path / "DS", add_to=True)
+        return next(r.gesture for r in done.dataset.recordings if Path(r.file).name == name)
+
+    before = "Tail pull"
+    for after in ("Tail tap 2", "Back stroke 1", "Tail pull", "Tail tap 2"):
+        (folder / before / name).rename(folder / after / name)
+        assert label() == after
+        before = after
+    relabel(open_dataset(tmp_path / "DS"), [f"unknown/{name.removesuffix('.csv')}"], "", "K")
+    assert label() == "Tail pull", "a person's undo stays"
+
+
 def test_at_rest_is_nobodys_where_its_folder_says_so(labelled: Path, tmp_path: Path) -> None:
     folder = labelled / scripts.LABELLED
     moved = min((folder / "Tail tap 2").glob("*.csv"))

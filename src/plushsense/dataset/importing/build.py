@@ -311,14 +311,22 @@ class ImportedFiles:
         """
         recordings = list(recordings)
         trims, notes = truncation_marks(self.search.choices, recordings, self.sources, states)
-        folders = {f.source: f.gesture for f in self.search.found if f.gesture}
+        folders = {f.source: f.gesture for f in self.search.found}
         labels = []
         for info in recordings:
-            label = folders.get(self.sources.get(info.file, Path()), "")
-            if label and not (states or {}).get(info.id, MarkState()).gesture:
-                known = gestures.find(label)
+            source = self.sources.get(info.file)
+            now = (states or {}).get(info.id, MarkState())
+            if source is None or source not in folders or now.gesture_by not in ("", IMPORTER):
+                continue
+            label = folders[source]
+            known = gestures.find(label)
+            label = known.label if known is not None else label
+            if label and label != now.gesture:
                 why = f"the file lies in the folder '{label}', though its name says '{info.recorded}'"
-                labels.append(Mark(info.id, "relabel", IMPORTER, why, gesture=known.label if known else label))
+                labels.append(Mark(info.id, "relabel", IMPORTER, why, gesture=label))
+            elif not label and now.gesture and gestures.find(source.parent.name) is not None:
+                why = f"the file lies in the folder '{info.recorded}' again, as its name says"
+                labels.append(Mark(info.id, "relabel", IMPORTER, why))
         return trims, labels, notes
 
     def set_aside_reasons(self) -> dict[str, str]:

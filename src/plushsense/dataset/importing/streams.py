@@ -63,10 +63,10 @@ def find_people(search: SourceScan, folder: Path) -> None:
     search.found += [replace(f, origin=printable_path(f.source.relative_to(folder))) for f in found]
     search.simulated = search.simulated or is_simulation(folder, files)
     search.streams_named = True
-    search.notes.append(
-        f"{len(named)} of {len(people)} recordings are found in the streams of '{folder.name}', and have their people "
-        "from there: this undoes the anonymisation of the recordings"
-    )
+    note = f"{len(named)} of {len(people)} recordings are found in the streams of '{folder.name}'"
+    if named:
+        note += ", and have their people from there: this undoes the anonymisation of the recordings"
+    search.notes.append(note)
     lost = [f.origin for f in unknown if not people[f.source]]
     if lost:
         search.notes.append(

@@ -158,7 +158,7 @@ def truncation_marks(
     one, or was changed since.
 
     Args:
-        recordings: recordings of the data set; those with a trim in ``states`` are left as they are.
+        recordings: recordings of the data set; those with a trim in ``states``, or an undone one, stay as they are.
         origin: the source of each file of the data set.
     """
     by_name: dict[str, list[Choice]] = {}
@@ -170,7 +170,8 @@ def truncation_marks(
         path = origin.get(info.file)
         named = by_name.get(path.name.casefold(), ()) if path is not None else ()
         mine = [c for c in named if len(named) == 1 or (path is not None and c.folder == path.parent.name)]
-        if not mine or (states or {}).get(info.id, MarkState()).trimmed:
+        now = (states or {}).get(info.id, MarkState())
+        if not mine or now.trimmed or now.trim_by:
             continue
         choice = mine[-1]
         if choice.cut >= choice.rows:
