@@ -67,7 +67,7 @@ def fine_tune(
     if not deployable(arch) or not calibration:
         raise TrainingError(
             f"{arch.title} cannot be deployed, so there is nothing to fine-tune it for: train it with --padding stream "
-            "or mirror and --norm batch or none."
+            "and --norm batch or none."
         )
     if epochs < 1:
         raise TrainingError(f"{epochs} epochs of fine-tuning: accepted are 1 and more.")

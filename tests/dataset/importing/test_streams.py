@@ -92,4 +92,18 @@ def test_streams_that_cannot_be_used(study: tuple[Path, Places], tmp_path: Path)
     scripts.record(tmp_path / "named", people=1)
     with pytest.raises(DatasetError, match="the source has none: leave it out"):
         import_recordings(tmp_path / "named", tmp_path / "X", streams=streams)
+    scripts.record(tmp_path / "others", people=1, seed=9)
+    with pytest.raises(DatasetError, match="None of 20 recordings is in a stream of '.*others.*': give --streams"):
+        import_recordings(labelled, tmp_path / "X", streams=tmp_path / "others" / scripts.SESSIONS)
     assert not (tmp_path / "X").exists()
+
+
+def test_some_recordings_whose_people_are_not_known_are_counted(study: tuple[Path, Places], tmp_path: Path) -> None:
+    root, _ = study
+    moved = next(p for p in (root / scripts.LABELLED).rglob("*.csv") if "At rest" not in p.name)
+    scripts.record(tmp_path / "named", people=2)
+    (tmp_path / "named" / scripts.SESSIONS / moved.parent.name).mkdir()
+    shutil.copy(moved, tmp_path / "named" / scripts.SESSIONS / moved.parent.name / moved.name)
+    done = import_recordings(tmp_path / "named" / scripts.SESSIONS, tmp_path / "DS")
+    n = done.recordings
+    assert any(note.startswith(f"the people of 1 of {n} recordings are not known") for note in done.notes)

@@ -476,6 +476,23 @@ def read_copied(account: ImportedFiles, head: DatasetHead, progress: Progress | 
     return built
 
 
+def _no_people(dataset: Dataset, shape: str) -> str:
+    """Return the note that the people of some recordings, or of all, are not known."""
+    if shape == WINDOWS:
+        return NO_PEOPLE_OF_WINDOWS
+    if not dataset.subjects:
+        return NO_PEOPLE
+    n, of = sum(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings), len(dataset.recordings)
+    return Sentence(
+        f"the people of {n} of {plural(of, 'recording')} are not known, because their folders are gestures: splits by "
+        "subject are not possible; move them to the folders of their people, or import again with --subjects map.csv "
+        "(columns file,subject)",
+        reason="people_of_some_unknown",
+        n=n,
+        of=of,
+    )
+
+
 def summarize_import(
     dataset: Dataset, account: ImportedFiles, notes: list[str], new: set[str], trims: int = 0
 ) -> ImportSummary:
@@ -497,7 +514,7 @@ def summarize_import(
         [
             *([SIMULATED] if dataset.head.simulated else ()),
             *notes,
-            *([NO_PEOPLE_OF_WINDOWS if account.search.shape == WINDOWS else NO_PEOPLE] if unknown else ()),
+            *([_no_people(dataset, account.search.shape)] if unknown else ()),
         ],
         left_out=account.left_out,
         companions=account.count(COMPANIONS),

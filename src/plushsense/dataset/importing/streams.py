@@ -13,7 +13,7 @@ from pathlib import Path
 from plushsense.core.errors import DatasetError, FileFormatError
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import STREAM_NAME, ReadResult, read_recording, read_stream
-from plushsense.core.sentences import join_names
+from plushsense.core.sentences import join_names, plural
 from plushsense.dataset.importing.sources import (
     SourceFile,
     SourceScan,
@@ -56,6 +56,11 @@ def find_people(search: SourceScan, folder: Path) -> None:
     streams = [s for f in found if (s := _read(f, search)) is not None]
     people = {f.source: _people_of(f, streams, search) for f in unknown}
     named = {path: mine[0] for path, mine in people.items() if len(mine) == 1}
+    if not any(people.values()):
+        raise DatasetError(
+            f"None of {plural(len(people), 'recording')} is in a stream of '{folder}': give --streams the folder of "
+            "the people who made them, or leave it out."
+        )
     theirs = {path.resolve() for path in regular}
     search.found = [
         replace(f, subject=named.get(f.source, f.subject)) for f in search.found if f.source.resolve() not in theirs
