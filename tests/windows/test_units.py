@@ -25,7 +25,6 @@ from plushsense.models.reference import random_weights
 from plushsense.runtime.machine import FloatLogits
 from plushsense.windows.cut import WindowSet, WindowSpec
 from plushsense.windows.features import InputUnits, Scaler, statistics
-from plushsense.workflow.estimator import to_integers
 from plushsense.workflow.exchange import to_panel, to_torch
 
 Floats = NDArray[np.float64]
@@ -142,6 +141,9 @@ def test_all_steps_of_large_values_are_kept() -> None:
 
 @pytest.mark.parametrize("vectors", [False, True])
 def test_a_classifier_with_a_layout_reads_these_values(force: Dataset, accel: Dataset, vectors: bool) -> None:
+    # Imports scikit-learn, whose threads must not run where the tests are collected: see support/apart.py.
+    from plushsense.workflow.estimator import to_integers
+
     dataset = accel.with_inputs(accel.layout.for_vectors()) if vectors else force
     windows, sent = first_of_each(dataset)
     assert np.array_equal(to_integers(windows.x, dataset.layout), windows.integers)
