@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from plushsense.core.layouts import Layout, load_layout
-from plushsense.core.recorder_csv import Frames, kept_rows
+from plushsense.core.recorder_csv import Frames
+from plushsense.core.row_times import kept_rows
 from plushsense.windows.clock import SampleClock, resample, row_times_us
 
 ACCEL = load_layout("accel-3")

@@ -81,6 +81,7 @@ def test_the_same_bundle_gives_the_same_files(tmp_path: Path, bundle: Bundle) ->
     [
         ({"padding": "causal"}, "train --arch 5d1_4d3 --filters 4,6 --padding stream, and export that"),
         ({"padding": "mirror"}, "train --arch 5d1_4d3 --filters 4,6 --padding stream, and export that"),
+        ({"padding": "mirror", "norm": "layer"}, "--padding stream --norm batch, and export that"),
         ({"norm": "layer"}, "train 5d1_4d3 with --norm batch"),
     ],
 )

@@ -18,16 +18,8 @@ from numpy.typing import NDArray
 from plushsense.core.errors import DatasetError, FileFormatError, ForgottenError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, Gesture, GestureSet, plain_label
-from plushsense.core.recorder_csv import (
-    Frames,
-    ReadResult,
-    bridged_ms,
-    parse_name,
-    read_bytes,
-    read_recording,
-    read_stream,
-    stray_rows,
-)
+from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_bytes, read_recording, read_stream
+from plushsense.core.row_times import bridged_ms, stray_rows
 from plushsense.core.sentences import Sentence
 from plushsense.core.simulation import is_marked
 from plushsense.dataset.files import (

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
-from plushsense.core.recorder_csv import Frames, bridged_ms, stray_rows
+from plushsense.core.recorder_csv import Frames
+from plushsense.core.row_times import bridged_ms, stray_rows
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.marks import BY_HAND, SUGGESTED, Mark, MarkState, match_ids, read_marks
 from plushsense.dataset.onset import CONTEXT_S, Suggestion, suggest

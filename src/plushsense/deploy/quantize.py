@@ -128,7 +128,7 @@ def refuse_undeployable(arch: Arch) -> None:
     if arch.padding == "causal":
         raise ArchError(
             f"{arch.title} has the padding '{arch.padding}', whose zeros cannot be folded with the normalisation: "
-            f"train {arch.symbol} with --padding stream{' and --norm batch' * (arch.norm == 'layer')}.",
+            f"train {arch.symbol} with --padding stream.",
             reason="arch_padding",
             padding=arch.padding,
         )

@@ -286,8 +286,8 @@ def refuse_image(arch: Arch) -> None:
     if arch.padding != "stream":
         raise ArchError(
             f"{arch.title} has the padding '{arch.padding}', with which a toy would compute the whole window again at "
-            f"every step: train --arch {arch.symbol} --filters {','.join(map(str, arch.filters))} --padding stream, "
-            "and export that.",
+            f"every step: train --arch {arch.symbol} --filters {','.join(map(str, arch.filters))} --padding stream"
+            f"{' --norm batch' * (arch.norm == 'layer')}, and export that.",
             reason="arch_padding",
             padding=arch.padding,
         )

@@ -129,7 +129,7 @@ class FrameReader:
         device_us = int(device_ms) * 1000
         if not self._begun:
             self._begun, self.zero_us = True, device_us
-        if not clock.keeps(device_ms):
+        if not clock.accept(device_ms):
             return
         if clock.restarted:
             if not health.fault:

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import Layout
-from plushsense.core.recorder_csv import Frames, kept_rows
+from plushsense.core.recorder_csv import Frames
+from plushsense.core.row_times import kept_rows
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.decisions import DecideSpec, Rules

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import Layout
-from plushsense.core.recorder_csv import Frames, kept_rows
+from plushsense.core.recorder_csv import Frames
+from plushsense.core.row_times import kept_rows
 from plushsense.dataset.store import Dataset, RecordingInfo
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.decisions import DecideSpec

@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.layouts import Layout
-from plushsense.core.recorder_csv import Frames, kept_rows
+from plushsense.core.recorder_csv import Frames
+from plushsense.core.row_times import kept_rows
 
 
 def row_times_us(frames: Frames, layout: Layout) -> NDArray[np.int64]:
@@ -100,10 +101,10 @@ class SampleClock:
 
         If ``restarted`` is then true, the frame started a new segment: reset later computations before these samples.
         """
-        rows = self.samples(values) if self.keeps(device_ms) else []
+        rows = self.samples(values) if self.accept(device_ms) else []
         return [np.array(row, dtype=np.int64) for row in rows]
 
-    def keeps(self, device_ms: int) -> bool:
+    def accept(self, device_ms: int) -> bool:
         """Apply rule 1 to the time of the next frame; return False if the frame is left out."""
         time = int(device_ms) * 1000
         seen = self._seen_us
@@ -115,7 +116,7 @@ class SampleClock:
         return not self.left_out
 
     def samples(self, values: Sequence[int]) -> list[list[int]]:
-        """Add the values of the frame that `keeps` has just kept; return the samples that it completes.
+        """Add the values of the frame that `accept` has just kept; return the samples that it completes.
 
         They are plain integers, which are faster for a live stream than the arrays of `push`.
         """

@@ -40,8 +40,8 @@ def find_people(search: SourceScan, folder: Path) -> None:
         folder: folders of people, each with its ``fulldatastream.csv``.
 
     Raises:
-        DatasetError: if ``folder`` has no stream, the streams do not tell the people apart, or ``search`` has no
-            recording without a known person.
+        DatasetError: if ``folder`` has no stream, none of the recordings is in one, or ``search`` has no recording
+            without a known person.
     """
     if not folder.is_dir():
         raise DatasetError(f"There is no folder '{folder}': --streams names the folder of the people's folders.")

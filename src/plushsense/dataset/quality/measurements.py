@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.layouts import ACCELERATION, Layout
-from plushsense.core.recorder_csv import Frames, bridged_ms, stray_rows
+from plushsense.core.recorder_csv import Frames
+from plushsense.core.row_times import bridged_ms, stray_rows
 from plushsense.dataset.quality.copies import HashedRows
 from plushsense.dataset.quality.findings import CheckLimits
 from plushsense.dataset.store import Dataset, RecordingInfo, StreamInfo

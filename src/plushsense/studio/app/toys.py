@@ -73,7 +73,7 @@ class SampleBuffer:
             for frame in frames:
                 if self._first_ms is None:
                     self._first_ms = self._seen_ms = frame.device_ms
-                if self._clock.keeps(frame.device_ms):
+                if self._clock.accept(frame.device_ms):
                     self._offset_ms += max(0, self._seen_ms - frame.device_ms)
                     self._seen_ms = frame.device_ms
                 at = self.count % size
