@@ -21,7 +21,7 @@ from nicegui import context, ui
 from plushsense.studio.app.shell import query
 
 async def show(page):
-    ui.label(page.words("hello.greeting"))
+    ui.label(page.words("Greetings from a new page"))
     if "leave" in query():
         context.client.delete()
         try:
@@ -30,11 +30,9 @@ async def show(page):
             print("left", isinstance(sys.exc_info()[1], asyncio.CancelledError), flush=True)
 """
 TEXTS = """
-[pages]
-hello = "Hello"
-[hello]
-title = "A page of its own"
-greeting = "Greetings from a new page"
+from plushsense.studio.app.words import PageTexts
+
+TEXTS = PageTexts(name="Hello", title="A page of its own")
 """
 STUDIO = """
 import sys
@@ -51,17 +49,17 @@ sys.exit(main(["studio", "--home", sys.argv[2], "--port", "0", "--no-show", "--j
 def test_a_page_is_one_folder_and_one_line(tmp_path: Path) -> None:
     folder = tmp_path / "pages" / "hello"
     folder.mkdir(parents=True)
-    (folder / "__init__.py").write_text("")
+    (folder / "__init__.py").write_text(TEXTS)
     (folder / "page.py").write_text(PAGE)
-    for language in ("en", "lv"):
-        (folder / f"{language}.toml").write_text(TEXTS)
     env = {k: v for k, v in os.environ.items() if not k.startswith(("NICEGUI_", "PYTEST_"))}
     command = [sys.executable, "-c", STUDIO, str(folder.parent), str(tmp_path / "home")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env) as studio:
         try:
             assert studio.stdout is not None
             url = json.loads(studio.stdout.readline())["url"]
-            with urllib.request.urlopen(f"{url}hello", timeout=120) as answer:
+            # A page without a translation is in English.
+            latvian = urllib.request.Request(f"{url}hello", headers={"Accept-Language": "lv"})
+            with urllib.request.urlopen(latvian, timeout=120) as answer:
                 hello = answer.read().decode()
             with urllib.request.urlopen(url, timeout=120) as answer:
                 home = answer.read().decode()

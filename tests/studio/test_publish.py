@@ -21,6 +21,7 @@ from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
 from plushsense.studio.app.words import LANGUAGES, Words
 from plushsense.studio.app.workspace import PACKAGES, Workspace
 from plushsense.studio.pages.publish.packages import (
+    MEANINGS,
     DatasetFacts,
     PackageFacts,
     missing_extras,
@@ -127,23 +128,16 @@ def trial(design: str, sees: str, mean: float, low: float) -> dict[str, Any]:
 @pytest.mark.parametrize("language", LANGUAGES)
 def test_what_the_figures_mean(language: str) -> None:
     words = Words(language)
+    personal, guessing, simulated = (words(MEANINGS[key]) for key in ("personal", "guessing", "simulated"))
     trials = [trial("recordings", "everything", 0.929, 0.884), trial("gestures", "everything", 0.532, 0.44)]
-    said = reidentification_text(words, {"trials": trials, "simulated": False})
-    assert (
-        "93" in said[0] and "27" in said[0] and "88" in said[0] and words.number(3.7, 1) in said[0] and "53" in said[1]
-    )
-    assert words("publish.means_personal") in said and words("publish.no_sessions") in said
-    guessed = reidentification_text(
-        words, {"trials": [trial("recordings", "everything", 0.04, 0.01)], "simulated": False}
-    )
-    assert words("publish.means_guessing") in guessed
+    found = reidentification_text(words, {"trials": trials, "simulated": False})
+    assert all(figure in found[0] for figure in ("93", "27", "88", words.number(3.7, 1))) and "53" in found[1]
+    assert personal in found and len(found) == 5
+    chance = [trial("recordings", "everything", 0.04, 0.01)]
+    assert guessing in reidentification_text(words, {"trials": chance, "simulated": False})
     virtual = reidentification_text(words, {"trials": trials, "simulated": True})
-    assert words("publish.means_simulated") in virtual and words("publish.means_personal") not in virtual
-    assert reidentification_text(words, {}) == [words("publish.nobody_looked")]
-
-
-def test_every_validator_has_words() -> None:
-    assert all(Words(language).get(f"publish.v_{name}") for language in LANGUAGES for name in VALIDATORS)
+    assert simulated in virtual and personal not in virtual
+    assert len(reidentification_text(words, {})) == 1
 
 
 def test_missing_extras(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.deploy.emit import FACTS
 from plushsense.recording.session_files import SESSION_HEAD, SESSION_LOG
 from plushsense.studio.app import shell
-from plushsense.studio.app.shell import LIGHT_COOKIE, PAGES, TOUR
+from plushsense.studio.app.shell import LIGHT_COOKIE, PAGES, TOUR, page_texts
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.review.controller import VIEWS
@@ -100,7 +100,7 @@ def test_help_and_tour(empty: str, look: Fixture) -> None:
     for n, (name, path) in enumerate(PAGES.items(), 1):
         page.wait_for_url(f"{empty}{path}?{TOUR}=1")
         step = marked(page, "tour-step")
-        assert Words("en")(f"tour.{name}") in step.inner_text()
+        assert page_texts(name).tour in step.inner_text()
         connected(page)
         marked(page, "tour-next" if n < len(PAGES) else "tour-end").click()
     page.wait_for_url(empty + "/")

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 Fixture = Callable[..., Any]
 W = Words("lv")
+LOST = "CONNECTION LOST, NOT RECORDING. Kept: {done} of {steps} recordings."
 SPEED = 20
 NAME = "Viss pa reizei"
 PATIENT = bool(os.environ.get("PLUSHSENSE_SHOTS"))
@@ -92,25 +93,25 @@ def test_a_therapist_can_do_it_alone(studio: Fixture, look: Fixture, shots: Fixt
     t = Therapist(browser.open(server.url), shots)
 
     with t.step("first child"):
-        t.press(W("home.next_record_button"))
+        t.press(W("Record"))
         t.page.wait_for_url("**/record")
         connected(t.page)
-        t.page.get_by_text(W("record.own_protocol")).click()
+        t.page.get_by_text(W("Make your own list of gestures")).click()
         for gesture in ASKED:
             t.page.get_by_role("checkbox", name=W.gesture(gesture), exact=True).click()
-        t.fill(W("record.own_repetitions"), "1")
-        t.fill(W("record.own_name"), NAME)
-        t.press(W("record.own_save"))
+        t.fill(W("How often each"), "1")
+        t.fill(W("Name of the list"), NAME)
+        t.press(W("Save and choose it"))
         marked(t.page, "discard-protocol").wait_for()
-        t.fill(W("record.code"), "S01")
-        t.press(W("record.begin"))
+        t.fill(W("Code of the person"), "S01")
+        t.press(W("Begin the session"))
         marked(t.page, "state-box").wait_for()
         record(t, 0, KILLED)
         start_recording(t.page, KILLED)
         server.kill()
-        marked(t.page, "connection-lost").get_by_text(W("record.lost")[:20]).wait_for()
+        marked(t.page, "connection-lost").get_by_text(W(LOST)[:20]).wait_for()
         server.start()
-        t.page.get_by_role("button", name=re.compile(W("record.go_on"))).first.click()
+        t.page.get_by_role("button", name=re.compile(W("Continue"))).first.click()
         marked(t.page, "state-box").wait_for()
         connected(t.page)
         # On a slow machine the recording may have ended by itself before.
@@ -119,29 +120,29 @@ def test_a_therapist_can_do_it_alone(studio: Fixture, look: Fixture, shots: Fixt
         record(t, at, len(ASKED))
 
     with t.step("look at the recordings"):
-        t.press(W("record.collect"))
+        t.press(W("Look at the recordings"))
         t.page.wait_for_url("**/review?dataset=**", timeout=LONG_MS)
         marked(t.page, "accept-sure").wait_for()
 
     with t.step("second child"):
-        t.press(W("pages.home"))
-        t.choose("person", W("home.person", n=12))
-        t.press(W("home.choose_virtual"))
+        t.press(W("Home"))
+        t.choose("person", W("Person {n}", n=12))
+        t.press(W("Use the virtual toy"))
         marked(t.page, "chosen").wait_for()
-        t.press(W("pages.record"))
+        t.press(W("Record"))
         connected(t.page)
-        t.fill(W("record.code"), "S02")
+        t.fill(W("Code of the person"), "S02")
         t.choose("protocol", NAME)
-        t.press(W("record.begin"))
+        t.press(W("Begin the session"))
         marked(t.page, "state-box").wait_for()
         record(t, 0, CLOSED)
         t.page.close()
         t.page = browser.open(server.url)
-        t.press(W("home.next_recording_button"))
+        t.press(W("Show the recording"))
         marked(t.page, "state-box").wait_for()
         connected(t.page)
         record(t, CLOSED, len(ASKED))
-        t.press(W("record.collect"))
+        t.press(W("Look at the recordings"))
         t.page.wait_for_url("**/review?dataset=**", timeout=LONG_MS)
 
     with t.step("what is doubtful"):
@@ -152,23 +153,23 @@ def test_a_therapist_can_do_it_alone(studio: Fixture, look: Fixture, shots: Fixt
         connected(t.page)
 
     with t.step("network"):
-        t.press(W("pages.train"))
+        t.press(W("Train"))
         connected(t.page)
-        t.fill(W("train.minutes"), "1")
-        t.press(W("train.make"))
+        t.fill(W("Minutes, at most"), "1")
+        t.press(W("Make a network"))
         if PATIENT:
             marked(t.page, "verdict").first.wait_for(timeout=300_000)
             assert marked(t.page, "verdict").first.inner_text()
         else:
             # She saves time: the network is kept before it is tested on people left out.
-            marked(t.page, "at").get_by_text(W("train.stages.evaluating")).wait_for(timeout=240_000)
-            t.press(W("train.stop"))
+            marked(t.page, "at").get_by_text(W("testing on people left out")).wait_for(timeout=240_000)
+            t.press(W("Stop"))
             marked(t.page, "saved").wait_for()
 
     with t.step("live"):
-        t.press(W("pages.live"))
+        t.press(W("Live"))
         connected(t.page)
-        t.press(W("live.start"))
+        t.press(W("Start"))
         marked(t.page, "do-Tail hit 1").wait_for()
         events = marked(t.page, "events").locator("li[data-id]")
         for _ in range(5):
@@ -178,22 +179,22 @@ def test_a_therapist_can_do_it_alone(studio: Fixture, look: Fixture, shots: Fixt
             t.page.wait_for_timeout(600)
         events.first.wait_for()
         with t.page.expect_download() as log:
-            t.press(W("log.save"))
+            t.press(W("Save as a table (CSV)"))
         lines = Path(log.value.path()).read_text(encoding="utf-8").splitlines()
         assert len(lines) > 1
-        t.press(W("live.stop"))
+        t.press(W("Stop"))
 
     with t.step("package"):
-        t.press(W("pages.publish"))
+        t.press(W("Publish"))
         connected(t.page)
-        t.fill(W("publish.data_title"), "Pieskārieni")
-        t.fill(W("publish.description"), "Divi virtuāli bērni pieskaras virtuālai rotaļlietai.")
+        t.fill(W("Title"), "Pieskārieni")
+        t.fill(W("Description"), "Divi virtuāli bērni pieskaras virtuālai rotaļlietai.")
         marked(t.page, "creator-name").fill("Ozola, Anna")
         t.choose("licence", "CC-BY-4.0")
-        t.fill(W("publish.contact_name"), "Anna Ozola")
-        t.fill(W("publish.contact_mail"), "anna@example.org")
-        t.fill(W("publish.consent"), "Simulācija: neviens cilvēks nav piedalījies.")
-        t.press(W("publish.do"))
+        t.fill(W("Contact: name"), "Anna Ozola")
+        t.fill(W("Contact: e-mail"), "anna@example.org")
+        t.fill(W("What the people consented to"), "Simulācija: neviens cilvēks nav piedalījies.")
+        t.press(W("Make the package"))
         marked(t.page, "download").wait_for(timeout=240_000)
         with t.page.expect_download() as package:
             marked(t.page, "download").click()

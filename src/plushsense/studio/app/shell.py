@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 from urllib.parse import urlencode
@@ -20,8 +21,21 @@ from nicegui.events import GenericEventArguments
 from nicegui.translations import translations
 
 from plushsense.core.errors import PlushSenseError
-from plushsense.studio.app.words import LANGUAGES, Words
+from plushsense.studio.app.words import LANGUAGES, PageTexts, Texts, Words
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
+
+_CONNECTION: Texts = {
+    "connection_lost": "The connection to the studio is lost.",
+    "trying_to_reconnect": "Everything recorded so far is saved. Trying to reconnect …",
+    "message_too_long": "The message is too long",
+    "message_too_long_body": "The page sent more than the studio accepts.",
+}
+
+_LIGHT_TEXTS: Texts = {
+    "system": "Same as the system",
+    "light": "Light",
+    "dark": "Dark",
+}
 
 _CLICKED = "(e) => emit({seen: document.querySelector('[data-seen]').dataset.seen, times: e.detail})"
 
@@ -87,9 +101,7 @@ PAGES = {
 """The pages: maps name to path, in the order of the navigation bar.
 
 To add a page, add a line here and a folder ``pages/<name>`` with a module ``page``, whose function ``show(page)`` adds
-the content below the title. Put its texts in ``pages/<name>/<language>.toml`` for each of `LANGUAGES`, or in
-``app/words``. The texts ``pages.<name>`` (for the navigation bar) and ``<name>.title`` are required; ``help.<name>``
-and ``tour.<name>`` are optional.
+the content below the title. The folder's ``__init__`` holds its `PageTexts` as ``TEXTS``.
 """
 
 TOUR = "tour"
@@ -122,6 +134,12 @@ Kind = Literal["info", "good", "warning", "error"]
 _CSS = Path(__file__).with_name("studio.css")
 
 
+def page_texts(name: str) -> PageTexts:
+    """Return title, help and the like of the page ``name``."""
+    texts: PageTexts = import_module(f"plushsense.studio.pages.{name}").TEXTS
+    return texts
+
+
 @dataclass
 class Page:
     """An open page: its workspace, its texts, and the place where messages appear."""
@@ -146,8 +164,10 @@ class Page:
             with tag(box, "message"):
                 ui.label(sentence).classes("flex-grow")
                 if undo is not None:
-                    button("undo", self.words("shell.undo"), on_page(undo), "outline color=inherit")
-                icon_button("close", self.words("shell.close"), lambda: self.say(""), "flat round dense color=inherit")
+                    button("undo", self.words("Undo"), on_page(undo), "outline color=inherit")
+                icon_button(
+                    "close", self.words("Close this message"), lambda: self.say(""), "flat round dense color=inherit"
+                )
 
     @contextmanager
     def show_errors(self) -> Iterator[None]:
@@ -158,7 +178,10 @@ class Page:
             self.say(self.words.error(refusal), "error")
         except OSError as cause:
             where = f" ('{cause.filename}')" if cause.filename else ""
-            self.say(self.words("sentences.system", where=where, why=cause.strerror or str(cause)), "error")
+            self.say(
+                self.words("The computer refused: {why}{where}.", where=where, why=cause.strerror or str(cause)),
+                "error",
+            )
 
 
 def visitor() -> tuple[Words, bool | None]:
@@ -175,32 +198,33 @@ def visitor() -> tuple[Words, bool | None]:
 def frame(workspace: Workspace, name: str) -> Iterator[Page]:
     """Build the navigation bar and title of the page ``name`` (a key of `PAGES`), and yield the page to fill."""
     words, dark = visitor()
+    texts = page_texts(name)
     page = Page(workspace, name, words, bool(dark))
     _set_appearance(words, dark)
-    ui.page_title(f"{words(f'pages.{name}')} · PlushSense")
+    ui.page_title(f"{words(texts.name)} · PlushSense")
     add_style(_CSS.read_text(encoding="utf-8"))
     with ui.header().classes("ps-header items-center no-wrap"):
         # Written as HTML because a link made by NiceGUI would reload the page.
-        html(Markup('<a class="ps-skip" href="#content">{}</a>').format(words("shell.skip")))
+        html(Markup('<a class="ps-skip" href="#content">{}</a>').format(words("Skip to the content")))
         html(_LOGO, "span").classes("ps-logo").props("aria-hidden=true")
         ui.label("PlushSense").classes("ps-brand")
-        with ui.element("nav").classes("ps-bar row items-center").props(f'aria-label="{words("shell.pages")}"'):
+        with ui.element("nav").classes("ps-bar row items-center").props(f'aria-label="{words("Pages")}"'):
             for key, path in PAGES.items():
-                link = ui.link(words(f"pages.{key}"), path)
+                link = ui.link(words(page_texts(key).name), path)
                 if key == name:
                     link.props('aria-current="page"')
         # On a phone, the link may be outside the visible part of the bar.
         ui.run_javascript("document.querySelector('.ps-bar [aria-current]')?.scrollIntoView({inline: 'center'})")
         ui.space()
-        if words.get(f"help.{name}"):
-            _help(words, name)
+        if texts.help:
+            _help(words, texts)
         _choices(words, dark)
     with ui.element("div").classes("ps-main column no-wrap items-start").props('id="content" tabindex="-1"'):
         if name != "record":
             _recording_bar(page)
-        if TOUR in query() and words.get(f"tour.{name}"):
+        if TOUR in query() and texts.tour:
             _tour(words, name)
-        tag(html(words(f"{name}.title"), "h1"), "title")
+        tag(html(words(texts.title), "h1"), "title")
         page._messages = ui.column().classes("w-full ps-messages")
         yield page
 
@@ -216,47 +240,47 @@ def _recording_bar(page: Page) -> None:
         bar.set_visibility(bool(page.workspace.recording))
         with bar:
             for name in page.workspace.recording:
-                ui.label(f"● {page.words('shell.recording_now', name=name)}").classes("text-bold")
-                link = ui.link(page.words("shell.show_recording"), address("record", session=name)).classes("ps-link")
-                named(link, f"{page.words('shell.show_recording')}: {name}")
+                ui.label(f"● {page.words('Recording now: {name}.', name=name)}").classes("text-bold")
+                link = ui.link(page.words("Show the recording"), address("record", session=name)).classes("ps-link")
+                named(link, f"{page.words('Show the recording')}: {name}")
 
     draw()
     on_change(page.workspace.recording_changed, draw)
 
 
-def _help(words: Words, name: str) -> None:
-    """Add the button that opens the help of the page ``name``, which leads to the tour."""
+def _help(words: Words, texts: PageTexts) -> None:
+    """Add the button that opens the help of a page, which leads to the tour."""
     with ui.dialog() as dialog:
-        named(dialog.props("transition-duration=0"), words("shell.help"))
+        named(dialog.props("transition-duration=0"), words("Help"))
         with tag(ui.card(), "help"):
-            heading(f"{words('shell.help')}: {words(f'pages.{name}')}", 2)
-            for paragraph in words(f"help.{name}").split("\n"):
+            heading(f"{words('Help')}: {words(texts.name)}", 2)
+            for paragraph in words(texts.help).split("\n"):
                 ui.label(paragraph)
             with ui.row().classes("w-full justify-end"):
-                button("tour", words("shell.tour"), lambda: ui.navigate.to(address("home", **{TOUR: "1"})))
-                button("", words("shell.close_help"), dialog.close, "unelevated autofocus")
-    opener = icon_button("help", words("shell.help"), dialog.open, "flat round dense color=white")
+                button("tour", words("Tour of two minutes"), lambda: ui.navigate.to(address("home", **{TOUR: "1"})))
+                button("", words("Close"), dialog.close, "unelevated autofocus")
+    opener = icon_button("help", words("Help"), dialog.open, "flat round dense color=white")
     tag(opener.props('aria-haspopup="dialog"'), "open-help")
 
 
 def _tour(words: Words, name: str) -> None:
     """Add the sentences of the tour about the page ``name``, with buttons to the next and the former page."""
-    pages = [page for page in PAGES if words.get(f"tour.{page}")]
-    at = pages.index(name)
+    pages = [page for page in PAGES if page_texts(page).tour]
+    at, texts = pages.index(name), page_texts(name)
 
     def go(key: str, look: str, label: str, place: str) -> None:
         button(key, words(label), lambda: ui.navigate.to(place), look)
 
-    with tag(named(ui.element("section").classes("ps-card ps-next w-full"), words("shell.tour")), "tour-step"):
-        heading(words("shell.tour_step", n=at + 1, m=len(pages), page=words(f"pages.{name}")), 2)
-        ui.label(words(f"tour.{name}"))
+    with tag(named(ui.element("section").classes("ps-card ps-next w-full"), words("Tour of two minutes")), "tour-step"):
+        heading(words("Tour {n} of {m}: {page}", n=at + 1, m=len(pages), page=words(texts.name)), 2)
+        ui.label(words(texts.tour))
         with ui.row().classes("w-full"):
             if at + 1 < len(pages):
-                go("tour-next", "unelevated", "shell.tour_next", address(pages[at + 1], **{TOUR: "1"}))
+                go("tour-next", "unelevated", "Next page", address(pages[at + 1], **{TOUR: "1"}))
             if at:
-                go("tour-back", "outline", "shell.tour_back", address(pages[at - 1], **{TOUR: "1"}))
+                go("tour-back", "outline", "Page before", address(pages[at - 1], **{TOUR: "1"}))
             last = at + 1 == len(pages)
-            go("tour-end", "unelevated" if last else "flat", "shell.tour_end", address("home" if last else name))
+            go("tour-end", "unelevated" if last else "flat", "End the tour", address("home" if last else name))
 
 
 def _set_appearance(words: Words, dark: bool | None) -> None:
@@ -266,8 +290,7 @@ def _set_appearance(words: Words, dark: bool | None) -> None:
     own = copy(client.page)
     own.dark, own.language = dark, _QUASAR[words.language]  # type: ignore[assignment]
     client.page = own
-    keys = ("connection_lost", "trying_to_reconnect", "message_too_long", "message_too_long_body")
-    translations[own.language] = {key: words(f"shell.{key}") for key in keys}  # type: ignore[index]
+    translations[own.language] = {key: words(text) for key, text in _CONNECTION.items()}  # type: ignore[index]
     style = f":root {{ color-scheme: dark; background: {_DARK_BACKGROUND}; }}"
     if dark is not False:
         add_style(style if dark else f"@media (prefers-color-scheme: dark) {{ {style} }}")
@@ -278,19 +301,21 @@ def _choices(words: Words, dark: bool | None) -> None:
     language = ui.toggle({code: code.upper() for code in LANGUAGES}, value=words.language)
     language.props(
         f"dense unelevated color=blue-grey-9 toggle-color=blue-grey-1 toggle-text-color=black "
-        f'aria-label="{words("shell.language")}"'
+        f'aria-label="{words("Language")}"'
     )
     tag(language, "language").on_value_change(lambda e: _set_cookie(LANGUAGE_COOKIE, str(e.value)))
     now = "dark" if dark else "system" if dark is None else "light"
     button = ui.button(icon=_LIGHTS[now]).props("flat round dense color=white")
-    tag(button, "light").props(f'aria-label="{words("shell.lights")}: {words(f"shell.{now}")}" aria-haspopup="menu"')
+    tag(button, "light").props(
+        f'aria-label="{words("Colour scheme")}: {words(_LIGHT_TEXTS[now])}" aria-haspopup="menu"'
+    )
     with button, ui.menu():
         for light, icon in _LIGHTS.items():
             item = ui.menu_item(on_click=lambda light=light: _set_cookie(LIGHT_COOKIE, light))
             tag(item, f"light-{light}").props(f"role=menuitemradio aria-checked={str(light == now).lower()}")
             with item, ui.row().classes("items-center no-wrap q-gutter-sm"):
                 ui.icon(icon).props("aria-hidden=true")
-                ui.label(words(f"shell.{light}")).classes("text-bold" if light == now else "")
+                ui.label(words(_LIGHT_TEXTS[light])).classes("text-bold" if light == now else "")
 
 
 def _set_cookie(cookie: str, value: str) -> None:

@@ -32,24 +32,33 @@ from plushsense.studio.app.shell import (
     scroll_region,
     tag,
 )
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.app.workspace import Workspace
+
+KINDS_OF_TRAINING: Texts = {
+    "train": "Train one network",
+    "evaluate": "Evaluate on people left out",
+    "sweep": "Compare many networks",
+    "search": "Find a small network",
+    "make": "Make a network",
+}
+"""Names of the jobs of the train page."""
 
 _CSS = Path(__file__).with_name("elements.css")
 _RECENT_S = 900.0
 _TITLES = {
-    "simulate": "home.try_title",
-    "import": "home.import_title",
-    "check": "home.check_title",
-    "backup": "home.backup_title",
-    "restore": "home.restore_title",
-    "forget": "home.forget_title",
-    "export": "export.doing",
-    "profile": "export.counting",
-    "verify": "export.verifying",
-    "publish": "publish.doing",
-    "validate": "publish.checking",
-    "pseudonymise": "publish.renaming",
+    "simulate": "Trial: a data set of virtual people",
+    "import": "Import into the data set “{name}”",
+    "check": "Checking “{name}”",
+    "backup": "Backup of “{name}”",
+    "restore": "Restoring “{name}”",
+    "forget": "Removing a person from “{name}”",
+    "export": "Export “{name}”",
+    "profile": "Cost of “{name}”",
+    "verify": "Verify “{name}”",
+    "publish": "Package “{name}”",
+    "validate": "Check of “{name}”",
+    "pseudonymise": "Copy with pseudonyms “{name}”",
 }
 
 
@@ -80,7 +89,7 @@ def item_menu(words: Words, about: str, actions: Mapping[str, Callable[[], Any]]
         about: what the actions apply to, for screen readers.
     """
     opener = named(
-        ui.button(icon="more_vert").props('flat round dense aria-haspopup="menu"'), f"{words('shell.menu')}: {about}"
+        ui.button(icon="more_vert").props('flat round dense aria-haspopup="menu"'), f"{words('More')}: {about}"
     )
     with tag(opener, "menu"), ui.menu():
         for label, call in actions.items():
@@ -118,7 +127,7 @@ def ask(words: Words, title: str, go: str, answer: Callable[[str], Any], label: 
                 field = tag(ui.input(label, value=value).props("autofocus").classes("w-full"), "ask-text")
                 on_enter(field, done)
             with ui.row().classes("w-full justify-end"):
-                button("", words("shell.cancel"), dialog.close, "flat" if label else "flat autofocus")
+                button("", words("Cancel"), dialog.close, "flat" if label else "flat autofocus")
                 button("ask-go", go, done, "unelevated" if label else "outline")
     dialog.on("hide", dialog.delete)
     dialog.open()
@@ -144,7 +153,7 @@ async def change_files(
         async def take_back() -> None:
             assert undo is not None
             back = undo
-            await change_files(page, lambda: back(result), page.words("shell.undone"), refresh)
+            await change_files(page, lambda: back(result), page.words("Undone."), refresh)
 
         page.say(message, "good", None if undo is None else take_back)
 
@@ -231,7 +240,7 @@ def title_of(words: Words, job: StudioJob) -> str:
     """Return the title of a job in this visitor's language; ``job.title`` is in that of the person who started it."""
     spec = job.spec
     if job.task not in _TITLES:
-        return f"{words(f'train.kinds.{job.task}')}: {job.title}"
+        return f"{words(KINDS_OF_TRAINING[job.task])}: {job.title}"
     name = spec.get("name") or Path(spec.get("place") or spec.get("dest") or spec["dataset"]).name
     return words(_TITLES[job.task], name=name)
 
@@ -438,7 +447,7 @@ class WorkPanel:
                 with ui.column().classes("ps-card w-full"):
                     with ui.row().classes("w-full items-center"):
                         text(title_of(words, job), "h2", "col-grow")
-                        button("stop", words("export.stop"), lambda job=job: self._jobs.stop(job.id), icon="stop")
+                        button("stop", words("Stop"), lambda job=job: self._jobs.stop(job.id), icon="stop")
                     # Not a status element, because screen readers would read out every step.
                     where = ui.label("").classes("ps-dim")
                     bar = ui.linear_progress(0.0, show_value=False, size="12px")
@@ -449,7 +458,7 @@ class WorkPanel:
                 message = (
                     words.explain(last.message, last.reason, last.values)
                     if bad
-                    else words("export.stopped", title=title_of(words, last))
+                    else words("Stopped: {title}. Finished parts are kept.", title=title_of(words, last))
                 )
                 row = ui.row().classes(
                     f"ps-message ps-message-{'error' if bad else 'warning'} w-full items-center no-wrap"
@@ -457,7 +466,7 @@ class WorkPanel:
                 with tag(row.props(f'role="{"alert" if bad else "status"}"'), "ended"):
                     ui.label(message).classes("flex-grow").style("overflow-wrap: anywhere")
                     look = "flat round dense color=inherit"
-                    icon_button("close", words("shell.close"), lambda: self._close(last.id), look)
+                    icon_button("close", words("Close this message"), lambda: self._close(last.id), look)
 
     def _update(self, job: StudioJob) -> None:
         bar, where = self._bars[job.id]

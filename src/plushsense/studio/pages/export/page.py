@@ -18,7 +18,7 @@ from plushsense.models.bundle import Bundle
 from plushsense.studio.app.guard import download_address, path_in
 from plushsense.studio.app.jobs import Jobs, StudioJob
 from plushsense.studio.app.shell import Page, address, button, html, moment, query, set_address, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.app.workspace import EXPORTS, plain_name
 from plushsense.studio.pages.export.exports import BundleFacts, ExportFacts, exports_of, formats, newest_job, targets
 from plushsense.studio.widgets.elements import (
@@ -37,6 +37,62 @@ from plushsense.studio.widgets.elements import (
     verdict,
 )
 
+_NEXT_STEPS: Texts = {
+    "arduino": "Arduino and PlatformIO: copy the folder {arduino} to the libraries. An example is in {sketch}.",
+    "idf": "ESP-IDF: the component is {idf}; {example} is a complete project.",
+    "plain": "Any other C99 compiler: compile plushsense.h, plushsense.c, plush_model.h and plush_model.c.",
+    "read": "README.md in the export describes how to pass frames, what is returned, and what is required.",
+}
+
+_HEADS: Texts = {
+    "target": "Target",
+    "compiler": "Compiler",
+    "flags": "Flags",
+    "answers": "Answers",
+    "mismatches": "Different",
+    "difference": "Largest difference",
+    "verdict": "Verdict",
+    "stream": "Input",
+    "samples": "Samples",
+    "frames": "Frames",
+    "fault_kind": "Where",
+    "fault": "Fault",
+    "chip": "Chip",
+    "mhz": "MHz",
+    "estimate": "ms per step, estimated",
+    "fits": "In time?",
+    "counted_on": "Measured on",
+    "instructions": "Instructions per step",
+    "flash_all": "Flash with code (bytes)",
+    "ram_all": "RAM (bytes)",
+    "stack": "Stack (bytes)",
+    "name": "Name",
+    "network": "Network structure",
+    "data": "Data",
+    "made": "Created",
+    "last_proof": "Last verification",
+}
+
+_OUTCOMES: Texts = {
+    "caught": "detected",
+    "not_shown": "cannot be detected",
+    "not_caught": "NOT detected",
+}
+
+_STAGES: Texts = {
+    "begin": "Starting …",
+    "export": "Writing the C and the golden vectors …",
+    "profile": "Measuring the cost of a step …",
+    "vectors": "Computing the expected answers …",
+    "verify": "Compiling and running …",
+}
+
+_FITS_TEXTS: Texts = {
+    "yes": "yes",
+    "no": "no",
+    "unsure": "not sure",
+}
+
 _FITS = {"yes": True, "no": False, "unsure": None}
 
 
@@ -49,34 +105,41 @@ def show_cost(page: Page, work: WorkPanel, export: ExportFacts, counted: StudioJ
     async def start() -> None:
         await work.start("profile", {"place": str(export.folder)})
 
-    with tag(ui.column().classes("ps-card w-full"), "cost"), _folded(words("export.cost")):
+    with tag(ui.column().classes("ps-card w-full"), "cost"), _folded(words("Cost of a step")):
         if not profile:
-            text(words("export.not_counted"))
+            text(words("Not measured yet."))
         elif not current:
-            notice(words("export.counted_before"))
+            notice(words("The files have changed since the measurement. Measure again."))
         elif "refused" in profile:
             tag(notice(words.sentence(profile["refused"])), "cost-refused")
         else:
             assert counted is not None
             _display_cost(words, profile, moment(counted.ended_s))
         if not current or "refused" in profile:
-            button("count", words("export.count"), start)
+            button("count", words("Measure"), start)
 
 
 def _display_cost(words: Words, profile: dict[str, Any], when: str) -> None:
-    text(words("export.cost_about", step=words.significant(profile["step_ms"], 3)), classes="ps-dim")
+    text(
+        words(
+            "An answer is due every {step} ms. Instructions are counted exactly, on emulators. Times are estimated "
+            "from them, as a lower and an upper bound: nothing was measured on a real chip.",
+            step=words.significant(profile["step_ms"], 3),
+        ),
+        classes="ps-dim",
+    )
     rows = [
         (
             each["chip"],
             f"{each['mhz']}",
-            words("export.between", low=words.significant(each["low"], 2), high=words.significant(each["high"], 2)),
-            verdict(_FITS[each["fits"]], words(f"export.fits_{each['fits']}")),
+            words("{low} to {high}", low=words.significant(each["low"], 2), high=words.significant(each["high"], 2)),
+            verdict(_FITS[each["fits"]], words(_FITS_TEXTS[each["fits"]])),
         )
         for each in profile["estimated_ms"].values()
     ]
     if rows:
-        head = [words(f"export.{k}") for k in ("chip", "mhz", "estimate", "fits")]
-        tag(table(words("export.estimate_caption", when=when), head, rows, (1,)), "estimates")
+        head = [words(_HEADS[k]) for k in ("chip", "mhz", "estimate", "fits")]
+        tag(table(words("Estimated time of a step on real chips, {when}", when=when), head, rows, (1,)), "estimates")
     counted = [
         (
             TARGETS[name].title,
@@ -87,14 +150,23 @@ def _display_cost(words: Words, profile: dict[str, Any], when: str) -> None:
         if each["instructions_per_step"] is not None
     ]
     if counted:
-        head = [words(f"export.{k}") for k in ("counted_on", "instructions", "flash_all", "ram_all", "stack")]
-        table(words("export.counted_caption", optimise=profile["optimise"]), head, counted, (1, 2, 3, 4))
+        head = [words(_HEADS[k]) for k in ("counted_on", "instructions", "flash_all", "ram_all", "stack")]
+        table(
+            words("Measured on emulators, compiled with {optimise}", optimise=profile["optimise"]),
+            head,
+            counted,
+            (1, 2, 3, 4),
+        )
     for name, packages in profile["missing"].items():
         text(_missing_target(words, TARGETS[name].title, packages), classes="ps-dim")
 
 
 def _missing_target(words: Words, title: str, packages: Sequence[str]) -> str:
-    return words("export.target_missing", target=title, packages=" ".join(packages))
+    return words(
+        "Not available: {target}. It needs the Debian packages {packages}  (apt-get install {packages}).",
+        target=title,
+        packages=" ".join(packages),
+    )
 
 
 def show_facts(page: Page, export: ExportFacts, made: StudioJob | None) -> None:
@@ -102,13 +174,13 @@ def show_facts(page: Page, export: ExportFacts, made: StudioJob | None) -> None:
     words, card = page.words, export.facts
     with tag(ui.column().classes("ps-card w-full"), "export-facts"):
         if card.get("simulated"):
-            notice(words("shell.simulation"))
+            notice(words("Simulation: these data say nothing about a real toy."))
         for warning in made.warnings if made else ():
             notice(words.sentence(warning))
-        text(words("export.hand_over"))
-        download = ui.link(words("export.download"), download_address(EXPORTS, export.name)).classes("ps-link")
+        text(words("Give this file to the person who programs the toy."))
+        download = ui.link(words("Download as a zip"), download_address(EXPORTS, export.name)).classes("ps-link")
         tag(download.props("download"), "download")
-        with _folded(words("export.details")):
+        with _folded(words("Details for the engineer")):
             _list_facts(words, export)
 
 
@@ -126,28 +198,34 @@ def _list_facts(words: Words, export: ExportFacts) -> None:
     step = words.significant(card["step_ms"], 3)
     facts(
         [
-            (words("export.network"), str(card["title"])),
-            (words("export.gestures"), str(card["classes"])),
-            (words("export.layout"), str(card.get("layout", ""))),
-            (words("export.flash"), words("export.flash_value", n=words.count(export.flash_bytes))),
-            (words("export.ram"), words("export.ram_value", n=words.count(export.ram_bytes))),
+            (words("Network structure"), str(card["title"])),
+            (words("Gestures"), str(card["classes"])),
+            (words("Sensors"), str(card.get("layout", ""))),
             (
-                words("export.step"),
-                words("export.step_value", ms=step, macs=words.count(card["macs_per_step"])),
+                words("Flash for the network"),
+                words("{n} bytes, without the code; see the cost below", n=words.count(export.flash_bytes)),
             ),
-            (words("export.made"), moment(export.made_s)),
-            (words("export.place"), str(export.folder)),
+            (words("RAM"), words("{n} bytes for each toy", n=words.count(export.ram_bytes))),
+            (
+                words("A step"),
+                words("every {ms} ms, {macs} multiplications", ms=step, macs=words.count(card["macs_per_step"])),
+            ),
+            (words("Created"), moment(export.made_s)),
+            (words("Folder"), str(export.folder)),
         ]
     )
     for name, each in card.get("conversions", {}).items():
         apart = each.get("largest_difference")
-        message = words("export.converted", file=each["file"], n=words.count(each["bytes"]), name=name)
-        text(message if apart is None else f"{message} {words('export.apart', d=words.significant(apart, 1))}")
+        message = words("{name}: {file}, {n} bytes.", file=each["file"], n=words.count(each["bytes"]), name=name)
+        if apart is not None:
+            difference = words.significant(apart, 1)
+            message += f" {words('Its outputs differ by up to {d} from those of the trained network.', d=difference)}"
+        text(message)
     with ui.expansion(
-        words("export.files", n=len(export.files), size=size(sum(export.files.values()), words))
+        words("Files: {n}, {size}", n=len(export.files), size=size(sum(export.files.values()), words))
     ) as files:
         rows = [(name, words.count(bytes_)) for name, bytes_ in export.files.items()]
-        table(words("export.files_caption"), (words("export.file"), words("export.bytes")), rows, (1,))
+        table(words("Files of the export"), (words("File"), words("Size (bytes)")), rows, (1,))
     tag(files.classes("w-full"), "files")
 
 
@@ -155,18 +233,18 @@ def show_next(page: Page) -> None:
     """Build the card with the next steps for a firmware engineer."""
     words = page.words
     card = tag(ui.column().classes("ps-card w-full"), "next")
-    with card, _folded(words("export.next")), ui.element("ol").classes("ps-steps"):
-        for key in ("arduino", "idf", "plain", "read"):
-            message = words(f"export.next_{key}", arduino=ARDUINO, sketch=SKETCH, idf=IDF, example=IDF_EXAMPLE)
+    with card, _folded(words("Next steps for the firmware engineer")), ui.element("ol").classes("ps-steps"):
+        for step in _NEXT_STEPS.values():
+            message = words(step, arduino=ARDUINO, sketch=SKETCH, idf=IDF, example=IDF_EXAMPLE)
             text(message, "li")
 
 
 def verification_verdict(words: Words, export: ExportFacts, proof: StudioJob | None) -> Markup:
     """Render the outcome of the last verification: equal, unequal, outdated or never run."""
     if proof is None:
-        return verdict(None, words("export.never_proved"))
+        return verdict(None, words("never verified"))
     if proof.result.get("digest") != export.digest:
-        return verdict(None, words("export.proved_before"))
+        return verdict(None, words("changed since it was verified"))
     good, outcome = _outcome(words, proof.result)
     return verdict(good, f"{outcome}, {moment(proof.ended_s)}")
 
@@ -174,8 +252,8 @@ def verification_verdict(words: Words, export: ExportFacts, proof: StudioJob | N
 def _outcome(words: Words, result: dict[str, Any]) -> tuple[bool | None, str]:
     """Return whether a verification passed, and its text; None means it passed with C code changed by the user."""
     if not result["passed"]:
-        return False, words("export.unequal")
-    return (True, words("export.equal")) if result["own"] else (None, words("export.equal_not_own"))
+        return False, words("not equal")
+    return (True, words("equal")) if result["own"] else (None, words("equal, but not our own code"))
 
 
 class VerificationCard:
@@ -189,9 +267,16 @@ class VerificationCard:
         words = self.words
         missing = await run.io_bound(targets) or {}
         with tag(ui.column().classes("ps-card w-full"), "proof"):
-            text(words("export.prove"), "h3")
-            text(words("export.prove_about"), classes="ps-dim")
-            with ui.expansion(words("export.more")).classes("w-full"):
+            text(words(in_context("heading", "Verify")), "h3")
+            text(
+                words(
+                    "The C code in this folder is compiled and run if it is exactly what this version of PlushSense "
+                    "writes for the network. Each answer is compared with that of the exact network, also in test "
+                    "scenarios, which use the same network with other decision rules."
+                ),
+                classes="ps-dim",
+            )
+            with ui.expansion(words("More settings")).classes("w-full"):
                 with ui.row().classes("w-full"):
                     for name in (n for n, packages in missing.items() if not packages):
                         self._chosen[name] = ui.checkbox(self._title(name), value=True)
@@ -200,26 +285,41 @@ class VerificationCard:
                     if packages:
                         message = _missing_target(words, self._title(name), packages)
                         tag(text(message, classes="ps-dim"), f"missing-{name}")
-                options = {"": words("export.recorded_none")} | await titles(self.page.workspace)
-                self._dataset = ui.select(options, value="", label=words("export.recorded")).classes("w-full")
-                self._faults = tag(ui.checkbox(words("export.faults")), "faults")
-                self._trust = tag(ui.checkbox(words("export.trust")), "trust")
-            start = button("verify", words("export.verify"), self._start, "", icon="fact_check")
+                options = {"": words("No recordings, only the golden vectors and test scenarios")} | await titles(
+                    self.page.workspace
+                )
+                self._dataset = ui.select(options, value="", label=words("Also stream the recordings of")).classes(
+                    "w-full"
+                )
+                self._faults = tag(
+                    ui.checkbox(words("Also insert faults, one at a time; each must be detected (takes minutes)")),
+                    "faults",
+                )
+                self._trust = tag(
+                    ui.checkbox(
+                        words(
+                            "Also compile and run C files that were changed or come from elsewhere (they can do "
+                            "anything on this computer that you can do)"
+                        )
+                    ),
+                    "trust",
+                )
+            start = button("verify", words("Verify"), self._start, "", icon="fact_check")
             start.set_enabled(bool(self._chosen))
             proof = newest_job(self.page.workspace.part(Jobs), "verify", self.export.folder)
             if proof is not None:
                 self._display(proof)
 
     def _title(self, name: str) -> str:
-        return self.words("export.host") if name == "host" else TARGETS[name].title
+        return self.words("This computer (gcc, clang, sanitizers)") if name == "host" else TARGETS[name].title
 
     async def _start(self) -> None:
         words, chosen = self.words, [name for name, box in self._chosen.items() if box.value]
         if not chosen:
-            self.page.say(words("export.no_target"), "error")
+            self.page.say(words("Choose at least one target."), "error")
             return
         if self.work.running("verify"):
-            self.page.say(words("export.verify_runs"), "warning")
+            self.page.say(words("A verification is running already. Wait for it, or stop it."), "warning")
             return
         self.page.say("")
         with self.page.show_errors():
@@ -238,7 +338,10 @@ class VerificationCard:
         with tag(ui.column().classes("w-full"), "verdict"):
             if result["digest"] != self.export.digest:
                 text(
-                    words("export.changed_since", when=moment(proof.ended_s)),
+                    words(
+                        "The files have changed since this verification of {when}. Verify again.",
+                        when=moment(proof.ended_s),
+                    ),
                     classes="ps-message ps-message-warning w-full",
                 )
             good, outcome = _outcome(words, result)
@@ -249,45 +352,76 @@ class VerificationCard:
                 notice(sentence, "error" if good is False else "warning")
             rows = [
                 (
-                    words("export.host_short") if r["target"] == "host" else self._title(r["target"]),
+                    words("This computer") if r["target"] == "host" else self._title(r["target"]),
                     r["compiler"],
                     r["flags"],
                     words.count(r["vectors"]),
                     words.count(r["mismatches"]),
                     words.count(r["max_abs_diff"]),
-                    verdict(not r["mismatches"], words("export.unequal" if r["mismatches"] else "export.equal")),
+                    verdict(not r["mismatches"], words("not equal" if r["mismatches"] else "equal")),
                 )
                 for r in result["runs"]
             ]
             keys = ("target", "compiler", "flags", "answers", "mismatches", "difference", "verdict")
-            caption = words("export.runs_caption", when=moment(proof.ended_s))
-            tag(table(caption, [words(f"export.{k}") for k in keys], rows, (3, 4, 5)), "runs")
+            caption = words("Compiled and run programs, {when}", when=moment(proof.ended_s))
+            tag(table(caption, [words(_HEADS[k]) for k in keys], rows, (3, 4, 5)), "runs")
             counts = ("samples", "frames", "answers")
             streams = [(s["name"], *(words.count(s[key]) for key in counts)) for s in result["streams"]]
-            head = [words(f"export.{k}") for k in ("stream", *counts)]
-            tag(table(words("export.streams_caption"), head, streams, (1, 2, 3)), "streams")
+            head = [words(_HEADS[k]) for k in ("stream", *counts)]
+            tag(
+                table(
+                    words(
+                        "Inputs of each program (scenario: the network with other rules; golden: the vectors of the "
+                        "export)"
+                    ),
+                    head,
+                    streams,
+                    (1, 2, 3),
+                ),
+                "streams",
+            )
             for each in result["not_run"]:
-                text(words("export.not_run", what=each["what"], why=words.sentence(each["why"])), classes="ps-dim")
+                text(
+                    words("Not run: {what} ({why}).", what=each["what"], why=words.sentence(each["why"])),
+                    classes="ps-dim",
+                )
             if result["faults"]:
                 self._mutants(result["faults"])
 
     def _sum(self, result: dict[str, Any]) -> str:
         total, unequal = self.words.count(result["vectors"]), self.words.count(result["mismatches"])
         if not result["mismatches"]:
-            return self.words("export.all_equal", n=total, settings=len(result["runs"]))
-        return self.words("export.some_unequal", bad=unequal, n=total)
+            return self.words(
+                "All {n} answers of {settings} programs are equal to the exact network's.",
+                n=total,
+                settings=len(result["runs"]),
+            )
+        return self.words("{bad} of {n} answers differ.", bad=unequal, n=total)
 
     def _sentences(self, result: dict[str, Any]) -> list[str]:
         words, sentences = self.words, []
         if result["first"]:
-            sentences.append(words("export.first_difference", where=result["first"]))
+            sentences.append(
+                words("The answers differ. The first difference, for the engineer: {where}", where=result["first"])
+            )
         elif not result["decisions"]:
-            sentences.append(words("export.nothing_proved"))
+            sentences.append(
+                words("Nothing is verified: in no answer had the toy finished warming up. Export the network again.")
+            )
         elif not result["passed"]:
-            sentences.append(words("export.fault_missed"))
+            sentences.append(
+                words("An inserted fault was not detected: the golden vectors of this export are too weak for it.")
+            )
         if not result["own"]:
-            sentences.append(words("export.not_own"))
-            sentences.append(words("export.changed_files", files=", ".join(result["changed"])))
+            sentences.append(
+                words(
+                    "The code in this folder is not what this version of PlushSense writes for the .plush file in "
+                    "it. Equal answers say nothing about what else it does. Export again to be sure."
+                )
+            )
+            sentences.append(
+                words("These files are not what PlushSense writes: {files}", files=", ".join(result["changed"]))
+            )
         return sentences
 
     def _mutants(self, faults: Sequence[dict[str, Any]]) -> None:
@@ -296,13 +430,16 @@ class VerificationCard:
         rows = []
         for each in faults:
             state = True if each["caught"] else None if each["silent"] else False
-            cell = verdict(state, words(f"export.{kinds[state]}"))
+            cell = verdict(state, words(_OUTCOMES[kinds[state]]))
             rows.append((each["kind"], each["fault"], self._title(each["target"]), cell))
-        with ui.expansion(words("export.faults_found", n=len(rows))).classes("w-full"):
-            head = [words(f"export.{k}") for k in ("fault_kind", "fault", "target", "verdict")]
-            table(words("export.faults_caption"), head, rows)
+        with ui.expansion(words("{n} inserted faults", n=len(rows))).classes("w-full"):
+            head = [words(_HEADS[k]) for k in ("fault_kind", "fault", "target", "verdict")]
+            table(words("Inserted faults, one at a time"), head, rows)
             if any(f["silent"] for f in faults):
-                text(words("export.not_shown_about"), classes="ps-dim")
+                text(
+                    words("Cannot be detected: no test scenario of this network depends on that line of the rules."),
+                    classes="ps-dim",
+                )
 
 
 _TASKS = ("export", "profile", "verify")
@@ -322,7 +459,13 @@ class _Exporting:
 
     async def build(self) -> None:
         style()
-        text(self.words("export.about"), classes="ps-dim")
+        text(
+            self.words(
+                "Put a trained network into a toy: the studio writes a folder for the person who programs the toy. "
+                "Everything stays on this computer."
+            ),
+            classes="ps-dim",
+        )
         await self._form()
         self.work = WorkPanel(self.page, _TASKS, self._progress_text, self._ended, self._allow)
         self._allow()
@@ -338,24 +481,22 @@ class _Exporting:
         words = self.words
         bundles = await run.io_bound(self.workspace.bundles) or []
         with tag(ui.column().classes("ps-card w-full"), "new"):
-            text(words("export.new"), "h2")
+            text(words("New export"), "h2")
             if not bundles:
-                tag(text(words("export.no_bundle")), "no-bundle")
-                ui.link(words("pages.train"), address("train")).classes("ps-link")
+                tag(text(words("There is no network yet. Train one first.")), "no-bundle")
+                ui.link(words("Train"), address("train")).classes("ps-link")
                 return
             options = {str(p): self._label(p) for p in bundles}
             model = self.query.get("model", "")
             first = model if model in options else str(bundles[0])
-            select = ui.select(
-                options, value=first, label=words("export.bundle"), on_change=lambda e: self._choose(e.value)
-            )
+            select = ui.select(options, value=first, label=words("Network"), on_change=lambda e: self._choose(e.value))
             tag(select.classes("w-full"), "bundle")
             self._state = ui.column().classes("w-full")
-            self._name = tag(ui.input(words("export.name")).props("maxlength=64").classes("w-full"), "name")
-            self._button = button("do", words("export.do"), self._start, "", icon="memory")
-            with _folded(words("export.about_network")):
+            self._name = tag(ui.input(words("Name")).props("maxlength=64").classes("w-full"), "name")
+            self._button = button("do", words("Export"), self._start, "", icon="memory")
+            with _folded(words("About this network")):
                 self._about = tag(ui.column().classes("w-full"), "bundle-facts")
-            with ui.expansion(words("export.more")).classes("w-full"):
+            with ui.expansion(words("More settings")).classes("w-full"):
                 await self._more()
             await self._choose(first)
 
@@ -367,16 +508,29 @@ class _Exporting:
         words = self.words
         extras = await run.io_bound(formats) or {}
         self._formats: dict[str, ui.checkbox] = {}
-        text(words("export.formats"), "h3")
-        text(words("export.formats_about"), classes="ps-dim")
+        text(words("Also for other runtimes"), "h3")
+        text(
+            words(
+                "These formats compute a whole window for each answer. Each is tested in its own runtime before it "
+                "is written."
+            ),
+            classes="ps-dim",
+        )
         for name in (n for n, extra in extras.items() if not extra):
             self._formats[name] = tag(ui.checkbox(f"{name}: {CONVERTERS[name].holds}"), f"format-{name}")
         for extra in dict.fromkeys(e for e in extras.values() if e):
             missing = ", ".join(n for n, needed in extras.items() if needed == extra)
-            text(words("export.format_missing", names=missing, extra=extra), classes="ps-dim")
-        text(words("export.calibrate"), "h3")
-        options = {"": words("export.calibrate_kept")} | await titles(self.workspace)
-        self._dataset = ui.select(options, value="", label=words("export.calibrate_on")).classes("w-full")
+            text(
+                words(
+                    "Not installed: {names}. Install with  pip install 'plushsense[{extra}]'",
+                    names=missing,
+                    extra=extra,
+                ),
+                classes="ps-dim",
+            )
+        text(words("Calibration for 8 bits"), "h3")
+        options = {"": words("From training, as stored in the network")} | await titles(self.workspace)
+        self._dataset = ui.select(options, value="", label=words("Data set for the calibration")).classes("w-full")
 
     async def _choose(self, path: str) -> None:
         chosen = await run.io_bound(lambda: BundleFacts.of(Path(path)))
@@ -389,7 +543,7 @@ class _Exporting:
                 tag(notice(self.words.sentence(chosen.problem or ""), "error"), "bundle-problem")
             else:
                 if chosen.simulated:
-                    notice(self.words("shell.simulation"))
+                    notice(self.words("Simulation: these data say nothing about a real toy."))
                 if chosen.cannot:
                     tag(notice(self.words.sentence(chosen.cannot), "error"), "bundle-cannot")
         if chosen.bundle is not None:
@@ -405,29 +559,29 @@ class _Exporting:
         words, origin = self.words, bundle.provenance
         subjects, dataset = origin.get("subjects"), str(origin.get("dataset", ""))
         people = len(set(subjects) - {NOBODY, UNKNOWN_SUBJECT}) if isinstance(subjects, list) else int(subjects or 0)
-        trained = words("export.trained_value", dataset=dataset, people=people)
-        network = words("export.network_value", title=bundle.arch.title, padding=bundle.arch.padding)
+        trained = words("{dataset}, people: {people}", dataset=dataset, people=people)
+        network = words("{title}, padding {padding}", title=bundle.arch.title, padding=bundle.arch.padding)
         rows = [
-            (words("export.network"), network),
-            (words("export.gestures"), str(len(bundle.gestures.labels))),
-            (words("export.layout"), bundle.layout.name),
-            (words("export.trained_on"), trained if dataset else words("export.unknown_dataset")),
-            (words("export.adapted_to"), bundle.adapted_to or ""),
-            (words("export.size"), size(bytes_, words)),
+            (words("Network structure"), network),
+            (words("Gestures"), str(len(bundle.gestures.labels))),
+            (words("Sensors"), bundle.layout.name),
+            (words("Trained on"), trained if dataset else words("unknown")),
+            (words("Adapted to"), bundle.adapted_to or ""),
+            (words("Size"), size(bytes_, words)),
         ]
         scores = origin.get("scores")
         if not isinstance(scores, dict) or scores.get("accuracy") is None:
-            return [*rows, (words("export.scores"), words("export.no_scores"))]
+            return [*rows, (words("Scores"), words("the network has no scores"))]
         value = words(
-            "export.scores_value",
+            "accuracy {accuracy}, macro-F1 {f1}, windows: {windows}, split {split}",
             accuracy=words.number(scores["accuracy"], 2),
             f1=words.number(scores.get("macro_f1") or float("nan"), 2),
             windows=scores.get("windows", "?"),
             split=scores.get("split", "?"),
         )
-        leaky = f" {words('export.leaky')}" if scores.get("leaky") else ""
-        simulated = f" {words('export.simulated_scores')}" if origin.get("simulated") else ""
-        return [*rows, (words("export.scores"), f"{value}{leaky}{simulated}")]
+        leaky = f" {words('(leaky: windows of the same recordings were trained on)')}" if scores.get("leaky") else ""
+        simulated = f" {words('(of virtual people: no result)')}" if origin.get("simulated") else ""
+        return [*rows, (words("Scores"), f"{value}{leaky}{simulated}")]
 
     def _allow(self) -> None:
         """Enable the button while no export runs and the bundle can be read."""
@@ -450,13 +604,13 @@ class _Exporting:
 
     def _progress_text(self, job: StudioJob) -> str:
         stage, total = str(job.progress.get("stage", "begin")), job.progress.get("total") or 0
-        count = f" {self.words('export.of', done=job.progress.get('done', 0), total=total)}" if total else ""
-        return f"{self.words(f'export.stage_{stage}')}{count}"
+        count = f" {self.words('({done} of {total})', done=job.progress.get('done', 0), total=total)}" if total else ""
+        return f"{self.words(_STAGES[stage])}{count}"
 
     async def _ended(self, job: StudioJob) -> None:
         name = Path(job.spec["place"]).name
         if job.task == "export":
-            self.page.say(self.words("export.done", name=name), "good")
+            self.page.say(self.words("“{name}” is exported. Verify it before it goes into a toy.", name=name), "good")
             self._name.set_value(self._free_name(name))
         if job.task == "export" or name == self.open:
             await self._show(name)
@@ -482,7 +636,7 @@ class _Exporting:
             set_address(address("export", name=name))
             self._detail.clear()
             with self._detail:
-                text(words("export.one", name=name), "h2")
+                text(words("Export “{name}”", name=name), "h2")
                 if export.problem:
                     notice(words.sentence(export.problem), "error")
                     return
@@ -508,16 +662,16 @@ class _Exporting:
                 (
                     link(each.name, address("export", name=each.name)),
                     words.sentence(each.problem) if each.problem else str(each.facts["title"]),
-                    words("export.simulation_short") if each.facts.get("simulated") else "",
+                    words("simulation") if each.facts.get("simulated") else "",
                     moment(each.made_s) if each.made_s else "",
                     verification_verdict(words, each, proof),
                 )
             )
         self._list.clear()
         with self._list:
-            text(words("export.earlier"), "h2")
+            text(words("Exports"), "h2")
             if not rows:
-                text(words("export.none"), classes="ps-dim")
+                text(words("There are no exports yet."), classes="ps-dim")
                 return
             keys = ("name", "network", "data", "made", "last_proof")
-            table(words("export.earlier_caption"), [words(f"export.{k}") for k in keys], rows)
+            table(words("Exports of this studio, the newest first"), [words(_HEADS[k]) for k in keys], rows)

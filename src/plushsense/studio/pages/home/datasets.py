@@ -12,6 +12,7 @@ from plushsense.dataset.privacy.forget import people_of_dataset
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import Page, address, button, heading, named, on_page, tag
+from plushsense.studio.app.words import in_context
 from plushsense.studio.app.workspace import BACKUPS, BUNDLES, DATASETS, plain_name
 from plushsense.studio.pages.home.overview import DatasetEntry, WorkspaceSummary
 from plushsense.studio.pages.home.sections import (
@@ -33,7 +34,7 @@ class DatasetSection:
 
     def __init__(self, page: Page, jobs: Jobs, actions: FileActions) -> None:
         self._page, self._jobs, self._actions = page, jobs, actions
-        with titled_card(page, "home.datasets", "datasets"):
+        with titled_card(page, "Data sets", "datasets"):
             self._rows = ui.column().classes("w-full ps-small-gap")
             self._backups = tag(ui.element("details").classes("w-full"), "backups")
 
@@ -42,7 +43,7 @@ class DatasetSection:
         self._rows.clear()
         with self._rows:
             if not contents.datasets:
-                ui.label(self._page.words("home.no_datasets")).classes("ps-dim")
+                ui.label(self._page.words("There are no data sets yet.")).classes("ps-dim")
             for entry in contents.datasets:
                 self._row(entry)
         self._show_backups(contents.backups)
@@ -56,33 +57,43 @@ class DatasetSection:
                     simulation_badge(page)
                 ui.space()
                 more = {
-                    words("home.backup"): lambda: self._backup(entry),
-                    words("home.pseudonyms"): lambda: ui.navigate.to(address("publish", dataset=entry.path)),
-                    words("home.forget"): lambda: ForgetDialog(page, self._jobs, entry).open(),
+                    words("Make a backup"): lambda: self._backup(entry),
+                    words("Copy with pseudonyms"): lambda: ui.navigate.to(address("publish", dataset=entry.path)),
+                    words("Remove a person"): lambda: ForgetDialog(page, self._jobs, entry).open(),
                 }
                 self._actions.menu(entry.path, entry.name, {} if entry.refused else more)
             if entry.refused:
                 ui.label(words.sentence(entry.refused)).classes("ps-bad ps-break")
                 return
-            excluded = f" ({words('home.excluded', n=entry.excluded)})" if entry.excluded else ""
+            excluded = f" ({words('excluded: {n}', n=entry.excluded)})" if entry.excluded else ""
             facts = [
-                words("home.people", n=entry.people),
-                words("home.recordings", n=entry.recordings) + excluded,
+                words("people: {n}", n=entry.people),
+                words("recordings: {n}", n=entry.recordings) + excluded,
                 _size(page, entry.bytes),
                 entry.layout,
             ]
             ui.label(" · ".join(facts)).classes("ps-dim")
             checks = [j for j in self._jobs.all("check") if j.spec.get("dataset") == str(entry.path)]
             last = next((j for j in checks if j.state == DONE and j.result.get("dataset") == str(entry.path)), None)
-            ui.label(findings_text(page, last.result) if last is not None else words("home.unchecked"))
+            ui.label(
+                findings_text(page, last.result)
+                if last is not None
+                else words(in_context("data set", "Not checked yet."))
+            )
             with ui.row().classes("items-center ps-small-gap"):
                 page_links(page, ("review", "train", "publish"), entry.name, dataset=entry.path)
                 if not any(j.state == RUNNING for j in checks):
-                    button("check", words("home.check"), lambda: self._check(entry), SMALL, about=entry.name)
+                    button(
+                        "check",
+                        words(in_context("button", "Check")),
+                        lambda: self._check(entry),
+                        SMALL,
+                        about=entry.name,
+                    )
 
     def _check(self, entry: DatasetEntry) -> None:
         with self._page.show_errors():
-            title = self._page.words("home.check_title", name=entry.name)
+            title = self._page.words("Checking “{name}”", name=entry.name)
             self._jobs.start("check", {"dataset": str(entry.path), "name": entry.name}, title)
 
     def _backup(self, entry: DatasetEntry) -> None:
@@ -92,24 +103,24 @@ class DatasetSection:
             stem = f"{plain_name(entry.name, entry.path.name)} {time.strftime('%Y-%m-%d')}"
             place = workspace.folder / BACKUPS / f"{workspace.free_name(BACKUPS, stem, '.zip', separator=' ')}.zip"
             spec = {"dataset": str(entry.path), "place": str(place), "name": entry.name}
-            self._jobs.start("backup", spec, self._page.words("home.backup_title", name=entry.name))
+            self._jobs.start("backup", spec, self._page.words("Backup of “{name}”", name=entry.name))
 
     def _show_backups(self, backups: Sequence[Path]) -> None:
         words = self._page.words
         self._backups.clear()
         self._backups.set_visibility(bool(backups))
         with self._backups:
-            summary(words("home.backups", n=len(backups)))
+            summary(words("Backups: {n}", n=len(backups)))
             for path in backups:
                 with ui.row().classes("ps-row items-center w-full ps-small-gap"):
                     ui.label(f"{path.stem} · {_size(self._page, path.stat().st_size)}").classes("flex-grow ps-break")
-                    link = ui.link(words("home.download"), download_address(BACKUPS, path.stem)).classes("ps-link")
-                    named(link.props("download"), f"{words('home.download')}: {path.stem}")
+                    link = ui.link(words("Download"), download_address(BACKUPS, path.stem)).classes("ps-link")
+                    named(link.props("download"), f"{words('Download')}: {path.stem}")
                     restore = on_page(lambda path=path: self._restore(path))
-                    button("", words("home.restore"), restore, SMALL, about=path.stem)
+                    button("", words("Restore"), restore, SMALL, about=path.stem)
                     button(
                         "",
-                        words("shell.discard"),
+                        words("Discard"),
                         on_page(lambda path=path: self._discard(path)),
                         SMALL,
                         about=path.stem,
@@ -121,10 +132,13 @@ class DatasetSection:
         with self._page.show_errors():
             name = workspace.free_name(DATASETS, path.stem, separator=" ")
             spec = {"file": str(path), "dest": str(workspace.new(DATASETS, name)), "name": name}
-            self._jobs.start("restore", spec, self._page.words("home.restore_title", name=name))
+            self._jobs.start("restore", spec, self._page.words("Restoring “{name}”", name=name))
 
     async def _discard(self, path: Path) -> None:
-        workspace, message = self._page.workspace, self._page.words("shell.discarded", name=path.stem)
+        workspace, message = (
+            self._page.workspace,
+            self._page.words("“{name}” is discarded. It can be restored on the home page.", name=path.stem),
+        )
         await self._actions.change(lambda: workspace.discard(path), message, workspace.restore)
 
 
@@ -145,18 +159,18 @@ class ForgetDialog:
         with self._page.show_errors():
             self._jobs.check_unused(self._entry.path)
             people = await run.io_bound(people_of_dataset, self._entry.path) or []
-            title = words("home.forget_title", name=self._entry.name)
+            title = words("Removing a person from “{name}”", name=self._entry.name)
             with context.client.content, ui.dialog() as dialog:
                 named(dialog.props("transition-duration=0"), title)
                 with tag(ui.card().classes("ps-dialog"), "forget"):
                     heading(title, 2)
                     choice = ui.select(
-                        people, label=words("home.forget_who"), on_change=lambda e: self._preview(e.value)
+                        people, label=words("Code of the person"), on_change=lambda e: self._preview(e.value)
                     )
                     tag(choice.classes("w-full"), "forget-person")
                     self._box = ui.column().classes("w-full ps-small-gap").props('aria-live="polite"')
                     with ui.row().classes("w-full justify-end"):
-                        button("", words("shell.cancel"), dialog.close, "flat")
+                        button("", words("Cancel"), dialog.close, "flat")
             self._dialog = dialog
             dialog.on("hide", dialog.delete)
             dialog.open()
@@ -176,10 +190,16 @@ class ForgetDialog:
         plan = found.plan
         with self._box:
             counts = {"files": len(plan.files), "raw": plan.raw, "marks": plan.marks}
-            ui.label(words("home.forget_removed", **counts)).classes("text-bold")
+            ui.label(
+                words(
+                    "This is removed and cannot be restored: {files} files, of which {raw} are recordings or "
+                    "streams; {marks} marks.",
+                    **counts,
+                )
+            ).classes("text-bold")
             self._paths(plan.files)
             if derived := [*plan.caches, *plan.evaluations, *plan.leftovers]:
-                ui.label(words("home.forget_derived"))
+                ui.label(words("Everything that may be derived from the person is removed, too:"))
                 self._paths(derived)
             sessions = workspace.recordings / person
             rest = [
@@ -191,10 +211,15 @@ class ForgetDialog:
                 *(str(self._entry.path / mention) for mention in plan.mentions),
                 *([f"https://doi.org/{plan.published}"] if plan.published else ()),
             ]
-            ui.label(words("home.forget_rest")).classes("text-bold")
+            ui.label(words("This remains. Look through it and delete it yourself:")).classes("text-bold")
             self._paths(dict.fromkeys(rest))
-            ui.label(words("home.forget_elsewhere")).classes("ps-note")
-            button("forget-next", words("home.forget_next"), self._confirm, "outline color=negative")
+            ui.label(
+                words(
+                    "The studio cannot reach copies elsewhere: memory cards, other computers, toys, published data, "
+                    "keys of pseudonyms."
+                )
+            ).classes("ps-note")
+            button("forget-next", words("Go on"), self._confirm, "outline color=negative")
 
     @staticmethod
     def _paths(paths: Iterable[str]) -> None:
@@ -212,15 +237,20 @@ class ForgetDialog:
 
         def remove() -> None:
             if str(code.value or "").strip() != self._person:
-                code.error = words("home.forget_wrong")
+                code.error = words("This is not the code of the chosen person.")
                 return
             self._dialog.close()
             spec = {"dataset": str(self._entry.path), "person": self._person, "name": self._entry.name}
             with self._page.show_errors():
-                self._jobs.start("forget", spec, words("home.forget_title", name=self._entry.name))
+                self._jobs.start("forget", spec, words("Removing a person from “{name}”", name=self._entry.name))
 
         with self._box:
-            ui.label(words("home.forget_sure", person=self._person)).classes("text-bold ps-break")
-            code = tag(ui.input(words("home.forget_code")).props("autofocus").classes("w-full"), "forget-code")
+            ui.label(
+                words(
+                    "{person} will be removed from this data set for good. Type the code once more.",
+                    person=self._person,
+                )
+            ).classes("text-bold ps-break")
+            code = tag(ui.input(words("Code of the person")).props("autofocus").classes("w-full"), "forget-code")
             on_enter(code, on_page(remove))
-            button("forget-go", words("home.forget_go"), on_page(remove), "unelevated color=negative")
+            button("forget-go", words("Remove for good"), on_page(remove), "unelevated color=negative")

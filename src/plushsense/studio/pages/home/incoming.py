@@ -27,9 +27,27 @@ from plushsense.models.bundle import Bundle
 from plushsense.studio.app.guard import UPLOAD_BYTES
 from plushsense.studio.app.jobs import DONE, INCOMING, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, button, heading, on_change, on_page, tag
+from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import BUNDLES, DATASETS, WORK, Workspace, plain_name
 from plushsense.studio.pages.home.sections import simulation_badge, titled_card
 from plushsense.studio.widgets.elements import errors_beside, facts, notice, summary
+
+_CHOOSE: Texts = {
+    "choose_files": "Choose files",
+    "choose_folder": "Choose a folder",
+}
+
+_FOLDS: Texts = {
+    "preview_gestures": "Gestures: {n}",
+    "rejected": "Files that are not imported: {n}",
+}
+
+_LAYOUTS: Texts = {
+    "plush-15": "plush toy",
+    "plush-14": "plush toy, older firmware",
+    "accel-3": "one accelerometer",
+    "phone-6": "phone, acceleration and rotation",
+}
 
 ARCHIVE_BYTES = UPLOAD_BYTES - 1_000_000
 """Maximum size of an uploaded file in bytes; the request that carries it is slightly larger."""
@@ -187,14 +205,19 @@ class IncomingSection:
         self._layout = self._person = ""
         self._ended = True
         words = self._words
-        with titled_card(page, "home.incoming", "incoming"):
-            about = words("home.incoming_about", mb=ARCHIVE_BYTES // 1_000_000)
-            texts = {"sending": words("home.receiving"), "cancel": words("shell.cancel")}
+        with titled_card(page, "Import files", "incoming"):
+            about = words(
+                "Drop recordings anywhere on this page, or choose them: single files, a whole folder, a .zip, a "
+                "backup or a .plush network (at most {mb} MB each). They are copied from this device to the studio "
+                "and nowhere else.",
+                mb=ARCHIVE_BYTES // 1_000_000,
+            )
+            texts = {"sending": words("Uploading …"), "cancel": words("Cancel")}
             with UploadArea(self._store, self._finish, texts) as area, ui.column().classes("w-full ps-small-gap"):
                 ui.label(about).classes("ps-dim")
                 with ui.row().classes("ps-small-gap"):
                     for key, folder in (("choose_files", "false"), ("choose_folder", "true")):
-                        choose = button(key, words(f"home.{key}"), icon="folder" if folder == "true" else "upload_file")
+                        choose = button(key, words(_CHOOSE[key]), icon="folder" if folder == "true" else "upload_file")
                         # In the browser, since it opens its dialog only as the answer to a click.
                         choose.on("click", js_handler=f"() => runMethod({area.id}, 'pick', [{folder}])")
             self._box = ui.column().classes("w-full ps-small-gap").props('aria-live="polite"')
@@ -223,11 +246,18 @@ class IncomingSection:
             with page.show_errors():
                 if problem is not None:
                     raise problem
-                page.say(words("home.upload_cancelled" if end["cancelled"] else "home.upload_broken"), "warning")
+                page.say(
+                    words(
+                        "The upload was cancelled. Nothing was imported."
+                        if end["cancelled"]
+                        else "The upload broke off. Nothing was imported. Try again."
+                    ),
+                    "warning",
+                )
             return
         added, incoming.bundles = incoming.bundles, []
         if added:
-            page.say(words("home.bundle_came", name="”, “".join(added)), "good")
+            page.say(words("The network “{name}” is added.", name="”, “".join(added)), "good")
             await self._refresh()
         if refused:
             page.say(" ".join(words.sentence(note) for note in refused[:_MAX_LINES]), "error")
@@ -249,7 +279,7 @@ class IncomingSection:
         }
         self._ended = False
         with self._page.show_errors():
-            self._job = self._jobs.start("inspect", spec, self._words("home.inspecting"))
+            self._job = self._jobs.start("inspect", spec, self._words("Looking at the files …"))
         self._update()
 
     def _update(self) -> None:
@@ -258,7 +288,7 @@ class IncomingSection:
             return
         if job.state == RUNNING:
             done, total = job.progress.get("done"), job.progress.get("total")
-            text = self._words("home.inspecting") + (f" {done} / {total}" if total else "")
+            text = self._words("Looking at the files …") + (f" {done} / {total}" if total else "")
             if self._progress is None:
                 self._box.clear()
                 with self._box, ui.row().classes("items-center ps-small-gap").props('role="status"'):
@@ -277,29 +307,29 @@ class IncomingSection:
         with self._box, tag(ui.column().classes("ps-row w-full ps-small-gap"), "preview"):
             reasons = [r["reason"]["reason"] for r in result.get("rejected", ()) if isinstance(r["reason"], dict)]
             unknown_person = "person_unknown" in (job.reason, *reasons) or UNKNOWN_SUBJECT in result.get("people", ())
-            heading(words("home.preview"), 3)
+            heading(words("What the files contain"), 3)
             if job.state == DONE:
                 self._contents(result)
             elif job.reason != "person_unknown":
-                message = words.explain(job.message, job.reason, job.values) or words("home.stopped")
+                message = words.explain(job.message, job.reason, job.values) or words("stopped")
                 tag(notice(message, "error"), "preview-problem")
             if not result.get("restored"):
                 self._settings(str(result.get("layout", self._layout)), unknown_person, job.reason)
             if job.state == DONE:
                 self._keep_row(result)
             else:
-                button("import-cancel", words("shell.cancel"), on_page(self._cancel), "flat")
+                button("import-cancel", words("Cancel"), on_page(self._cancel), "flat")
 
     def _contents(self, result: dict[str, Any]) -> None:
         words, people = self._words, result["people"]
-        names = {NOBODY: words("home.nobody"), UNKNOWN_SUBJECT: "?"}
+        names = {NOBODY: words("nobody"), UNKNOWN_SUBJECT: "?"}
         if result["simulated"]:
             simulation_badge(self._page)
         if result["restored"]:
-            ui.label(words("home.is_backup", name=result["name"]))
+            ui.label(words("This is a backup of the data set “{name}”.", name=result["name"]))
         rows = [
-            (words("home.preview_people"), ", ".join(f"{names.get(p, p)} ({n})" for p, n in people.items())),
-            (words("home.preview_recordings"), str(result["recordings"])),
+            (words("People (recordings)"), ", ".join(f"{names.get(p, p)} ({n})" for p, n in people.items())),
+            (words("Recordings"), str(result["recordings"])),
         ]
         facts(rows)
         gestures = [f"{words.gesture(label)}: {n}" for label, n in sorted(result["gestures"].items())]
@@ -307,7 +337,9 @@ class IncomingSection:
         own = ("simulated", "layout_guessed")
         notes = [words.sentence(n) for n in result["notes"] if not isinstance(n, dict) or n["reason"] not in own]
         if result["flagged"]:
-            notes.append(words("home.flagged", n=result["flagged"]))
+            notes.append(
+                words("Recordings with something to look at: {n}. The page Review shows them.", n=result["flagged"])
+            )
         for note in notes:
             ui.label(note).classes("ps-note ps-break")
         self._lines("rejected", [f"{r['file']}: {words.sentence(r['reason'])}" for r in result["rejected"]])
@@ -316,11 +348,11 @@ class IncomingSection:
         if not lines:
             return
         with tag(ui.element("details").classes("w-full"), key):
-            summary(self._words(f"home.{key}", n=len(lines)))
+            summary(self._words(_FOLDS[key], n=len(lines)))
             for line in lines[:_MAX_LINES]:
                 ui.label(line).classes("ps-break ps-note")
             if len(lines) > _MAX_LINES:
-                ui.label(self._words("home.more", n=len(lines) - _MAX_LINES)).classes("ps-dim")
+                ui.label(self._words("and {n} more", n=len(lines) - _MAX_LINES)).classes("ps-dim")
 
     def _settings(self, current: str, unknown_person: bool, reason: str) -> None:
         """Add the fields of what the files do not state: the layout, and the person where it is not known."""
@@ -335,40 +367,50 @@ class IncomingSection:
                 self._person = code
                 self._inspect()
 
-        options = {
-            name: f"{name}: {words.get(f'home.layout_{name}', load_layout(name).title)}" for name in layout_names()
-        }
-        layout = ui.select(options, value=current if current in options else None, label=words("home.layout"))
+        options = {name: f"{name}: {words(_LAYOUTS.get(name, load_layout(name).title))}" for name in layout_names()}
+        layout = ui.select(options, value=current if current in options else None, label=words("Sensors of the toy"))
         tag(layout.classes("w-full"), "layout").on_value_change(lambda e: on_page(change_layout)(str(e.value)))
-        layout.props(f'hint="{words("home.layout_guessed")}"' if current and not self._layout else "")
+        layout.props(
+            f'hint="{words("Guessed from the files. Change it if it is wrong.")}"'
+            if current and not self._layout
+            else ""
+        )
         if reason == "layout_unknown":
-            layout.error = words("sentences.layout_unknown")
+            layout.error = words("It is not clear which sensors these files are from. Choose them.")
         if unknown_person or self._person:
             with ui.row().classes("items-start ps-small-gap w-full"):
-                person = tag(ui.input(words("home.whose"), value=self._person).classes("ps-wide"), "person-of-files")
+                person = tag(
+                    ui.input(words("Code of the person (such as S01)"), value=self._person).classes("ps-wide"),
+                    "person-of-files",
+                )
                 person.on("keydown.enter", on_page(change_person))
-                button("person-use", words("home.whose_use"), on_page(change_person))
+                button("person-use", words("Use this code"), on_page(change_person))
             if unknown_person:
-                person.error = words("sentences.person_unknown")
+                person.error = words("It is not known whose recordings these are. Enter the code of the person.")
 
     def _keep_row(self, result: dict[str, Any]) -> None:
         words, workspace = self._words, self._page.workspace
-        plain = plain_name(result["name"] or self._incoming.name, words("home.new_dataset"))
+        plain = plain_name(result["name"] or self._incoming.name, words("recordings"))
         free = workspace.free_name(DATASETS, plain, separator=" ")
-        name = tag(ui.input(words("home.name"), value=free).props("maxlength=64").classes("w-full"), "incoming-name")
+        name = tag(
+            ui.input(words("Name of the new data set"), value=free).props("maxlength=64").classes("w-full"),
+            "incoming-name",
+        )
 
         async def keep() -> None:
             with errors_beside(self._page, name):
                 place = await run.io_bound(self._incoming.keep, str(name.value or ""))
                 if place is not None:
                     self._reset()
-                    self._page.say(words("home.imported", name=place.name), "good")
+                    self._page.say(
+                        words("The data set “{name}” is there. Review its recordings next.", name=place.name), "good"
+                    )
                     await self._refresh()
 
         with ui.row().classes("ps-small-gap"):
-            text = words("home.restore_backup" if result["restored"] else "home.import")
+            text = words("Restore" if result["restored"] else "Import")
             button("import", text, on_page(keep), "unelevated color=primary")
-            button("import-cancel", words("shell.cancel"), on_page(self._cancel), "flat")
+            button("import-cancel", words("Cancel"), on_page(self._cancel), "flat")
 
     async def _cancel(self) -> None:
         await run.io_bound(self._leave)

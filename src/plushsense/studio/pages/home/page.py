@@ -11,6 +11,7 @@ from plushsense.core.errors import need
 from plushsense.studio.app.jobs import RUNNING, Jobs
 from plushsense.studio.app.shell import Page, address, button, html, named, on_change, tag
 from plushsense.studio.app.toys import Toys
+from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import DATASETS, WORK
 from plushsense.studio.pages.home.datasets import DatasetSection
 from plushsense.studio.pages.home.incoming import IncomingSection
@@ -27,10 +28,36 @@ from plushsense.studio.pages.home.sections import (
 from plushsense.studio.pages.home.toy import ToySection
 from plushsense.studio.widgets.elements import style
 
+_NEXT: Texts = {
+    "try": "There is nothing here yet. Try everything with a virtual toy: it takes a minute and needs no hardware.",
+    "record": "A toy is chosen: record the first person.",
+    "go_on": "Session {session} of {subject} is not finished.",
+    "recording": "Session {session} of {subject} is being recorded.",
+    "making": "A data set is being made. See its progress under Jobs.",
+    "collect": "Some sessions are not in a data set yet: {n} (recordings: {recordings}).",
+    "review": "Review the recordings of “{name}” before you train a network on them.",
+    "more": "“{name}” holds one person only. Record more people, so that the network also works for new people.",
+    "train": "“{name}” is ready: train a network on it.",
+    "live": "The network “{name}” is trained. Watch it live, or export it for the toy.",
+}
+
+_NEXT_BUTTONS: Texts = {
+    "try": "Try everything with a virtual toy",
+    "record": "Record",
+    "go_on": "Continue recording",
+    "recording": "Show the recording",
+    "collect": "Put them into a data set",
+    "review": "Review",
+    "more": "Record",
+    "train": "Train",
+    "live": "Watch it live",
+    "export": "Export",
+}
+
 
 def bundles(page: Page, actions: FileActions) -> Callable[[WorkspaceSummary], None]:
     """Build the section that lists trained networks; return the function that fills it."""
-    box = titled_card(page, "home.bundles", "bundles")
+    box = titled_card(page, "Trained networks", "bundles")
     with box:
         rows = ui.column().classes("w-full ps-small-gap")
 
@@ -49,9 +76,9 @@ def bundles(page: Page, actions: FileActions) -> Callable[[WorkspaceSummary], No
                     if entry.refused:
                         ui.label(page.words.sentence(entry.refused)).classes("ps-bad ps-break")
                         continue
-                    facts = [page.words("home.gestures", n=entry.gestures)]
+                    facts = [page.words("gestures: {n}", n=entry.gestures)]
                     if entry.dataset:
-                        facts.append(page.words("home.trained_on", name=entry.dataset))
+                        facts.append(page.words("trained on “{name}”", name=entry.dataset))
                     ui.label(" · ".join(facts)).classes("ps-dim")
                     with ui.row().classes("ps-small-gap"):
                         page_links(page, ("live", "export"), entry.name, model=entry.path)
@@ -65,24 +92,29 @@ def invitation(page: Page) -> None:
     if invite is None:
         return
     words = page.words
-    with titled_card(page, "home.invite", "invite"):
-        ui.label(words("home.invite_about")).classes("ps-dim")
+    with titled_card(page, "Connect another device", "invite"):
+        ui.label(
+            words(
+                "A tablet or another computer needs its own address, which can be opened once. Scan the code with "
+                "its camera, or type the address."
+            )
+        ).classes("ps-dim")
         place = ui.column().classes("w-full").props('aria-live="polite"')
 
         def show() -> None:
             place.clear()
             with place:
                 address_of_device = invite()
-                text = ui.textarea(words("home.invite_address"), value=address_of_device).props("readonly autogrow")
+                text = ui.textarea(words("Address for one device"), value=address_of_device).props("readonly autogrow")
                 tag(text.classes("w-full ps-mono"), "invitation")
                 with page.show_errors():
                     code = need("segno", "studio").make(address_of_device, error="m")
                     # Light in the dark scheme, too: cameras do not read an inverted code.
                     drawing = Markup(code.svg_inline(scale=5, border=3, light="#ffffff", dark="#000000"))
                     image = html(drawing).props("role=img")
-                    tag(named(image, words("home.invite_code")), "invitation-code")
+                    tag(named(image, words("QR code of the address")), "invitation-code")
 
-        button("invite-new", words("home.invite_new"), show)
+        button("invite-new", words("New address"), show)
 
 
 MAKING = ("simulate", "import", "restore")
@@ -178,13 +210,13 @@ class NextStepCard:
         words = self._page.words
         self._box.clear()
         with self._box:
-            html(words("home.next"), "h2")
+            html(words("Next step"), "h2")
             with ui.row().classes("items-center w-full"):
-                tag(ui.label(words(f"home.next_{step.key}", **step.values)), "next-sentence").classes("text-lg")
-                if text := words.get(f"home.next_{step.key}_button"):
-                    button("next-button", text, lambda: self._do(step), "unelevated size=lg color=primary")
+                tag(ui.label(words(_NEXT[step.key], **step.values)), "next-sentence").classes("text-lg")
+                if text := _NEXT_BUTTONS.get(step.key):
+                    button("next-button", words(text), lambda: self._do(step), "unelevated size=lg color=primary")
                 if second := {"try": "record", "live": "export"}.get(step.key):
-                    button("", words(f"home.next_{second}_button"), lambda: ui.navigate.to(address(second)))
+                    button("", words(_NEXT_BUTTONS[second]), lambda: ui.navigate.to(address(second)))
 
     def _do(self, step: NextStep) -> None:
         if step.key == "try":
@@ -199,9 +231,9 @@ class NextStepCard:
         workspace = self._page.workspace
         batch = next(b for b in self._summary.batches() if any(s.waiting for s in b))
         with self._page.show_errors():
-            name = self._page.words("home.new_dataset")
+            name = self._page.words("recordings")
             place = workspace.dataset_for(batch[0].layout, batch[0].simulated, name)
-            title = self._page.words("home.import_title", name=workspace.title(place))
+            title = self._page.words("Import into the data set “{name}”", name=workspace.title(place))
             self._jobs.import_sessions([s.path for s in batch if s.waiting], place, title)
 
     def _try(self) -> None:
@@ -210,11 +242,11 @@ class NextStepCard:
         with self._page.show_errors():
             if not workspace.toy:
                 self._toys.person(7)
-            name = workspace.free_name(DATASETS, self._page.words("home.try_name"), separator=" ")
+            name = workspace.free_name(DATASETS, self._page.words("virtual toy"), separator=" ")
             spec = {
                 "people": _PEOPLE,
                 "repetitions": _REPETITIONS,
                 "dest": str(workspace.folder / DATASETS / name),
                 "work": str(workspace.folder / WORK),
             }
-            self._jobs.start("simulate", spec, self._page.words("home.try_title"))
+            self._jobs.start("simulate", spec, self._page.words("Trial: a data set of virtual people"))

@@ -11,10 +11,43 @@ from nicegui import ui
 
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
-from plushsense.studio.app.shell import Page, address, button, html, moment, named, on_page, tag
+from plushsense.studio.app.shell import Page, address, button, html, moment, named, on_page, page_texts, tag
+from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import BACKUPS, DATASETS, DISCARDED
 from plushsense.studio.pages.home.overview import DatasetEntry, SessionEntry, WorkspaceSummary
 from plushsense.studio.widgets.elements import ask, change_files, errors_beside, item_menu, summary, title_of
+
+_KINDS: Texts = {
+    "recordings": "Session",
+    "datasets": "Data set",
+    "bundles": "Network",
+    "protocols": "List of gestures",
+    "backups": "Backup",
+}
+
+_STATES: Texts = {
+    "active": "being recorded now",
+    "finished": "finished",
+    "unfinished": "not finished",
+}
+
+_JOB_STATES: Texts = {
+    "running": "running",
+    "done": "done",
+    "refused": "failed",
+    "stopped": "stopped",
+}
+
+_ACTIONS: Texts = {
+    "stop": "Stop",
+    "again": "Start again",
+    "drop": "Remove from the list",
+}
+
+_FOLDS: Texts = {
+    "warnings": "Warnings: {n}",
+    "rejected": "Files that are not imported: {n}",
+}
 
 SMALL = 'outline padding="4px 12px"'
 """Quasar properties of the buttons inside rows of a list."""
@@ -50,13 +83,13 @@ def titled_card(page: Page, title: str, name: str) -> ui.card:
 
 def simulation_badge(page: Page) -> None:
     """Add the label that marks simulated data."""
-    ui.label(page.words("home.simulated")).classes("ps-simulated")
+    ui.label(page.words("Simulation")).classes("ps-simulated")
 
 
 def page_links(page: Page, pages: tuple[str, ...], name: str, **query: Any) -> None:
     """Add links to pages that open with ``query``; screen readers also read ``name``."""
     for to in pages:
-        text = page.words(f"pages.{to}")
+        text = page.words(page_texts(to).name)
         named(ui.link(text, address(to, **query)).classes("ps-link"), f"{text}: {name}")
 
 
@@ -71,20 +104,20 @@ class FileActions:
         words, workspace = self._page.words, self._page.workspace
 
         async def rename(new: str) -> None:
-            message = words("home.renamed", name=name, new=new)
+            message = words("“{name}” is now called “{new}”.", name=name, new=new)
             await self.change(lambda: workspace.rename(path, new), message, lambda now: workspace.rename(now, name))
 
         async def discard() -> None:
             with self._page.show_errors():
                 self._jobs.check_unused(path)
-                message = words("shell.discarded", name=name)
+                message = words("“{name}” is discarded. It can be restored on the home page.", name=name)
                 await self.change(lambda: workspace.discard(path), message, workspace.restore)
 
         def ask_name() -> None:
-            title = words("home.rename_title", name=name)
-            ask(words, title, words("home.rename"), rename, words("home.new_name"), name)
+            title = words("Rename “{name}”", name=name)
+            ask(words, title, words("Rename"), rename, words("New name"), name)
 
-        item_menu(words, name, {words("home.rename"): ask_name, **(more or {}), words("shell.discard"): discard})
+        item_menu(words, name, {words("Rename"): ask_name, **(more or {}), words("Discard"): discard})
 
     async def change(self, work: Callable[[], Any], message: str, undo: Callable[[Any], Any] | None = None) -> None:
         """Change files as `change_files` does."""
@@ -97,7 +130,7 @@ class DiscardedSection:
     def __init__(self, page: Page, actions: FileActions) -> None:
         self._page, self._actions = page, actions
         with tag(ui.element("details").classes("ps-card w-full"), "discarded") as self._box:
-            summary(page.words("home.discarded"))
+            summary(page.words("Discarded"))
             self._rows = ui.column().classes("w-full ps-small-gap")
 
     def fill(self, paths: Sequence[Path]) -> None:
@@ -108,31 +141,36 @@ class DiscardedSection:
         with self._rows:
             for path in paths:
                 kind, _, name = path.relative_to(workspace.folder / DISCARDED).as_posix().partition("/")
-                self._row(path, f"{words(f'home.kind_{kind}')}: {name}", name)
+                self._row(path, f"{words(_KINDS[kind])}: {name}", name)
 
     def _row(self, path: Path, text: str, name: str) -> None:
         words, workspace, change = self._page.words, self._page.workspace, self._actions.change
 
         async def restore() -> None:
-            await change(lambda: workspace.restore(path), words("home.restored", name=name))
+            await change(lambda: workspace.restore(path), words("“{name}” is restored.", name=name))
 
         async def delete(_: str) -> None:
-            await change(lambda: workspace.delete(path), words("home.deleted", name=name))
+            await change(lambda: workspace.delete(path), words("“{name}” is deleted.", name=name))
 
         def ask_delete() -> None:
-            ask(words, words("home.delete_title", name=name), words("home.delete"), delete)
+            ask(
+                words,
+                words("Delete “{name}” for good? This cannot be undone.", name=name),
+                words("Delete for good"),
+                delete,
+            )
 
         with ui.row().classes("ps-row items-center w-full ps-small-gap"):
             ui.label(text).classes("flex-grow ps-break")
-            button("", words("home.restore"), on_page(restore), SMALL, about=name)
-            button("", words("home.delete"), ask_delete, SMALL, about=name)
+            button("", words("Restore"), on_page(restore), SMALL, about=name)
+            button("", words("Delete for good"), ask_delete, SMALL, about=name)
 
 
 def findings_text(page: Page, result: dict[str, Any]) -> str:
     """Summarise the findings of a check in one line."""
     counts = result.get("by_severity") or {}
     return page.words(
-        "home.findings",
+        "Checked: {undecided} to decide, {warnings} to look at, {notes} good to know.",
         undecided=result.get("undecided", 0),
         warnings=counts.get("warning", 0),
         notes=counts.get("info", 0),
@@ -146,7 +184,7 @@ class SessionSection:
         self._page, self._jobs = page, jobs
         self._chosen: set[str] = set()
         self._displayed: tuple[object, ...] = ()
-        self._box = titled_card(page, "home.sessions", "sessions")
+        self._box = titled_card(page, "Recorded sessions", "sessions")
         with self._box:
             self._inner = ui.column().classes("w-full ps-small-gap")
         self._box.set_visibility(False)
@@ -174,22 +212,22 @@ class SessionSection:
             if batch[0].simulated:
                 simulation_badge(page)
             scroll = ui.column().classes("ps-scroll w-full ps-no-gap").props("tabindex=0 role=group")
-            with named(scroll, words("home.sessions")):
+            with named(scroll, words("Recorded sessions")):
                 for entry in batch:
                     box = ui.checkbox(self._describe(entry), value=str(entry.path) in self._chosen)
                     box.on_value_change(lambda e, entry=entry: self._choose(entry, bool(e.value)))
                     box.set_enabled(not entry.active)
             with ui.row().classes("items-start ps-small-gap w-full"):
-                free = page.workspace.free_name(DATASETS, words("home.new_dataset"))
-                name = tag(ui.input(words("home.name"), value=free).classes("ps-wide"), "new-name")
-                button("make", words("home.make"), lambda: self._make(batch, name), "unelevated")
+                free = page.workspace.free_name(DATASETS, words("recordings"))
+                name = tag(ui.input(words("Name of the new data set"), value=free).classes("ps-wide"), "new-name")
+                button("make", words("Make a data set from these"), lambda: self._make(batch, name), "unelevated")
             first = batch[0]
             fitting = [d for d in datasets if (d.simulated, d.layout) == (first.simulated, first.layout)]
             if fitting:
                 with ui.row().classes("items-end ps-small-gap w-full"):
                     names = {str(d.path): d.name for d in fitting}
-                    to = ui.select(names, value=next(iter(names)), label=words("home.add_to")).classes("ps-wide")
-                    button("add", words("home.add"), lambda: self._add(batch, str(to.value)))
+                    to = ui.select(names, value=next(iter(names)), label=words("Existing data set")).classes("ps-wide")
+                    button("add", words("Add new recordings"), lambda: self._add(batch, str(to.value)))
 
     def _describe(self, entry: SessionEntry) -> str:
         words = self._page.words
@@ -197,13 +235,13 @@ class SessionSection:
             return f"{entry.subject}/{entry.session}: {words.sentence(entry.refused)}"
         facts = [
             entry.subject,
-            words("home.session", name=entry.session),
+            words("session {name}", name=entry.session),
             moment(entry.start_s),
-            words("home.recordings", n=entry.recordings),
-            words(f"home.{'active' if entry.active else 'finished' if entry.finished else 'unfinished'}"),
+            words("recordings: {n}", n=entry.recordings),
+            words(_STATES["active" if entry.active else "finished" if entry.finished else "unfinished"]),
         ]
         if entry.datasets:
-            facts.append(words("home.kept", names=", ".join(f"“{n}”" for n in entry.datasets)))
+            facts.append(words("in the data sets {names}", names=", ".join(f"“{n}”" for n in entry.datasets)))
         return " · ".join(facts)
 
     def _choose(self, entry: SessionEntry, chosen: bool) -> None:
@@ -222,10 +260,10 @@ class SessionSection:
     def _start(self, batch: tuple[SessionEntry, ...], place: Path, name: str) -> None:
         chosen = [s.path for s in batch if str(s.path) in self._chosen]
         if not chosen:
-            self._page.say(self._page.words("home.none_chosen"), "warning")
+            self._page.say(self._page.words("No session is chosen. Tick at least one."), "warning")
             return
         self._page.say("")
-        self._jobs.import_sessions(chosen, place, self._page.words("home.import_title", name=name))
+        self._jobs.import_sessions(chosen, place, self._page.words("Import into the data set “{name}”", name=name))
 
 
 class JobList:
@@ -235,7 +273,7 @@ class JobList:
         self._page, self._jobs = page, jobs
         self._displayed: tuple[Any, ...] | None = None
         self._progress_bars: dict[str, tuple[ui.label, ui.linear_progress]] = {}
-        with titled_card(page, "home.work", "work"):
+        with titled_card(page, "Jobs", "work"):
             self._rows = ui.column().classes("w-full ps-small-gap")
         self.update()
 
@@ -251,7 +289,7 @@ class JobList:
             self._progress_bars.clear()
             with self._rows:
                 if not current:
-                    ui.label(self._page.words("home.no_work")).classes("ps-dim")
+                    ui.label(self._page.words("Nothing is running.")).classes("ps-dim")
                 for job in displayed:
                     with tag(ui.column().classes("ps-row w-full ps-small-gap"), f"job-{job.state}"):
                         self._row(job)
@@ -270,7 +308,7 @@ class JobList:
             bar = ui.linear_progress(0.0, show_value=False, size="10px").props("rounded")
             self._progress_bars[job.id] = (label, named(bar, title))
         else:
-            ui.label(f"{words(f'home.{job.state}')} · {moment(job.ended_s or job.begun_s)}").classes("ps-dim")
+            ui.label(f"{words(_JOB_STATES[job.state])} · {moment(job.ended_s or job.begun_s)}").classes("ps-dim")
         if job.state == REFUSED:
             ui.label(words.explain(job.message, job.reason, job.values)).classes("ps-bad ps-break")
         if job.state == DONE:
@@ -290,12 +328,12 @@ class JobList:
             with self._page.show_errors():
                 action()
 
-        button(f"job-{key}", self._page.words(f"home.{key}"), clicked, SMALL, about=title_of(self._page.words, job))
+        button(f"job-{key}", self._page.words(_ACTIONS[key]), clicked, SMALL, about=title_of(self._page.words, job))
 
     def _progress(self, job: StudioJob) -> tuple[str, float | None]:
         """Return the progress as text, and as a fraction from 0 to 1 (None if unknown)."""
         minutes, seconds = divmod(int(max(0.0, time.time() - job.begun_s)), 60)
-        text = f"{self._page.words('home.running')} · {minutes}:{seconds:02d}"
+        text = f"{self._page.words('running')} · {minutes}:{seconds:02d}"
         done, total = job.progress.get("done"), job.progress.get("total")
         if isinstance(done, int | float) and isinstance(total, int | float) and total > 0:
             share = min(1.0, done / total)
@@ -309,25 +347,29 @@ class JobList:
             ui.label(findings_text(page, result))
         if job.task == "backup":
             place = Path(job.spec["place"])
-            ui.label(words("home.backup_done", file=str(place))).classes("ps-break")
-            link = ui.link(words("home.download"), download_address(BACKUPS, place.stem)).classes("ps-link")
+            ui.label(words("Written and read back: {file}", file=str(place))).classes("ps-break")
+            link = ui.link(words("Download"), download_address(BACKUPS, place.stem)).classes("ps-link")
             tag(link.props("download"), "download")
         if job.task == "forget":
-            ui.label(words("home.forget_done", n=result["files"]))
+            ui.label(
+                words("The person is removed, with {n} files. Delete what remains elsewhere, too.", n=result["files"])
+            )
         if job.task in ("import", "simulate", "restore"):
             people = result.get("subjects", result.get("people", 0))
-            facts = [words("home.recordings", n=result["recordings"]), words("home.people", n=people)]
+            facts = [words("recordings: {n}", n=result["recordings"]), words("people: {n}", n=people)]
             if job.spec.get("add"):
-                facts.append(words("home.new", n=result["added"]["recordings"]))
+                facts.append(words("new: {n}", n=result["added"]["recordings"]))
             ui.label(" · ".join(facts))
         warnings = [words.sentence(w) for w in (*job.warnings, *result.get("warnings", ()))]
         if result.get("flagged"):
-            warnings.append(words("home.flagged", n=result["flagged"]))
+            warnings.append(
+                words("Recordings with something to look at: {n}. The page Review shows them.", n=result["flagged"])
+            )
         rejected = [f"{r['file']}: {words.sentence(r['reason'])}" for r in result.get("rejected", ())]
         for key, lines in (("warnings", warnings), ("rejected", rejected)):
             if lines:
-                with ui.expansion(words(f"home.{key}", n=len(lines))).classes("w-full").props("dense"):
+                with ui.expansion(words(_FOLDS[key], n=len(lines))).classes("w-full").props("dense"):
                     for line in lines[:_MAX_LINES]:
                         ui.label(line).classes("ps-break ps-note")
                     if len(lines) > _MAX_LINES:
-                        ui.label(words("home.more", n=len(lines) - _MAX_LINES)).classes("ps-dim")
+                        ui.label(words("and {n} more", n=len(lines) - _MAX_LINES)).classes("ps-dim")

@@ -8,8 +8,21 @@ from plushsense.core.errors import PlushSenseError
 from plushsense.core.sentences import Sentence
 from plushsense.studio.app.shell import Page, button, on_change, on_page, tag
 from plushsense.studio.app.toys import PERSONS, Toys, ToyTrial, with_layout
+from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.home.sections import SMALL, simulation_badge, titled_card
 from plushsense.studio.widgets.elements import errors_beside
+
+_TESTS: Texts = {
+    "good": "The toy works: {frames} frames in {seconds} s, and the layout {layout} fits.",
+    "slow": (
+        "The layout {layout} fits, but {frames} frames came in {seconds} s instead of {rate} a second. Check the "
+        "connection."
+    ),
+    "malformed": (
+        "Many lines are not of the sensors {layout}: {malformed} (frames: {frames}). Check the connection, or "
+        "whether the toy has other sensors."
+    ),
+}
 
 
 class ToySection:
@@ -18,20 +31,22 @@ class ToySection:
     def __init__(self, page: Page, toys: Toys) -> None:
         self._page, self._words, self._toys = page, page.words, toys
         words = self._words
-        with titled_card(page, "home.toy", "toy"):
+        with titled_card(page, "Toy", "toy"):
             self._chosen = ui.column().classes("w-full ps-small-gap").props('aria-live="polite"')
             with ui.row().classes("items-end ps-small-gap w-full"):
-                options = {n: words("home.person", n=n) for n in range(1, PERSONS + 1)}
-                who = ui.select(options, value=7, label=words("home.virtual_person")).classes("ps-wide")
+                options = {n: words("Person {n}", n=n) for n in range(1, PERSONS + 1)}
+                who = ui.select(options, value=7, label=words("Person who uses the virtual toy")).classes("ps-wide")
                 tag(who, "person")
-                text = words("home.choose_virtual")
+                text = words("Use the virtual toy")
                 button("virtual", text, lambda: self._choose(f"virtual://?person={who.value}"), "unelevated")
             self._others = ui.column().classes("w-full ps-small-gap")
             with ui.row().classes("items-start ps-small-gap w-full"):
-                field = ui.input(words("home.address"), placeholder="tcp://192.168.1.20:3333").classes("ps-wide")
+                field = ui.input(words("Address of another toy"), placeholder="tcp://192.168.1.20:3333").classes(
+                    "ps-wide"
+                )
                 self._address = tag(field, "address")
                 field.on("keydown.enter", self._use)
-                button("use", words("home.use"), self._use)
+                button("use", words("Use this toy"), self._use)
         self._update()
         on_change(toys.changed, self._update)
         if not toys.searched:
@@ -66,10 +81,10 @@ class ToySection:
         self._chosen.clear()
         with self._chosen:
             if not toy:
-                ui.label(words("home.no_toy")).classes("ps-dim")
+                ui.label(words("No toy is chosen yet.")).classes("ps-dim")
                 return
             with ui.row().classes("items-center ps-small-gap"):
-                tag(ui.label(words("home.chosen", url=toy)).classes("ps-break text-bold"), "chosen")
+                tag(ui.label(words("Chosen: {url}", url=toy)).classes("ps-break text-bold"), "chosen")
                 if self._toys.simulated:
                     simulation_badge(self._page)
             if trial is not None:
@@ -82,9 +97,9 @@ class ToySection:
             with ui.row().classes("ps-small-gap"):
                 if trial is not None and trial.layout:
                     fitting, url = trial.layout, with_layout(trial.url, trial.layout)
-                    text = words("home.use_layout", layout=fitting)
+                    text = words("Use the sensors of {layout}", layout=fitting)
                     button("use-layout", text, on_page(lambda: self._choose(url)), "unelevated")
-                button("test", words("home.test"), on_page(self._try_out)).set_enabled(
+                button("test", words("Test the toy"), on_page(self._try_out)).set_enabled(
                     trial is None or not trial.running
                 )
 
@@ -92,9 +107,9 @@ class ToySection:
         """Return the kind of message and the sentence about a trial."""
         words, result = self._words, trial.result
         if trial.running:
-            return "info", words("home.testing")
+            return "info", words("Reading the toy for a second …")
         if trial.layout:
-            return "warning", words("home.test_other", layout=trial.layout)
+            return "warning", words("The toy works, but its sensors are those of {layout}.", layout=trial.layout)
         if trial.error is not None:
             error = trial.error
             if isinstance(error, PlushSenseError):
@@ -104,12 +119,12 @@ class ToySection:
         values = {"seconds": words.number(result.seconds, 1), "rate": words.number(result.rate_hz)}
         key = "good" if result.fits and result.on_time else "slow" if result.fits else "malformed"
         values |= {"frames": str(result.frames), "layout": result.layout, "malformed": str(result.malformed)}
-        return ("good" if key == "good" else "warning"), words(f"home.test_{key}", **values)
+        return ("good" if key == "good" else "warning"), words(_TESTS[key], **values)
 
     def _show_others(self) -> None:
         words, toys = self._words, self._toys
         self._others.clear()
-        given = [(url, "", words("home.given")) for url in self._page.workspace.devices]
+        given = [(url, "", words("given when the studio was started")) for url in self._page.workspace.devices]
         found = [d for d in toys.listing.devices if d.kind != "virtual"]
         # The description of a serial port is that of the system.
         listed = [(d.url, d.name, words.sentence(a) if isinstance(a := d.description, Sentence) else a) for d in found]
@@ -119,17 +134,20 @@ class ToySection:
                     with ui.column().classes("ps-no-gap"):
                         ui.label(name or url).classes("ps-break")
                         ui.label(" · ".join(t for t in (url if name else "", about) if t)).classes("ps-dim ps-break")
-                    button(
-                        "", words("home.choose"), on_page(lambda url=url: self._choose(url)), SMALL, about=name or url
-                    )
+                    button("", words("Choose"), on_page(lambda url=url: self._choose(url)), SMALL, about=name or url)
             if toys.searching:
                 with ui.row().classes("items-center ps-small-gap").props('role="status"'):
                     ui.spinner(size="1.2em").props("aria-hidden=true")
-                    ui.label(words("home.looking"))
+                    ui.label(words("Looking for toys …"))
                 return
             if toys.searched and not listed:
-                ui.label(words("home.none_found")).classes("ps-dim")
+                ui.label(words("No other toy was found.")).classes("ps-dim")
             for note in toys.listing.notes:
                 ui.label(words.sentence(note)).classes("ps-dim ps-note ps-break")
-            button("look", words("home.look_again" if toys.searched else "home.look"), toys.search, SMALL)
-            ui.label(words("home.look_about")).classes("ps-dim ps-note")
+            button("look", words("Look again" if toys.searched else "Look for toys"), toys.search, SMALL)
+            ui.label(
+                words(
+                    "Only serial ports are searched when this page opens. The button also searches by Bluetooth, and "
+                    "asks the network for LSL streams."
+                )
+            ).classes("ps-dim ps-note")

@@ -13,15 +13,28 @@ from nicegui import ui
 from plushsense.core.errors import BadInput, PlushSenseError
 from plushsense.recording.session import check_subject
 from plushsense.studio.app.shell import Page, button, named, on_change, tag
+from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.live.adapting import Adapting, Improved
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.validation import Validation
+
+_OUTCOMES: Texts = {
+    "gain": "Of {n} own recordings, each left out once, it reads {after} right instead of {before}.",
+    "no_gain": (
+        "The recordings would not clearly help: of {n}, each left out once, {after} instead of {before} would be "
+        "read right."
+    ),
+    "inseparable": (
+        "The recordings cannot be told apart (of {n}, {after} are read right): perhaps their gestures or the sensors "
+        "are wrong."
+    ),
+}
 
 
 def show(page: Page, people: PersonFields) -> None:
     """Build the part, which is beside the current event."""
     box = ui.element("div").props("role=group").classes("w-full column no-wrap ps-small-gap q-mt-sm")
-    with named(box, page.words("live.adapt_about")):
+    with named(box, page.words("Adapt the network to a person")):
         _AdaptingPanel(page, people)
 
 
@@ -36,7 +49,9 @@ class PersonFields:
     def add(self, name: str, on_change: Callable[[], None] = lambda: None) -> ui.input:
         """Add a field; ``on_change`` is called when the text of any field has changed."""
         words = self._page.words
-        field = tag(ui.input(words("live.person"), value=self.code, placeholder="S01").props("maxlength=16"), name)
+        field = tag(
+            ui.input(words("Code of the person"), value=self.code, placeholder="S01").props("maxlength=16"), name
+        )
         self._fields.append(field)
 
         def changed() -> None:
@@ -59,7 +74,13 @@ class PersonFields:
         try:
             text = check_subject(self.code)
         except BadInput as refusal:
-            field.error = self._page.words.error(refusal) if self.code else self._page.words("live.person_first")
+            field.error = (
+                self._page.words.error(refusal)
+                if self.code
+                else self._page.words(
+                    "First enter the code of the person who touches the toy, for example S01 and never a name."
+                )
+            )
             field.run_method("focus")
         return text
 
@@ -72,12 +93,14 @@ class _AdaptingPanel:
         self._adapting = page.workspace.part(Adapting)
         self._busy = False
         words = page.words
-        ui.label(words("live.adapt_about")).classes("text-bold")
+        ui.label(words("Adapt the network to a person")).classes("text-bold")
         with ui.row().classes("w-full items-center ps-small-gap"):
             self._person = people.add("adapt-person", self._update).style("flex: 1 1 9rem")
-            self._recordings = ui.select({}, label=words("live.adapt_from")).style("flex: 1 1 15rem; min-width: 0")
+            self._recordings = ui.select({}, label=words("Recordings of the person")).style(
+                "flex: 1 1 15rem; min-width: 0"
+            )
             tag(self._recordings, "adapt-from")
-            self._adapt = button("adapt", words("live.adapt"), self._run, icon="auto_fix_high")
+            self._adapt = button("adapt", words("Adapt to these recordings"), self._run, icon="auto_fix_high")
         # Messages are displayed here, because the top of the page may be out of view.
         self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))
         on_change(self._adapting.changed, self._update)
@@ -90,20 +113,22 @@ class _AdaptingPanel:
             return
         words, recordings = self._words, Path(str(self._recordings.value or ""))
         self._busy = True
-        self._page.say(words("live.improving"))
+        self._page.say(words("The network is being improved…"))
         self._update()
         try:
             with self._page.show_errors():
                 done = await asyncio.to_thread(self._adapting.adapt, subject, recordings)
                 own = done.personal
                 scores = {"n": own.before.recordings, "before": own.before.right, "after": own.after.right}
-                outcome = words(f"live.own_{own.refusal or 'gain'}", **scores)
+                outcome = words(_OUTCOMES[own.refusal or "gain"], **scores)
                 if done.name:
                     names = {"name": done.name, "before": done.before.stem, "subject": subject}
-                    message = f"{words('live.improved', **names)} {outcome}"
-                    self._page.say(message, "good", lambda: self._take_back(done))
+                    message = words(
+                        "Now in use for {subject}: {name}. The former network, {before}, is unchanged.", **names
+                    )
+                    self._page.say(f"{message} {outcome}", "good", lambda: self._take_back(done))
                 else:
-                    self._page.say(f"{words('live.improve_refused')} {outcome}", "warning")
+                    self._page.say(f"{words('The network stays as it is.')} {outcome}", "warning")
         finally:
             self._busy = False
             self._update()
@@ -111,7 +136,7 @@ class _AdaptingPanel:
     async def _take_back(self, done: Improved) -> None:
         with self._page.show_errors():
             await asyncio.to_thread(self._adapting.take_back, done)
-            self._page.say(self._words("live.taken_back", name=done.before.stem), "good")
+            self._page.say(self._words("The network {name} is in use again.", name=done.before.stem), "good")
 
     def _update(self) -> None:
         subject = self._people.code
@@ -120,7 +145,7 @@ class _AdaptingPanel:
             # A code that is still being typed may be invalid.
             with contextlib.suppress(PlushSenseError, OSError):
                 sources = self._adapting.sources(subject)
-        everything = self._words("live.adapt_all", subject=subject)
+        everything = self._words("all recordings of {subject}", subject=subject)
         options = {str(p): p.name if p.name != subject else everything for p in sources}
         if options != self._recordings.options:
             self._recordings.set_options(options, value=next(iter(options), None))

@@ -17,9 +17,76 @@ from plushsense.core.sentences import Sentence
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.guard import is_loopback
 from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, LINES, on_change
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.state import UNREAD, EventSpan, LiveState, Performed, Situation
+
+VIEW_TEXTS: Texts = {
+    "signals": "Signals",
+    "signals_label": "The {n} signals of the toy over the last {s} seconds, one lane each",
+    "unit_count": "counts",
+    "now": "Now",
+    "timeline": "Events",
+    "timeline_label": "The events of the last minute; the list below describes them in words",
+    "events": "The last events, the newest first",
+    "events_none": "No event yet.",
+    "lasting": "still going on",
+    "eyes_label": "Eyes of the toy",
+    "latency": "Delay:",
+    "latency_decision": "from the toy to the decision {ms}\u00a0ms",
+    "latency_page": "to this page {ms}\u00a0ms (95\u00a0% are faster)",
+    "latency_page_most": "to this page at most {ms}\u00a0ms (95\u00a0% are faster)",
+    "chances": "What the network computes: the raw probability of each gesture",
+    "chances_about": (
+        "The toy does not react to these numbers, but to the events above, which are decided from them over some time."
+    ),
+    "by_gate": "noticed by the gate (threshold rules)",
+    "by_network": "recognised by the network",
+    "some_gesture": "A touch",
+    "gate_none": "This network has no gate.",
+    "gate_mark": "▸ begun by the gate, before the network was sure",
+    "reacts_to": "reaction to: {what}",
+    "really": "Really:",
+    "really_nothing": "the virtual person does nothing",
+    "really_next": "the virtual person is about to begin: {gesture}",
+    "did_row": "Grey: what the virtual person really did.",
+    "eyes_green": "Eyes green",
+    "eyes_red": "Eyes red",
+    "eyes_off": "Eyes off",
+    "state_warming": "Warming up",
+    "state_sensor_fault": "Sensor fault",
+    "state_stopped": "Not started",
+    "state_connecting": "Connecting …",
+    "state_gone": "The toy is gone",
+    "state_unreadable": "The toy cannot be read",
+    "state_silent": "No signal from the toy",
+    "state_nothing": "Nothing is happening",
+    "state_unsure": "Not sure",
+    "state_unknown": "Some touch that it does not know",
+    "about_stopped": "Choose the toy and the network, and press Start.",
+    "about_connecting": "Waiting for the first data of the toy.",
+    "about_gone": "It was unplugged or switched off, or is out of reach. The studio connects again by itself.",
+    "about_unreadable": (
+        "It sends lines, but none is of the layout {layout} ({n} numbers) of this network. Choose a network for this "
+        "toy, and check the cable."
+    ),
+    "about_silent": "It is connected but sends nothing. Check that it is switched on and charged.",
+    "about_sensor_fault": "The sensor values cannot be trusted, so nothing is recognised. Check the toy and its cable.",
+    "about_warming": "The network must read a few seconds before its first answer.",
+    "about_nothing": "The network sees no gesture.",
+    "about_unsure": "No gesture is clear enough for an event.",
+    "about_unknown": "None of its gestures fits, so there is no event.",
+    "quiet_off": "no reactions are chosen",
+    "quiet_none": "the chosen reactions have none for this touch",
+    "quiet_dark": "stays dark and silent, as chosen for this touch",
+    "quiet_over": "the reaction to this touch is over",
+    "quiet_named": "reacts as soon as the gesture is sure",
+    "quiet_ended": "reacts when the touch ends",
+    "quiet_pause": "pause after the last reaction",
+    "sound_purr": "purring",
+    "sound_shriek": "shrieking",
+}
+"""Texts that the script of the page shows; it finds them by these keys."""
 
 WINDOW_S = 8.0
 """Length of the displayed signals, in seconds."""
@@ -218,9 +285,9 @@ class LiveView(Element, component="live_view.js"):
         super().__init__()
         self._feed = feed
         self._props.update(
-            words=words.table("live"),
-            gestures=words.table("gestures"),
-            names=words.table("channels"),
+            words={key: words(text) for key, text in VIEW_TEXTS.items()},
+            gestures=words.names("gesture"),
+            names=words.names("channel"),
             affects={key: words.affect(key) for key in AFFECT_COLOURS},
             signs=dict(AFFECT_SIGNS),
             colours=dict(AFFECT_COLOURS),

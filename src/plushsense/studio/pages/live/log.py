@@ -11,11 +11,22 @@ from nicegui import ui
 
 from plushsense.reports.table import Table
 from plushsense.studio.app.shell import AFFECT_SIGNS, Page, add_style, button, html, moment, on_change, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.app.workspace import plain_name
+from plushsense.studio.pages.live.feed import VIEW_TEXTS
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.state import EventSpan
 from plushsense.studio.widgets.elements import table_html
+
+_HEADS: Texts = {
+    "time": "Time",
+    "person": "Person",
+    "gesture": "Gesture",
+    "affect": "Affect",
+    "confidence": "Confidence",
+    "lasted": "Duration",
+    "reaction": "Reaction of the toy",
+}
 
 _PRINT = """
 .lv-print { display: none; }
@@ -55,31 +66,37 @@ def log_rows(events: Sequence[EventSpan]) -> list[dict[str, Any]]:
 def printed(words: Words, events: Sequence[EventSpan]) -> Markup:
     """Return the log as a page for printing, in the language of ``words``."""
     virtual = any(event.really is not None for event in events)
-    head = [words(f"log.{key}") for key in ("time", "person", "gesture", "affect", "confidence", "lasted", "reaction")]
-    head += [words("log.really")] if virtual else []
+    head = [words(head) for head in _HEADS.values()]
+    head += [words("Really made")] if virtual else []
     rows = []
     for event in events:
-        reaction = [words(f"live.eyes_{event.eyes}")] if event.eyes else []
-        reaction += [words.get(f"live.sound_{event.sound}", event.sound)] if event.sound else []
+        reaction = [words(VIEW_TEXTS[f"eyes_{event.eyes}"])] if event.eyes else []
+        reaction += [words(VIEW_TEXTS.get(f"sound_{event.sound}", event.sound))] if event.sound else []
         row = [
             time.strftime("%H:%M:%S", time.localtime(event.at)),
             event.subject,
-            words.gesture(event.gesture) if event.gesture else words("live.some_gesture"),
+            words.gesture(event.gesture) if event.gesture else words("A touch"),
             f"{AFFECT_SIGNS[event.affect]} {words.affect(event.affect)}",
             "" if event.confidence is None else f"{words.number(100.0 * event.confidence)} %",
             "" if event.end_s is None else f"{words.number(event.end_s - event.begin_s, 1)} s",
             ", ".join(reaction),
         ]
-        row += [words.gesture(event.really or words("log.nothing"))] if virtual and event.really is not None else []
+        row += [words.gesture(event.really or words("nothing"))] if virtual and event.really is not None else []
         row += [""] if virtual and event.really is None else []
         rows.append(row)
     networks = ", ".join(dict.fromkeys(event.network for event in events))
     about = (
-        words("log.about", when=moment(events[0].session), network=networks) if events else words("live.events_none")
+        words("Session begun {when}. Network: {network}.", when=moment(events[0].session), network=networks)
+        if events
+        else words("No event yet.")
     )
-    mark = words("shell.simulation") if any(event.simulated for event in events) else ""
+    mark = (
+        words("Simulation: these data say nothing about a real toy.")
+        if any(event.simulated for event in events)
+        else ""
+    )
     return Markup("<h2>{}</h2><p>{}</p><p><b>{}</b></p>{}").format(
-        words("log.title"), about, mark, table_html(head, rows, numbers=(4, 5)) if rows else ""
+        words("Log of the session"), about, mark, table_html(head, rows, numbers=(4, 5)) if rows else ""
     )
 
 
@@ -92,9 +109,9 @@ class LogButtons:
         add_style(_PRINT)
         with ui.row().classes("w-full items-center ps-small-gap q-mt-sm"):
             self._count = tag(ui.label("").classes("ps-dim"), "log-count")
-            self._session = tag(ui.select({}, label=words("log.session")).classes("w-64"), "log-session")
-            self._save = button("log-save", words("log.save"), self._download, icon="download")
-            self._print = button("log-print", words("log.print"), self._open_print, icon="print")
+            self._session = tag(ui.select({}, label=words("Session begun")).classes("w-64"), "log-session")
+            self._save = button("log-save", words("Save as a table (CSV)"), self._download, icon="download")
+            self._print = button("log-print", words("Print"), self._open_print, icon="print")
         self._session.on_value_change(self._update)
         self._numbers = (-1, -1)
         on_change(reader.changed, self._update_after_event)
@@ -124,7 +141,7 @@ class LogButtons:
 
     def _update(self) -> None:
         n = len(self._events())
-        self._count.set_text(self._page.words("log.one" if n == 1 else "log.count", n=n))
+        self._count.set_text(self._page.words.plural("{n} event in the log", "{n} events in the log", n))
         for control in (self._save, self._print):
             control.set_enabled(n > 0)
 

@@ -15,6 +15,7 @@ from plushsense.devices.opening import is_virtual
 from plushsense.live.reactions import reaction_names
 from plushsense.studio.app.shell import Page, button, named, on_change, query, query_path, tag
 from plushsense.studio.app.toys import Toys
+from plushsense.studio.app.words import Texts, in_context
 from plushsense.studio.app.workspace import VIRTUAL, Workspace
 from plushsense.studio.pages.live import adapting_page, validation_page
 from plushsense.studio.pages.live.feed import PACE_S, PLOT_HZ, RATES_HZ, Feed, LiveView, follow
@@ -23,6 +24,16 @@ from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.signal_recording import SignalRecording
 from plushsense.studio.pages.live.state import LiveChoice
 from plushsense.studio.widgets.elements import style, summary
+
+_REACTIONS: Texts = {
+    "standard": "green, or red if rough",
+    "gentle": "green, or dark if rough",
+}
+
+_RATES: Texts = {
+    "decision": "Show the decision",
+    "plot": "Draw the signals",
+}
 
 _GRID = "display: grid; grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); gap: 12px; margin-top: 8px"
 _OF_NETWORK = ("no_network", "no_common_gesture", "toy_layout_differs")
@@ -37,7 +48,12 @@ def show(page: Page) -> None:
     feed = Feed(reader, words.error)
     with ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap"):
         _Controls(page, reader, feed)
-    simulated = tag(ui.label(words("shell.simulation")).classes("ps-message ps-message-warning w-full"), "simulation")
+    simulated = tag(
+        ui.label(words("Simulation: these data say nothing about a real toy.")).classes(
+            "ps-message ps-message-warning w-full"
+        ),
+        "simulation",
+    )
 
     def update_mark() -> None:
         simulated.set_visibility(reader.device is not None and reader.choice.simulated)
@@ -60,9 +76,9 @@ def show(page: Page) -> None:
 def _person_panel(page: Page, reader: LiveReader) -> None:
     """Add the buttons that direct the person of a virtual toy; they are hidden for any other toy."""
     words = page.words
-    box = named(ui.element("div").props("role=group").classes("w-full"), words("live.person_title"))
+    box = named(ui.element("div").props("role=group").classes("w-full"), words("Let the virtual person do this:"))
     with tag(box, "virtual-person"):
-        ui.label(words("live.person_title")).classes("text-bold")
+        ui.label(words("Let the virtual person do this:")).classes("text-bold")
         buttons = ui.row().classes("w-full ps-small-gap q-mt-xs")
 
     def direct(label: str | None) -> None:
@@ -86,10 +102,8 @@ def _person_panel(page: Page, reader: LiveReader) -> None:
                 button(
                     f"do-{label}", words.gesture(label), lambda label=label: direct(label), 'outline padding="3px 8px"'
                 ).classes("ps-note")
-            button("do-nothing", words("live.person_stop"), lambda: direct(""), "outline dense", icon="stop").classes(
-                "ps-note"
-            )
-            button("do-own", words("live.person_own"), lambda: direct(None), "flat dense").classes("ps-note")
+            button("do-nothing", words("Stop"), lambda: direct(""), "outline dense", icon="stop").classes("ps-note")
+            button("do-own", words("By themselves"), lambda: direct(None), "flat dense").classes("ps-note")
 
     on_change(reader.changed, update)
     update()
@@ -104,32 +118,32 @@ class _Controls:
         words, choice = page.words, reader.choice
         self._state: tuple[Any, ...] = ()
         with ui.row().classes("w-full items-center ps-small-gap"):
-            self._start = button("start", words("live.start"), self._begin, "unelevated", icon="play_arrow")
-            self._stop = button("stop", words("live.stop"), lambda: self._run(reader.stop), "unelevated", icon="stop")
+            self._start = button("start", words("Start"), self._begin, "unelevated", icon="play_arrow")
+            self._stop = button("stop", words("Stop"), lambda: self._run(reader.stop), "unelevated", icon="stop")
             self._fields = tag(ui.element("details").style("flex: 1 1 17rem; min-width: 0"), "settings")
             self._busy = tag(ui.spinner(size="1.6em").props("aria-hidden=true"), "busy")
         self._busy.set_visibility(False)
         with self._fields:
             self._title = summary("").classes("ps-break")
             with ui.element("div").classes("w-full").style(_GRID):
-                self._add_toy(words("live.toy"))
+                self._add_toy(words("Toy"))
                 self._bundles = {str(path): path.stem for path in self._workspace.bundles()}
                 chosen = str(choice.bundle) if choice.bundle else None
                 if chosen is None or (query().get("model") and not reader.now.running):
                     chosen = query_path(self._workspace, "model", self._bundles) or None
-                self._bundle = tag(ui.select(self._bundles, value=chosen, label=words("live.bundle")), "bundle")
-                names = {"": words("live.reactions_none")}
-                names |= {name: words.get(f"live.reactions_{name}", name) for name in reaction_names()}
-                self._reactions = ui.select(names, value=choice.reactions, label=words("live.reactions"))
+                self._bundle = tag(ui.select(self._bundles, value=chosen, label=words("Network")), "bundle")
+                names = {"": words(in_context("reactions", "none"))}
+                names |= {name: words(_REACTIONS.get(name, name)) for name in reaction_names()}
+                self._reactions = ui.select(names, value=choice.reactions, label=words("Reactions of the toy"))
                 tag(self._reactions, "reactions")
-                engines = {"float": words("live.engine_float"), "int8": words("live.engine_int8")}
-                self._engine = tag(ui.select(engines, value=choice.engine, label=words("live.engine")), "engine")
+                engines = {"float": words("as trained (float)"), "int8": words("as on the chip (int8)")}
+                self._engine = tag(ui.select(engines, value=choice.engine, label=words("Arithmetic")), "engine")
                 self._add_rate("decision", RATES_HZ[-1], lambda pace_s: setattr(feed, "decision_s", pace_s))
                 self._add_rate("plot", PLOT_HZ, lambda pace_s: setattr(feed, "plot_s", pace_s))
             self._rates = ui.label("").classes("ps-dim ps-note")
             with ui.row().classes("w-full items-center ps-small-gap"):
-                self._look = button("look", words("live.look"), self._toys.search, "flat", icon="search")
-                virtual = ui.checkbox(words("live.simulated"), value=choice.simulated)
+                self._look = button("look", words("Look for toys"), self._toys.search, "flat", icon="search")
+                virtual = ui.checkbox(words("This is a virtual toy: a simulation"), value=choice.simulated)
                 self._simulated = tag(virtual, "simulated")
         self._toy.on_value_change(self._update_simulated)
         for control in (self._bundle, self._engine, self._reactions):
@@ -144,14 +158,14 @@ class _Controls:
         first = reader.choice.toy if reader.now.running else workspace.toy or VIRTUAL
         options = _toy_options(self._toys, workspace, first)
         self._toy = ui.select(options, value=first, label=label, with_input=True, new_value_mode="add-unique")
-        tag(self._toy.props(f'hint="{self._page.words("live.toy_hint")}"'), "toy")
+        tag(self._toy.props(f'hint="{self._page.words("Choose, or type an address and press Enter")}"'), "toy")
 
     def _add_rate(self, name: str, usual: int, choose: Callable[[float], None]) -> None:
         """Add the choice of a rate at which this page displays something; ``usual`` is chosen at first."""
         words = self._page.words
         most = RATES_HZ[-1]
-        rates = {n: words("live.rate", n=n) if n > 1 else words("live.rate_one") for n in RATES_HZ[::-1]}
-        field = ui.select(rates, value=usual, label=words(f"live.rate_{name}"))
+        rates = {n: words("{n} times a second", n=n) if n > 1 else words("once a second") for n in RATES_HZ[::-1]}
+        field = ui.select(rates, value=usual, label=words(_RATES[name]))
         tag(field, f"rate-{name}").on_value_change(lambda e: choose(PACE_S if e.value == most else 1.0 / e.value))
 
     async def _run(self, command: Callable[..., None], *args: Any) -> bool:
@@ -225,9 +239,15 @@ class _Controls:
             control.set_enabled(not running)
         choice = reader.choice
         now = f": {choice.toy} · {choice.bundle.stem}" if running and choice.bundle is not None else ""
-        self._title.set_content(words("live.settings") + now)
+        self._title.set_content(words("Toy, network and settings") + now)
         step_s = reader.bundle.arch.step * reader.bundle.layout.period_us / 1e6 if reader.bundle is not None else 0.05
-        self._rates.set_text(words("live.rate_about", n=words.number(1.0 / step_s)))
+        self._rates.set_text(
+            words(
+                "These two change only this page. The network itself answers {n} times a second, and neither events "
+                "nor reactions wait for the page.",
+                n=words.number(1.0 / step_s),
+            )
+        )
         self._follow()
 
     def _update_toys(self) -> None:

@@ -15,18 +15,60 @@ from nicegui import ui
 from plushsense.experiments.protocol.run import PAGE, TABLE, TRIALS
 from plushsense.experiments.protocol.score import NAMELESS
 from plushsense.studio.app.shell import Page, button, html, on_change, section, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.live.adapting_page import PersonFields
 from plushsense.studio.pages.live.reader import LiveReader
 from plushsense.studio.pages.live.validation import FOLDER, Validation
 from plushsense.studio.widgets.elements import notice, picture, scroll_to, summary, table
+
+_HEADS: Texts = {
+    "rules_answered": "Rules: answered",
+    "rules_time": "Rules: time",
+    "toy_answered": "Toy's own rules: answered",
+    "toy_time": "Toy's own rules: time",
+    "answered": "Network: right affect",
+    "answered_time": "Network: time",
+    "named": "Right gesture",
+    "named_time": "Time to the right gesture",
+    "likelihood": "Likelihood",
+}
+
+_PHASES: Texts = {
+    "countdown": "Get ready: {gesture}",
+    "doing": "Now: {gesture}",
+    "after": "Thank you. Hand away.",
+    "paused": "Pause. Next: {gesture}",
+    "scoring": "The trials are being scored …",
+}
+
+_NOTES: Texts = {
+    "hybrid": (
+        "Rules: the paper's old toy, which knows only kind and rough. Network: with its gate. The time counts from "
+        "the prompt, so it includes the reaction time of the person."
+    ),
+    "cnn": (
+        "Rules: the paper's old toy, which knows only kind and rough. Network: without a gate, as it has none. The "
+        "time counts from the prompt, so it includes the reaction time of the person."
+    ),
+}
+
+_REACTIONS: Texts = {
+    "positive": "The toy is pleased now",
+    "negative": "The toy is cross now",
+}
+
+_SAVE: Texts = {
+    "report": "Save the report (in English)",
+    "table": "Save the table (CSV)",
+    "trials": "Save every trial (CSV)",
+}
 
 _FILES = {"report": PAGE, "table": TABLE, "trials": TRIALS}
 
 
 def show(page: Page, reader: LiveReader, people: PersonFields) -> None:
     """Build the section, whose content is folded until it is needed."""
-    with section(page.words("validation.title")) as box:
+    with section(page.words("Live validation with a new person")) as box:
         _ValidationPanel(page, reader, people)
     tag(box, "validation")
 
@@ -39,22 +81,33 @@ class _ValidationPanel:
         self._validation = page.workspace.part(Validation)
         self._workspace = page.workspace
         words = page.words
-        ui.label(words("validation.about")).classes("ps-dim")
+        ui.label(
+            words(
+                "The paper's protocol (section 4.6): the person makes every gesture as prompted, each several times "
+                "in a row. The page measures how long the rules and the network need for a right answer, and how "
+                "sure the network is. Choose a person on whom the network was not trained. The signals are recorded "
+                "as a session of that person."
+            )
+        ).classes("ps-dim")
         # Messages are displayed here, because the top of the page may be out of view.
         self._page = replace(page, _messages=ui.column().classes("w-full ps-messages"))
         self._form = ui.row().classes("w-full items-start ps-small-gap")
         with self._form:
             self._person = people.add("validation-person").classes("w-64")
-            times = {n: words("validation.times", n=n) if n > 1 else words("validation.once") for n in (3, 2, 1)}
-            self._repetitions = ui.select(times, value=3, label=words("validation.repetitions")).classes("w-36")
+            times = {n: words("{n} times", n=n) if n > 1 else words("once") for n in (3, 2, 1)}
+            self._repetitions = ui.select(times, value=3, label=words("Each gesture")).classes("w-36")
             tag(self._repetitions, "validation-times")
             datasets = {str(p): page.workspace.title(p) for p in page.workspace.datasets()}
-            rules = {"": words("validation.no_rules")} | datasets
+            rules = {"": words("nothing: without the rules")} | datasets
             first = next(iter(datasets), "")
-            self._rules = ui.select(rules, value=first, label=words("validation.rules")).classes("w-64")
+            self._rules = ui.select(rules, value=first, label=words("Tune the old rules on")).classes("w-64")
             tag(self._rules, "validation-rules")
-            self._noted = tag(ui.checkbox(words("validation.noted")), "validation-noted")
-            self._begin = button("validate", words("validation.begin"), self._start, "unelevated", icon="play_arrow")
+            self._noted = tag(
+                ui.checkbox(words("The toy has rules of its own: note its reactions")), "validation-noted"
+            )
+            self._begin = button(
+                "validate", words("Begin the validation"), self._start, "unelevated", icon="play_arrow"
+            )
         self._prompts = tag(ui.column().classes("w-full ps-card ps-next ps-small-gap"), "validation-prompts")
         with self._prompts:
             with ui.row().classes("w-full items-center no-wrap"):
@@ -69,20 +122,18 @@ class _ValidationPanel:
             with ui.row().classes("w-full ps-small-gap"):
                 self._pause = button("validation-pause", "", self._validation.pause, icon="pause")
                 self._skip = button(
-                    "validation-skip", words("validation.skip"), self._validation.skip, icon="skip_next"
+                    "validation-skip", words("Skip this trial"), self._validation.skip, icon="skip_next"
                 )
-                button("validation-stop", words("validation.stop"), self._validation.stop, icon="stop")
+                button("validation-stop", words("End and score"), self._validation.stop, icon="stop")
             self._reactions = ui.row().classes("w-full items-center ps-small-gap")
             with self._reactions:
-                for affect in ("positive", "negative"):
+                for affect, text in _REACTIONS.items():
                     react = partial(self._validation.react, affect)
-                    button(f"validation-{affect}", words(f"validation.toy_{affect}"), react, "outline")
+                    button(f"validation-{affect}", words(text), react, "outline")
                 self._noted_count = tag(ui.label("").classes("ps-dim"), "validation-noted-count")
         with tag(ui.element("details").classes("w-full"), "validation-results") as self._past:
-            summary(words("validation.results"))
-            self._results = tag(
-                ui.select({}, label=words("validation.result")).classes("w-64 q-mt-sm"), "validation-result"
-            )
+            summary(words("Results"))
+            self._results = tag(ui.select({}, label=words("Result")).classes("w-64 q-mt-sm"), "validation-result")
             self._result = tag(ui.column().classes("w-full ps-small-gap"), "validation-table")
         self._results.on_value_change(self._show_result)
         self._drawn: tuple[Any, ...] = ()
@@ -111,16 +162,16 @@ class _ValidationPanel:
         self._prompts.set_visibility(led)
         self._update_button()
         gesture = words.gesture(status.label)
-        self._prompt.set_text(words(f"validation.{status.phase}", gesture=gesture) if led else "")
+        self._prompt.set_text(words(_PHASES[status.phase], gesture=gesture) if led else "")
         self._left.set_text(f"{status.left_s} s" if status.left_s else "")
         where = {"n": status.at + 1, "total": status.total, "repetition": status.repetition}
-        self._trial.set_text(words("validation.trial", **where) if led else "")
-        self._pause.set_text(words("validation.go_on" if status.phase == "paused" else "validation.pause"))
+        self._trial.set_text(words("Trial {n} of {total} (repetition {repetition})", **where) if led else "")
+        self._pause.set_text(words("Continue" if status.phase == "paused" else "Pause"))
         self._pause.set_enabled(status.can_pause)
         self._skip.set_enabled(status.phase in ("countdown", "doing", "paused"))
         self._reactions.set_visibility(status.reactions is not None)
         if status.reactions is not None:
-            self._noted_count.set_text(words("validation.noted_count", n=status.reactions))
+            self._noted_count.set_text(words("Reactions noted: {n}", n=status.reactions))
         drawn = (status.label, status.result, status.failed)
         if drawn == self._drawn:
             return
@@ -133,7 +184,14 @@ class _ValidationPanel:
             self._update_results(str(status.result or ""))
             if last and status.result is not None:
                 self._past.props("open")
-                self._page.say(words("validation.done", n=status.done, folder=f"{FOLDER}/{status.result.name}"), "good")
+                self._page.say(
+                    words(
+                        "The validation has ended. Trials: {n}. Everything is in the folder {folder}.",
+                        n=status.done,
+                        folder=f"{FOLDER}/{status.result.name}",
+                    ),
+                    "good",
+                )
 
     def _update_results(self, chosen: str) -> None:
         found = self._validation.results()
@@ -157,7 +215,7 @@ class _ValidationPanel:
                         save = self._workspace.inside(folder / name)
                         button(
                             f"validation-{key}",
-                            self._words(f"validation.save_{key}"),
+                            self._words(_SAVE[key]),
                             lambda save=save: ui.download.content(save.read_bytes(), f"{save.parent.name}-{save.name}"),
                             icon="download",
                         )
@@ -171,7 +229,7 @@ def _result_table(words: Words, result: Mapping[str, Any]) -> None:
     by = {(row["gesture"], row["system"]): row for row in result["by_gesture"]}
     everything = {row["system"]: row for row in result["rows"] if row["group"] == "all"}
     labels = list(dict.fromkeys(row["gesture"] for row in result["by_gesture"]))
-    names = [*map(words.gesture, labels), words("validation.all")]
+    names = [*map(words.gesture, labels), words("All gestures")]
     chosen = [*({s: by[label, s] for s in systems} for label in labels), everything]
 
     def seconds(value: float | None) -> str:
@@ -188,10 +246,15 @@ def _result_table(words: Words, result: Mapping[str, Any]) -> None:
         cells += [f"{one['activated']}/{one['trials']}", seconds(one["reaction_s"]["median"])]
         cells += [f"{one['named']}/{one['trials']}", seconds(one["gesture_s"]["median"]), likelihood]
         rows.append(cells)
-    head = [words("log.gesture")]
-    head += [words(f"validation.{system}_{what}") for system in nameless for what in ("answered", "time")]
-    head += [words(f"validation.{key}") for key in ("answered", "answered_time", "named", "named_time", "likelihood")]
+    head = [words("Gesture")]
+    head += [words(_HEADS[f"{system}_{what}"]) for system in nameless for what in ("answered", "time")]
+    head += [words(_HEADS[key]) for key in ("answered", "answered_time", "named", "named_time", "likelihood")]
     if result["simulated"]:
-        notice(words("shell.simulation")).style("box-sizing: border-box")
-    ui.label(words(f"validation.note_{network}")).classes("ps-dim ps-note")
-    table(words("validation.caption", people=", ".join(result["people"])), head, rows, range(1, len(head)))
+        notice(words("Simulation: these data say nothing about a real toy.")).style("box-sizing: border-box")
+    ui.label(words(_NOTES[network])).classes("ps-dim ps-note")
+    table(
+        words("People: {people}. Times are medians of the answered trials.", people=", ".join(result["people"])),
+        head,
+        rows,
+        range(1, len(head)),
+    )

@@ -26,9 +26,50 @@ from plushsense.dataset.store import Dataset, read_people
 from plushsense.studio.app.guard import download_address
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, address, button, html, moment, set_address, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.app.workspace import PACKAGES, Workspace
 from plushsense.studio.widgets.elements import WorkPanel, link, notice, size, table, text, verdict
+
+_HEADS: Texts = {
+    "package": "Package",
+    "what": "Title",
+    "data": "Data",
+    "made": in_context("package", "Created"),
+    "last_check": "Last check",
+    "validator": "Validator",
+    "answer": "Result",
+    "looks_at": "What it checks",
+    "file": "File or folder",
+    "problem": "Problem, in the words of the validator",
+    "files_count": "Files",
+    "size": "Size",
+}
+
+_VALIDATORS: Texts = {
+    "checksums": "Every file is there and unchanged, and there is no other file.",
+    "data": "The recordings can be read, the tables agree with them, and nothing private is left.",
+    "times": "No true time is left.",
+    "metadata": "Title, version, licence and date are the same everywhere.",
+    "croissant": "mlcroissant accepts the description and loads the same numbers.",
+    "frictionless": "frictionless finds the declared type in every cell.",
+    "datacite": "The citation conforms to the DataCite schema.",
+}
+
+_NAMED: Texts = {
+    "unseen": "With a gesture that it was not trained on: {right} of 100.",
+    "moved": "From the movement only, without levels and clock: {right} of 100.",
+    "clock": "From the sampling clock only, without the touch: {right} of 100.",
+    "session": "In a session that it was not trained on: {right} of 100.",
+}
+
+MEANINGS: Texts = {
+    "personal": (
+        "Therefore these recordings must be treated as personal data: whoever has another recording of a person can "
+        "find that person here, although the package contains no names."
+    ),
+    "guessing": "This is no better than guessing. It is no proof of anonymity: treat the recordings with care.",
+    "simulated": "These people are virtual: the figures say nothing about real people.",
+}
 
 KEYS = "keys"
 """Subfolder of the workspace for secret key files, which are never part of a data set or package."""
@@ -202,7 +243,7 @@ class PackagesSection:
             (
                 link(each.name, address("publish", name=each.name)),
                 each.title,
-                words("export.simulation_short") if each.simulated else "",
+                words("simulation") if each.simulated else "",
                 Markup('<span class="text-no-wrap">{}</span>').format(moment(each.made_s)),
                 self._state(newest_validation(workspace.part(Jobs), each)),
             )
@@ -210,18 +251,18 @@ class PackagesSection:
         ]
         self._list.clear()
         with self._list:
-            text(words("publish.earlier"), "h2")
+            text(words("Packages"), "h2")
             if not rows:
-                text(words("publish.none"), classes="ps-dim")
+                text(words("There are no packages yet."), classes="ps-dim")
                 return
-            head = [words(f"publish.{k}") for k in ("package", "what", "data", "made", "last_check")]
-            table(words("publish.earlier_caption"), head, rows)
+            head = [words(_HEADS[k]) for k in ("package", "what", "data", "made", "last_check")]
+            table(words("Packages of this studio, the newest first"), head, rows)
 
     def _state(self, job: StudioJob | None) -> Markup:
         if job is None:
-            return verdict(None, self.words("publish.never_checked"))
+            return verdict(None, self.words("not checked"))
         good = bool(job.result["valid"])
-        return verdict(good, f"{self.words('publish.valid' if good else 'publish.invalid')}, {moment(job.ended_s)}")
+        return verdict(good, f"{self.words('valid' if good else 'not valid')}, {moment(job.ended_s)}")
 
     async def show(self, name: str) -> None:
         """Show the details of a package."""
@@ -235,48 +276,55 @@ class PackagesSection:
             set_address(address("publish", name=name))
             self._detail.clear()
             with self._detail:
-                text(words("publish.one", name=name), "h2")
+                text(words("Package “{name}”", name=name), "h2")
                 if package.simulated:
-                    notice(words("shell.simulation"))
+                    notice(words("Simulation: these data say nothing about a real toy."))
                 self._take(package)
                 self._answers(package, job)
                 with tag(ui.column().classes("ps-card w-full"), "recognised"):
-                    text(words("publish.recognised"), "h3")
+                    text(words("Can the people be recognised?"), "h3")
                     for sentence in reidentification_text(words, package.reidentification):
                         text(sentence)
                 self._contents(package)
 
     def _size(self, count: int) -> str:
-        return size(count).replace(".", self.words("shell.decimal_point"))
+        return size(count, self.words)
 
     def _take(self, package: PackageFacts) -> None:
         words = self.words
         with tag(ui.column().classes("ps-card ps-next w-full"), "take"):
-            text(words("publish.take"), "h3")
+            text(words(in_context("heading", "Download")), "h3")
             if package.zip is not None:
-                message = words("publish.download", size=self._size(package.zip.stat().st_size))
+                message = words("Download the zip ({size})", size=self._size(package.zip.stat().st_size))
                 download = ui.link(message, download_address(PACKAGES, package.name)).classes("ps-link")
                 tag(download.props("download"), "download")
             else:
-                notice(words("publish.no_zip"))
-            text(words("publish.by_hand"))
+                notice(words("The zip is only made when all validators accept the package."))
+            text(words("Upload the package to a repository yourself if you are allowed to. Its folder:"))
             text(str(package.place), classes="ps-path ps-break")
 
     def _answers(self, package: PackageFacts, job: StudioJob | None) -> None:
         words = self.words
         with tag(ui.column().classes("ps-card w-full"), "answers"):
-            text(words("publish.answers"), "h3")
+            text(words("Results of the validators"), "h3")
             if job is None:
-                text(words("publish.not_checked"))
+                text(words("This package has not been checked here since it was made."))
             else:
                 with ui.row().classes("items-center"):
                     html(self._state(job))
-                    text(words("publish.all_agree" if job.result["valid"] else "publish.some_disagree"), "span")
+                    text(
+                        words(
+                            "All validators accept it."
+                            if job.result["valid"]
+                            else "Do not publish it like this: some validators reject it."
+                        ),
+                        "span",
+                    )
                 self._validators(job.result)
                 for each in job.result.get("sentences", ()):
                     notice(words.sentence(Sentence.from_dict(each)), "info")
-            self._thorough = tag(ui.checkbox(words("publish.with_thorough")), "check-thorough")
-            check = button("check", words("publish.check"), lambda: self._check(package), icon="fact_check")
+            self._thorough = tag(ui.checkbox(words("Slow validators read every row of the sessions")), "check-thorough")
+            check = button("check", words("Check again"), lambda: self._check(package), icon="fact_check")
             check.set_enabled("publish" not in self.lacking)
 
     def _validators(self, result: dict[str, Any]) -> None:
@@ -284,21 +332,17 @@ class PackagesSection:
         rows = []
         for each in result["validators"]:
             good, name = not each["problems"], each["validator"]
-            about = words(f"publish.v_{name}") if name in VALIDATORS else ""
-            mark = verdict(
-                good, words("publish.passed") if good else words("publish.problems_found", n=each["problems"])
-            )
+            about = words(_VALIDATORS[name]) if name in VALIDATORS else ""
+            mark = verdict(good, words("passed") if good else words("problems: {n}", n=each["problems"]))
             rows.append((name, mark, about))
-        head = [words(f"publish.{k}") for k in ("validator", "answer", "looks_at")]
-        tag(table(words("publish.validators_caption"), head, rows), "validators")
+        head = [words(_HEADS[k]) for k in ("validator", "answer", "looks_at")]
+        tag(table(words("Validators"), head, rows), "validators")
         if problems := result["problems"]:
-            listed = [
-                (p["validator"], p["file"] or words("publish.whole"), p["problem"]) for p in problems[:_MAX_PROBLEMS]
-            ]
-            head = [words(f"publish.{k}") for k in ("validator", "file", "problem")]
-            tag(table(words("publish.problems_caption", n=len(problems)), head, listed), "problems")
+            listed = [(p["validator"], p["file"] or words("package"), p["problem"]) for p in problems[:_MAX_PROBLEMS]]
+            head = [words(_HEADS[k]) for k in ("validator", "file", "problem")]
+            tag(table(words("Problems: {n}", n=len(problems)), head, listed), "problems")
             if len(problems) > _MAX_PROBLEMS:
-                text(words("publish.more_problems", n=len(problems) - _MAX_PROBLEMS), classes="ps-dim")
+                text(words("… and {n} more.", n=len(problems) - _MAX_PROBLEMS), classes="ps-dim")
 
     async def _check(self, package: PackageFacts) -> None:
         self.page.say("")
@@ -309,17 +353,20 @@ class PackagesSection:
     def _contents(self, package: PackageFacts) -> None:
         words = self.words
         with tag(ui.column().classes("ps-card w-full"), "contents"):
-            text(words("publish.contents"), "h3")
+            text(words("Contents"), "h3")
             rows = [(name, str(files), self._size(total)) for name, (files, total) in package.contents.items()]
             files, total = (sum(each) for each in zip(*package.contents.values(), strict=True)) if rows else (0, 0)
-            with ui.expansion(words("publish.files", n=files, size=self._size(total))).classes("w-full"):
-                head = [words(f"publish.{k}") for k in ("file", "files_count", "size")]
-                table(words("publish.contents_caption"), head, rows, (1, 2))
+            with ui.expansion(words("Files: {n}, {size}", n=files, size=self._size(total))).classes("w-full"):
+                head = [words(_HEADS[k]) for k in ("file", "files_count", "size")]
+                table(words("Contents of the package"), head, rows, (1, 2))
             if package.citation:
-                text(words("publish.cite"), "h3")
+                text(words("How to cite it"), "h3")
                 tag(text(package.citation), "citation")
                 if "doi.org" not in package.citation:
-                    text(words("publish.no_doi"), classes="ps-dim")
+                    text(
+                        words("There is no DOI yet. Reserve one at a repository, then publish again with it."),
+                        classes="ps-dim",
+                    )
 
 
 def newest_validation(jobs: Jobs, package: PackageFacts) -> StudioJob | None:
@@ -340,13 +387,15 @@ def reidentification_text(words: Words, figures: dict[str, Any]) -> list[str]:
     trials = {(t["design"], t["sees"]): t for t in figures.get("trials", ())}
     head = trials.get(("recordings", "everything"))
     if head is None:
-        return [words("publish.nobody_looked")]
+        return [words("It was not tested whether people can be recognised, and the package states this.")]
     top, low, chance = head["top1"], (head["top1"].get("ci95") or [head["top1"]["mean"]])[0], head["chance"]
     interval = [_of_100(words, limit) for limit in top["ci95"] or ()]
-    between = words("publish.interval", low=interval[0], high=interval[1]) if interval else ""
+    between = words(" (95 % interval {low} to {high})", low=interval[0], high=interval[1]) if interval else ""
     sentences = [
         words(
-            "publish.named",
+            "Given one more recording of the same day and of a known gesture, a simple program recognises the right "
+            "one of {people} people in {right} of 100 cases{between}; guessing would be right in {chance}. It was "
+            "tested on {recordings} recordings.",
             right=_of_100(words, top["mean"]),
             people=head["people"],
             recordings=head["recordings"],
@@ -361,11 +410,23 @@ def reidentification_text(words: Words, figures: dict[str, Any]) -> list[str]:
         ("session", trials.get(("sessions", "everything"))),
     ):
         if trial is not None:
-            sentences.append(words(f"publish.named_{key}", right=_of_100(words, trial["top1"]["mean"])))
+            sentences.append(words(_NAMED[key], right=_of_100(words, trial["top1"]["mean"])))
     if ("sessions", "everything") not in trials:
-        sentences.append(words("publish.no_sessions"))
+        sentences.append(
+            words(
+                "Nothing is known about other sessions, because nobody was recorded twice. Part of the result may be "
+                "due to the day and not to the person."
+            )
+        )
     meaning = "simulated" if figures.get("simulated") else "guessing" if low <= chance else "personal"
-    return [*sentences, words(f"publish.means_{meaning}"), words("publish.lower_bound")]
+    return [
+        *sentences,
+        words(MEANINGS[meaning]),
+        words(
+            "A program made for this purpose may be better. The full report is reidentification.md in the package. "
+            "Ask your data protection officer."
+        ),
+    ]
 
 
 def _of_100(words: Words, share: float) -> str:

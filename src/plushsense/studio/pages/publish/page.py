@@ -13,10 +13,36 @@ from plushsense.core.sentences import Sentence
 from plushsense.dataset.store import Dataset
 from plushsense.studio.app.jobs import StudioJob
 from plushsense.studio.app.shell import Page, address, button, focus, query, tag
+from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import DATASETS, PACKAGES, plain_name
 from plushsense.studio.pages.publish.packages import KEYS, DatasetFacts, PackagesSection, missing_extras
 from plushsense.studio.pages.publish.statements import Field, StatementsForm, beside, watched
 from plushsense.studio.widgets.elements import WorkPanel, facts, notice, scroll_to, style, text, titles
+
+_STAGE_TEXTS: Texts = {
+    "begin": "Starting …",
+    "recognising": "Testing whether people can be recognised …",
+    "writing": "Writing the package …",
+    "rewriting": "Writing the copy with pseudonyms …",
+}
+
+_SWITCHES: Texts = {
+    "streams": "Also publish whole sessions",
+    "excluded": "Also publish excluded recordings",
+    "reidentification": "Test whether people can be recognised",
+    "thorough": "Slow validators read every row of the sessions",
+}
+
+_SWITCHES_ABOUT: Texts = {
+    "streams": "They contain everything between the gestures. Leave them out if the consent does not cover that.",
+    "excluded": "They are marked. If whole sessions are published, these contain the rows in any case.",
+    "reidentification": (
+        "A simple program tries to recognise people by their touch. The package states how often it was right."
+    ),
+    "thorough": (
+        "Takes some minutes more for a large data set. By default they read the first 1000 rows of each session."
+    ),
+}
 
 _MAX_CODES = 5
 
@@ -35,24 +61,60 @@ class PseudonymsForm:
         words, self._start = page.words, start
         simulated = chosen.dataset is not None and chosen.dataset.head.simulated
         if not chosen.own_codes and not chosen.own_dates:
-            tag(text(words("publish.renamed_already"), classes="ps-dim"), "renamed-already")
+            tag(
+                text(words("Codes and dates look like those of a copy with pseudonyms."), classes="ps-dim"),
+                "renamed-already",
+            )
             return
         codes = ", ".join(chosen.own_codes[:_MAX_CODES]) + (" …" if len(chosen.own_codes) > _MAX_CODES else "")
         with tag(ui.column().classes("w-full"), "advice"):
-            notice(words("publish.advice", codes=codes or "–"), "info" if simulated else "warning")
-        with tag(ui.expansion(words("publish.rename")).classes("w-full"), "rename"):
-            text(words("publish.rename_about"))
+            notice(
+                words(
+                    "The codes of the people ({codes}) are published as they are, and they were not drawn at random. "
+                    "If they are names, or if others know who is who, first make a copy with pseudonyms and publish "
+                    "that. Dates are always shifted.",
+                    codes=codes or "–",
+                ),
+                "info" if simulated else "warning",
+            )
+        with tag(ui.expansion(words("Make a copy with pseudonyms")).classes("w-full"), "rename"):
+            text(
+                words(
+                    "Creates a new data set with random codes and shifted dates. This data set is not changed, and "
+                    "the sensor values stay the same."
+                )
+            )
             name = page.workspace.free_name(DATASETS, f"{chosen.path.name}-shared")
-            self.name = tag(ui.input(words("publish.rename_name"), value=name).props("maxlength=64"), "rename-name")
-            key = ui.input(words("publish.rename_key"), value=f"{chosen.path.name}-people.csv").props("maxlength=64")
+            self.name = tag(
+                ui.input(words("Name of the new data set"), value=name).props("maxlength=64"), "rename-name"
+            )
+            key = ui.input(words("Key file: which code belongs to whom"), value=f"{chosen.path.name}-people.csv").props(
+                "maxlength=64"
+            )
             self.key = tag(key, "rename-key")
             for field in (self.name, self.key):
                 watched(field.classes("w-full"))
-            text(words("publish.key_place", folder=str(page.workspace.folder / KEYS)), classes="ps-dim")
-            self._listed = tag(ui.textarea(words("publish.rename_words")).props("autogrow").classes("w-full"), "words")
-            self._drop = tag(ui.checkbox(words("publish.rename_drop")), "drop-notes")
-            notice(words("publish.rename_safe"))
-            button("rename-do", words("publish.rename_do"), self._go, icon="masks")
+            text(
+                words(
+                    "Key files are in {folder}, outside of data sets and packages. An existing key file is used again.",
+                    folder=str(page.workspace.folder / KEYS),
+                ),
+                classes="ps-dim",
+            )
+            self._listed = tag(
+                ui.textarea(words("Words to remove everywhere, such as first names, one per line"))
+                .props("autogrow")
+                .classes("w-full"),
+                "words",
+            )
+            self._drop = tag(ui.checkbox(words("Leave out free-text notes")), "drop-notes")
+            notice(
+                words(
+                    "Whoever has the key can undo the pseudonyms. Move it to a safe place apart from the data that "
+                    "few people can open, and keep a second copy: it is not part of any backup. Never publish it."
+                )
+            )
+            button("rename-do", words("Make the copy"), self._go, icon="masks")
 
     async def _go(self) -> None:
         listed = [line.strip() for line in (self._listed.value or "").splitlines() if line.strip()]
@@ -62,7 +124,6 @@ class PseudonymsForm:
 
 _TASKS = ("publish", "validate", "pseudonymise")
 _STAGES = {"recognising people": "recognising", "writing": "writing", "rewriting": "rewriting"}
-_SWITCHES = ("streams", "excluded", "reidentification", "thorough")
 
 
 async def show(page: Page) -> None:
@@ -80,12 +141,34 @@ class _Publishing:
     async def build(self) -> None:
         words = self.words
         style()
-        text(words("publish.about"), classes="ps-dim")
+        text(
+            words(
+                "Makes a package of a data set that others can use, and checks it with the validators of each format."
+            ),
+            classes="ps-dim",
+        )
         with ui.row().classes("ps-message ps-message-warning w-full items-center no-wrap"):
             ui.icon("lock").props('aria-hidden="true"')
-            tag(text(words("publish.danger")), "danger")
+            tag(
+                text(
+                    words(
+                        "Nothing is uploaded. The package stays on this computer until you give it to somebody, and "
+                        "a copy that you gave away cannot be called back. Publish only what the consent forms allow."
+                    )
+                ),
+                "danger",
+            )
         if "publish" in self.lacking:
-            tag(notice(words("publish.missing_publish"), "error"), "missing-publish")
+            tag(
+                notice(
+                    words(
+                        "The validators are not installed, so nothing can be published or checked. Run  pip install "
+                        "'plushsense[publish]'  and start the studio again."
+                    ),
+                    "error",
+                ),
+                "missing-publish",
+            )
         await self._form()
         self.work = WorkPanel(self.page, _TASKS, self._progress_text, self._ended, self._allow)
         self._allow()
@@ -98,15 +181,16 @@ class _Publishing:
         words = self.words
         options = await titles(self.workspace)
         with tag(ui.column().classes("ps-card w-full"), "new"):
-            text(words("publish.new"), "h2")
+            text(words("New package"), "h2")
             if not options:
-                tag(text(words("publish.no_dataset")), "no-dataset")
+                tag(
+                    text(words("There is no data set yet. Record a session, or import recordings on the home page.")),
+                    "no-dataset",
+                )
                 return
             dataset = self.query.get("dataset", "")
             first = dataset if dataset in options else next(iter(options))
-            select = ui.select(
-                options, value=first, label=words("publish.dataset"), on_change=lambda e: self._choose(e.value)
-            )
+            select = ui.select(options, value=first, label=words("Data set"), on_change=lambda e: self._choose(e.value))
             tag(select.classes("w-full"), "dataset")
             self._rest = ui.column().classes("w-full")
             await self._choose(first)
@@ -123,50 +207,70 @@ class _Publishing:
                 tag(notice(problem, "error"), "dataset-problem")
                 return
             if chosen.dataset.head.simulated:
-                notice(words("shell.simulation"))
+                notice(words("Simulation: these data say nothing about a real toy."))
             tag(facts(self._facts_of(chosen.dataset)), "dataset-facts")
             self.pseudonyms = PseudonymsForm(self.page, chosen, self._pseudonymise)
             self.statements = StatementsForm(self.page, chosen.path, chosen.dataset.head)
             self._choices(chosen)
-            name = ui.input(words("publish.name"), value=self._free_name(chosen.path.name)).props("maxlength=64")
+            name = ui.input(words("Name of the package"), value=self._free_name(chosen.path.name)).props("maxlength=64")
             self._name = watched(tag(name.classes("w-full"), "name"))
             with ui.row().classes("w-full ps-bottom"):
-                self._button = button("do", words("publish.do"), self._start, "", icon="inventory_2")
+                self._button = button("do", words("Make the package"), self._start, "", icon="inventory_2")
         self._allow()
 
     def _facts_of(self, dataset: Dataset) -> list[tuple[str, str]]:
         words, recordings = self.words, len(dataset.recordings)
-        counts = words("publish.recordings_value", n=recordings, x=recordings - len(dataset.used))
+        counts = words("{n}, {x} of them excluded", n=recordings, x=recordings - len(dataset.used))
         return [
-            (words("publish.dataset_name"), dataset.head.name),
-            (words("publish.version"), dataset.head.version),
-            (words("publish.people"), str(len(dataset.subjects))),
-            (words("publish.recordings"), counts),
-            (words("publish.streams_count"), str(len(dataset.streams))),
-            (words("publish.place"), str(dataset.path)),
+            (words("Name"), dataset.head.name),
+            (words("Version"), dataset.head.version),
+            (words("People"), str(len(dataset.subjects))),
+            (words("Recordings"), counts),
+            (words("Whole sessions"), str(len(dataset.streams))),
+            (words("Folder"), str(dataset.path)),
         ]
 
     def _choices(self, chosen: DatasetFacts) -> None:
         words = self.words
-        text(words("publish.choices"), "h3")
+        text(words("Choices"), "h3")
         self._switches: dict[str, ui.checkbox] = {}
         for key in _SWITCHES:
-            box = ui.checkbox(words(f"publish.with_{key}"), value=key in ("streams", "reidentification"))
+            box = ui.checkbox(words(_SWITCHES[key]), value=key in ("streams", "reidentification"))
             self._switches[key] = tag(box, f"with-{key}")
-            text(words(f"publish.with_{key}_about"), classes="ps-dim").style("margin: -12px 0 0 40px")
+            text(words(_SWITCHES_ABOUT[key]), classes="ps-dim").style("margin: -12px 0 0 40px")
         if "baselines" in self.lacking:
             self._switches["reidentification"].set_value(False)
             self._switches["reidentification"].set_enabled(False)
-            tag(notice(words("publish.missing_baselines")), "missing-baselines")
+            tag(
+                notice(
+                    words(
+                        "Re-identification cannot be tested. Run  pip install 'plushsense[baselines]'  and start the "
+                        "studio again. Without the test, the package says that it was not made."
+                    )
+                ),
+                "missing-baselines",
+            )
         self._columns: dict[str, ui.checkbox] = {}
         if chosen.columns:
-            text(words("publish.columns"), classes="ps-dim")
+            text(words("Columns of the table of people to publish besides age group and gender:"), classes="ps-dim")
             self._columns = {c: tag(ui.checkbox(c), f"column-{c}") for c in chosen.columns}
-        self._keep = tag(ui.checkbox(words("publish.with_key")), "with-key")
-        text(words("publish.with_key_about"), classes="ps-dim").style("margin: -12px 0 0 40px")
-        field = ui.input(words("publish.key"), value=f"{chosen.path.name}.key").props("maxlength=64").classes("w-full")
+        self._keep = tag(ui.checkbox(words("Shift the dates of later versions in the same way")), "with-key")
+        text(
+            words(
+                "The shifts come from a secret key, which is kept. Otherwise they are drawn again each time and not "
+                "stored."
+            ),
+            classes="ps-dim",
+        ).style("margin: -12px 0 0 40px")
+        field = ui.input(words("Key file"), value=f"{chosen.path.name}.key").props("maxlength=64").classes("w-full")
         self._key = watched(tag(field.bind_visibility_from(self._keep, "value"), "key"))
-        where = text(words("publish.key_place", folder=str(self.workspace.folder / KEYS)), classes="ps-dim")
+        where = text(
+            words(
+                "Key files are in {folder}, outside of data sets and packages. An existing key file is used again.",
+                folder=str(self.workspace.folder / KEYS),
+            ),
+            classes="ps-dim",
+        )
         where.bind_visibility_from(self._keep, "value")
 
     def _free_name(self, stem: str) -> str:
@@ -227,7 +331,7 @@ class _Publishing:
         wrong = [field for field in fields if field.error]
         if wrong:
             focus(wrong[0])
-            self.page.say(self.words("publish.see_fields"), "error")
+            self.page.say(self.words("Not yet: see what is missing beside the fields in red."), "error")
         return bool(wrong)
 
     # Jobs -----------------------------------------------------------------------------------------------------
@@ -235,11 +339,11 @@ class _Publishing:
     def _progress_text(self, job: StudioJob) -> str:
         words, stage = self.words, str(job.progress.get("stage", ""))
         total = job.progress.get("total") or 0
-        of = f" {words('publish.of', done=job.progress.get('done', 0), total=total)}" if total else ""
+        of = f" {words('({done} of {total})', done=job.progress.get('done', 0), total=total)}" if total else ""
         if stage.startswith("validating"):
-            return f"{words('publish.stage_validating', name=stage.partition(': ')[2])}{of}"
+            return f"{words('Running the validators … {name}', name=stage.partition(': ')[2])}{of}"
         known = _STAGES.get(stage, "begin")
-        return f"{words(f'publish.stage_{known}')}{of}"
+        return f"{words(_STAGE_TEXTS[known])}{of}"
 
     async def _ended(self, job: StudioJob) -> None:
         if job.task == "pseudonymise":
@@ -248,8 +352,13 @@ class _Publishing:
         name = Path(job.spec["place"]).name
         if job.task == "publish":
             good = bool(job.result["valid"])
-            message = self.words("publish.done" if good else "publish.done_invalid", name=name)
-            self.page.say(message, "good" if good else "error")
+            message = "The package “{name}” is made, and all validators accept it."
+            if not good:
+                message = (
+                    "The package “{name}” is made, but some validators reject it: see below. "
+                    "It was not packed as a zip."
+                )
+            self.page.say(self.words(message, name=name), "good" if good else "error")
             if hasattr(self, "_name"):
                 self._name.set_value(self._free_name(name))
         await self.packages.show(name.removesuffix(".zip") if job.task == "validate" else name)
@@ -258,9 +367,16 @@ class _Publishing:
 
     async def _renamed(self, job: StudioJob) -> None:
         result = job.result
-        self.page.say(self.words("publish.renamed", name=Path(job.spec["place"]).name, file=result["key"]), "good")
+        self.page.say(
+            self.words(
+                "“{name}” is ready. The key is {file}: move it to a safe place, and never publish it.",
+                name=Path(job.spec["place"]).name,
+                file=result["key"],
+            ),
+            "good",
+        )
         with self.page._messages, tag(ui.column().classes("w-full"), "findings"):
-            link = ui.link(self.words("publish.renamed_go"), address("publish", dataset=job.spec["place"]))
+            link = ui.link(self.words("Publish the copy"), address("publish", dataset=job.spec["place"]))
             tag(link.classes("ps-link"), "go-renamed")
             for finding in result["findings"]:
                 where = [str(finding[k]) for k in ("file", "line") if finding[k]]

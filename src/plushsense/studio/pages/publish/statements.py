@@ -17,8 +17,43 @@ from plushsense.dataset.publishing.description import LICENCES, find_licence
 from plushsense.dataset.publishing.package import missing_statements
 from plushsense.dataset.store import DatasetHead
 from plushsense.studio.app.shell import Page, button, focus, heading, icon_button, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.widgets.elements import text
+
+_FIELDS: Texts = {
+    "creator_name": "Family name, first name",
+    "creator_orcid": "ORCID iD (optional)",
+    "creator_affiliation": "Institution (optional)",
+}
+
+_ABOUT: Texts = {
+    "title": "What others find and cite, such as “Touch on a plush companion”.",
+    "description": "What was recorded, with whom and for what. No names of participants.",
+    "licence": (
+        "What others may do with the data. CC-BY-4.0 allows everything as long as they name you. Ask your "
+        "institution which licence is allowed."
+    ),
+    "contact": "Whom users of the data may write to. Both are published.",
+    "consent": "One or two sentences that are published unchanged; for children, what the parents signed. No names.",
+}
+
+_LACKS: Texts = {
+    "licence": "licence",
+    "contact": "contact",
+    "consent": "consent statement",
+    "title": "title",
+    "description": "description",
+    "creators": "authors",
+}
+
+_NEEDS: Texts = {
+    "title": "Give a title.",
+    "description": "Describe the data in one or two sentences.",
+    "creators": "Name at least one author.",
+    "licence": "Choose a licence.",
+    "contact": "A name and an e-mail address are needed.",
+    "consent": "State what the people consented to.",
+}
 
 Field = ui.input | ui.select | ui.textarea
 
@@ -48,11 +83,11 @@ class _CreatorRow:
                 self.name = self._field("creator_name", creator.name if creator else "")
                 self.orcid = self._field("creator_orcid", creator.orcid if creator else "")
                 self.affiliation = self._field("creator_affiliation", creator.affiliation if creator else "")
-            remove = icon_button("delete", words("publish.creator_remove"), lambda: removed(self))
+            remove = icon_button("delete", words("Remove this author"), lambda: removed(self))
             tag(remove, "creator-remove")
 
     def _field(self, key: str, value: str) -> ui.input:
-        field = ui.input(self._words(f"publish.{key}"), value=value).classes("ps-wide")
+        field = ui.input(self._words(_FIELDS[key]), value=value).classes("ps-wide")
         watched(tag(field, key.replace("_", "-")))
         return field
 
@@ -70,32 +105,32 @@ class StatementsForm:
     def __init__(self, page: Page, path: Path, head: DatasetHead) -> None:
         words, about = page.words, head.about
         self._page, self._words, self._path = page, words, path
-        text(words("publish.statements"), "h3")
+        text(words("About the data"), "h3")
         self._lacks = tag(text(""), "lacks")
-        self._title = self._add("data_title", ui.input(words("publish.data_title"), value=about.title), "title")
-        description = ui.textarea(words("publish.description"), value=about.description).props("autogrow")
+        self._title = self._add("data_title", ui.input(words("Title"), value=about.title), "title")
+        description = ui.textarea(words("Description"), value=about.description).props("autogrow")
         self._description = self._add("description", description)
-        heading(words("publish.creators"), 4)
+        heading(words("Authors, as they are cited"), 4)
         self._list = tag(ui.column().classes("w-full ps-small-gap"), "creators")
         self._creators: list[_CreatorRow] = []
         for creator in about.creators or (None,):
             self._add_creator(creator)
-        button("creator-add", words("publish.creator_add"), self._add_creator, "outline dense", icon="add")
-        heading(words("publish.licence"), 4)
+        button("creator-add", words("Add an author"), self._add_creator, "outline dense", icon="add")
+        heading(words("Licence"), 4)
         licences = {s: s if s == each.title else f"{s}: {each.title}" for s, each in LICENCES.items()}
         if head.licence:
             # Display a current licence even if it is not in the list and will be rejected.
             licences.setdefault(head.licence, head.licence)
-        licence = ui.select(licences, value=head.licence or None, label=words("publish.licence"), with_input=False)
+        licence = ui.select(licences, value=head.licence or None, label=words("Licence"), with_input=False)
         self._licence = self._add("licence", licence)
-        heading(words("publish.contact"), 4)
-        self._name = self._add("contact_name", ui.input(words("publish.contact_name"), value=about.contact.name), "")
-        mail = ui.input(words("publish.contact_mail"), value=about.contact.email).props("type=email")
+        heading(words("Contact"), 4)
+        self._name = self._add("contact_name", ui.input(words("Contact: name"), value=about.contact.name), "")
+        mail = ui.input(words("Contact: e-mail"), value=about.contact.email).props("type=email")
         self._mail = self._add("contact_mail", mail, "contact")
-        heading(words("publish.consent_title"), 4)
-        consent = ui.textarea(words("publish.consent"), value=head.consent).props("autogrow")
+        heading(words("Consent"), 4)
+        consent = ui.textarea(words("What the people consented to"), value=head.consent).props("autogrow")
         self._consent = self._add("consent", consent)
-        button("save", words("publish.save"), self._save_part, icon="save")
+        button("save", words("Save these statements"), self._save_part, icon="save")
         self._show_missing(missing_statements(head))
 
     def _add(self, name: str, field: Any, about: str | None = None) -> Any:
@@ -103,7 +138,7 @@ class StatementsForm:
         key = name if about is None else about
         watched(tag(field.classes("w-full"), name.replace("_", "-")))
         if key:
-            text(self._words(f"publish.{key}_about"), classes="ps-dim ps-note")
+            text(self._words(_ABOUT[key]), classes="ps-dim ps-note")
         return field
 
     def _add_creator(self, creator: Any = None) -> None:
@@ -124,9 +159,11 @@ class StatementsForm:
         return [self._title, self._description, *rows, self._licence, self._name, self._mail, self._consent]
 
     def _show_missing(self, missing: list[str]) -> None:
-        listed = ", ".join(self._words(f"publish.lacks_{key}") for key in missing)
+        listed = ", ".join(self._words(_LACKS[key]) for key in missing)
         self._lacks.set_content(
-            self._words("publish.lacks", what=listed) if missing else self._words("publish.lacks_nothing")
+            self._words("The data set does not state yet: {what}.", what=listed)
+            if missing
+            else self._words("The data set states everything that is required.")
         )
 
     async def save(self, *, complete: bool = True) -> bool:
@@ -173,17 +210,17 @@ class StatementsForm:
             "consent": self._consent,
         }
         for key in missing:
-            places[key].error = self._words(f"publish.needs_{key}")
+            places[key].error = self._words(_NEEDS[key])
 
     def _ask_for_first_error(self) -> bool:
         """Move the focus to the first field with an error; return whether there is one."""
         wrong = [field for field in self._fields if field.error]
         if wrong:
             focus(wrong[0])
-            self._page.say(self._words("publish.see_fields"), "error")
+            self._page.say(self._words("Not yet: see what is missing beside the fields in red."), "error")
         return bool(wrong)
 
     async def _save_part(self) -> None:
         with self._page.show_errors():
             if await self.save(complete=False):
-                self._page.say(self._words("publish.saved"), "good")
+                self._page.say(self._words("Saved in the data set. You can change it at any time."), "good")

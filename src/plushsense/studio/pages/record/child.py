@@ -11,8 +11,17 @@ from nicegui.element import Element
 
 from plushsense.recording.status import RecorderStatus
 from plushsense.studio.app.shell import Page, add_style, html, on_change, tag
+from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.widgets.elements import own_picture, picture
+
+_STATES: Texts = {
+    "recording": "Now!",
+    "saving": "Well done!",
+    "paused": "We are taking a break",
+    "finished": "All done",
+    "stopped": "We are taking a break",
+}
 
 _CSS = Path(__file__).with_name("record.css")
 
@@ -44,7 +53,7 @@ class ConnectionAlert(Element, component="connection.js"):
 
 def gesture_picture(page: Page, gesture: str) -> Markup:
     """Return the picture of a gesture, preferably the user's own one; "" is the toy alone."""
-    name = page.words("record.picture", gesture=page.words.gesture(gesture)) if gesture else page.words("record.toy")
+    name = page.words("Picture: {gesture}", gesture=page.words.gesture(gesture)) if gesture else page.words("Toy")
     own = own_picture(page.workspace.folder, gesture) if gesture else ""
     if own:
         return Markup('<img src="{}" alt="{}" class="ps-own-picture">').format(own, name)
@@ -55,8 +64,6 @@ CHILD = "child"
 """Value of ``view`` in the address of the child's screen."""
 _DRAW_S = 0.1
 _RESTING = ("finished", "stopped")
-_STATES = ("countdown", "recording", "saving", "paused", "finished", "stopped")
-"""States that the screen names; the others need no word."""
 
 
 def show_child(page: Page, controller: RecordController, name: str) -> None:
@@ -82,7 +89,7 @@ class _ChildView:
             self._gesture = tag(html("", "h1"), "child-gesture")
             self._prompt = tag(ui.label().classes("ps-child-prompt ps-current"), "child-prompt")
             self._state = tag(ui.label().classes("ps-child-state ps-current").props("role=status"), "child-state")
-            ConnectionAlert().prepare(page.words("record.child_lost"))
+            ConnectionAlert().prepare(page.words("One moment …"))
 
     def _session(self) -> ActiveSession | None:
         return self._controller.get(self._name)
@@ -96,7 +103,7 @@ class _ChildView:
         if gesture != self._drawn:
             self._drawn = gesture
             self._picture.content = gesture_picture(self._page, gesture)
-            self._gesture.content = words.gesture(gesture) if gesture else words("record.child_rests")
+            self._gesture.content = words.gesture(gesture) if gesture else words("Thank you!")
         self._prompt.text = "" if s is None or rests else s.step.prompt
         self._prompt.set_visibility(bool(self._prompt.text))
         self._state.text = self._state_text(s)
@@ -108,4 +115,4 @@ class _ChildView:
             return ""
         if s.state == "countdown":
             return f"{math.ceil(s.countdown_s)}"
-        return self._page.words(f"record.child_{s.state}") if s.state in _STATES else ""
+        return self._page.words(_STATES[s.state]) if s.state in _STATES else ""

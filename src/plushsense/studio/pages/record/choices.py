@@ -12,16 +12,29 @@ from plushsense.core.gestures import load_gestures
 from plushsense.devices.opening import is_virtual, list_devices
 from plushsense.recording.plan import ORDERS
 from plushsense.studio.app.shell import Page, button, named, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.record.controller import RecordController
 from plushsense.studio.widgets.elements import summary
+
+_ORDERS: Texts = {
+    "gesture": "As listed, all repetitions of a gesture in a row",
+    "round": "As listed, every gesture once, then again",
+    "random": "Mixed, another order in each session",
+}
+
+PROTOCOLS: Texts = {
+    "plush-17": "The session of the paper: 17 gestures, 3 times each",
+    "quick": "Short trial: 4 gestures, once each",
+    "rest": "The toy at rest, nobody touches it",
+}
+"""Titles of the protocols that PlushSense has."""
 
 _SCAN_S = 3.0
 
 
 def toy_name(words: Words, url: str) -> str:
     """Return the text for a toy in a list: its URL, marked if the toy is virtual."""
-    return f"{words('record.virtual_toy')} · {url}" if is_virtual(url) else url
+    return f"{words('Virtual toy (simulation)')} · {url}" if is_virtual(url) else url
 
 
 class ToyChoice:
@@ -34,12 +47,12 @@ class ToyChoice:
 
     def __init__(self, page: Page, urls: Sequence[str], prefix: str = "") -> None:
         self._page, self._urls, words = page, urls, page.words
-        label = words("record.toy")
+        label = words("Toy")
         self._list = ui.select({u: toy_name(words, u) for u in urls}, value=urls[0], label=label)
         named(tag(self._list, f"{prefix}toy"), label).style("width: 27rem; max-width: 100%")
-        self._look = button(f"{prefix}look", words("record.look"), self._search)
-        self._other = ui.input(label=words("record.other_toy")).props(
-            f'outlined hint="{words("record.other_toy_hint")}"'
+        self._look = button(f"{prefix}look", words("Look for toys"), self._search)
+        self._other = ui.input(label=words("Address of another toy")).props(
+            f'outlined hint="{words("For example serial:///dev/ttyUSB0")}"'
         )
         tag(self._other, f"{prefix}other_toy").classes("w-64")
         self._list.on_value_change(lambda: self.show_error(""))
@@ -59,7 +72,9 @@ class ToyChoice:
     async def _search(self) -> None:
         words = self._page.words
         self._look.disable()
-        self._page.say(words("record.looking", s=f"{_SCAN_S:g}"))
+        self._page.say(
+            words("Looking for toys at ports, by Bluetooth and on the network (LSL), {s} s …", s=f"{_SCAN_S:g}")
+        )
         try:
             listing = await run.io_bound(list_devices, _SCAN_S)
         finally:
@@ -70,7 +85,7 @@ class ToyChoice:
         options |= {d.url: f"{d.name} · {d.url}" for d in listing.devices if d.url not in options}
         self._list.set_options(options, value=self._list.value)
         notes = [words.sentence(note) for note in listing.notes]
-        self._page.say(" ".join([words("record.found", n=len(options)), *notes]))
+        self._page.say(" ".join([words("Toys to choose from: {n}.", n=len(options)), *notes]))
 
 
 _GESTURES = "plush-18"
@@ -85,10 +100,10 @@ class ProtocolForm:
         self._page, self._controller, self._saved = page, controller, saved
         words = page.words
         with tag(ui.element("details").classes("w-full"), "own-protocol") as self._box:
-            summary(words("record.own_protocol"))
+            summary(words("Make your own list of gestures"))
             with ui.column().classes("w-full q-pt-sm"):
-                ui.label(words("record.own_gestures")).classes("text-bold")
-                with named(ui.row().classes("w-full ps-no-gap").props("role=group"), words("record.own_gestures")):
+                ui.label(words("Gestures to record")).classes("text-bold")
+                with named(ui.row().classes("w-full ps-no-gap").props("role=group"), words("Gestures to record")):
                     self._gestures = {
                         label: tag(ui.checkbox(words.gesture(label)).style("width: 16rem"), f"own-{label}")
                         for label in load_gestures(_GESTURES).labels
@@ -96,16 +111,16 @@ class ProtocolForm:
                 self._lacking = ui.label().classes("ps-bad").props("role=alert")
                 with ui.row().classes("w-full items-start"):
                     self._repetitions = ui.number(
-                        words("record.own_repetitions"), value=3, min=1, max=_MOST, step=1, format="%d"
+                        words("How often each"), value=3, min=1, max=_MOST, step=1, format="%d"
                     )
                     tag(self._repetitions, "own-repetitions").classes("w-64")
-                    orders = {order: words(f"record.order_{order}") for order in ORDERS}
-                    label = words("record.own_order")
+                    orders = {order: words(_ORDERS[order]) for order in ORDERS}
+                    label = words("Order")
                     self._order = tag(ui.select(orders, value="gesture", label=label), "own-order").classes("w-96")
                     named(self._order, label)
                 with ui.row().classes("w-full items-start"):
-                    self._name = tag(ui.input(words("record.own_name")), "own-name").classes("w-64")
-                    button("own-save", words("record.own_save"), self._save)
+                    self._name = tag(ui.input(words("Name of the list")), "own-name").classes("w-64")
+                    button("own-save", words("Save and choose it"), self._save)
 
     def _save(self) -> None:
         words = self._page.words

@@ -15,11 +15,36 @@ from plushsense.recording.plan import DEFAULT, wordings
 from plushsense.recording.request import PROTOCOL, SessionRequest
 from plushsense.recording.session import SessionSummary
 from plushsense.studio.app.shell import Page, address, button, html, named, query, tag
+from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.record.child import CHILD, show_child
-from plushsense.studio.pages.record.choices import ProtocolForm, ToyChoice, toy_name
+from plushsense.studio.pages.record.choices import PROTOCOLS, ProtocolForm, ToyChoice, toy_name
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.session import collect, show_session
 from plushsense.studio.widgets.elements import ask, change_files, item_menu, summary
+
+_LABELS: Texts = {
+    "code": "Code of the person",
+    "consent": "Number of the consent form",
+    "age_group": "Age group",
+    "gender": "Gender",
+    "protocol": "What to record",
+    "wording": "Wording",
+    "layout": "Sensor layout of the toy",
+}
+
+_HINTS: Texts = {
+    "code_hint": "For example S01, never a name",
+    "consent_hint": "Required for publishing",
+    "age_hint": "For example child, teen, adult",
+    "gender_hint": "In the person's own words",
+}
+
+_WORDINGS: Texts = {
+    "default": "Standard, in the language of the protocol",
+    "child": "For children, English",
+    "lv": "Latvian",
+    "lv-child": "For children, Latvian",
+}
 
 _LISTED = 8
 _CODE_ERRORS = ("no_person", "code_bad", "session_unfinished", "session_in_use")
@@ -56,13 +81,21 @@ async def show_start(page: Page, controller: RecordController, requested: str, e
     if ended in mine:
         session = mine[ended]
         counts = {"name": ended, "done": session.done, "steps": session.steps}
-        page.say(page.words("record.ended_whole" if session.finished else "record.ended_part", **counts), "good")
+        page.say(
+            page.words(
+                "{name} is finished: {done} of {steps} recorded."
+                if session.finished
+                else "{name}: {done} of {steps} recorded. You can continue at any time.",
+                **counts,
+            ),
+            "good",
+        )
         if session.done:
             _ended(page, session)
     elif requested in mine and not mine[requested].finished:
-        page.say(page.words("record.not_open", name=requested), "warning")
+        page.say(page.words("{name} is not open now. Continue it below.", name=requested), "warning")
     elif requested:
-        page.say(page.words("record.no_session", name=requested), "warning")
+        page.say(page.words("There is no unfinished session {name} here.", name=requested), "warning")
     _SessionLists(page, controller).fill(sessions)
     _Form(page, controller)
 
@@ -76,8 +109,10 @@ def _ended(page: Page, session: SessionSummary) -> None:
             collect(page, session.folder)
 
     with tag(ui.row().classes("ps-card ps-next w-full items-center"), "ended-session"):
-        ui.label(page.words("record.now_see", n=session.done)).classes("flex-grow text-lg")
-        see = button("collect", page.words("record.collect"), clicked, "unelevated size=lg", about=session.name)
+        ui.label(page.words("Recordings of this session: {n}. They are put into a data set.", n=session.done)).classes(
+            "flex-grow text-lg"
+        )
+        see = button("collect", page.words("Look at the recordings"), clicked, "unelevated size=lg", about=session.name)
 
 
 class _SessionLists:
@@ -94,25 +129,23 @@ class _SessionLists:
         with self._box:
             for active in controller.active_sessions():
                 with tag(ui.row().classes("ps-card w-full items-center"), "open-session"):
-                    ui.label(words("record.open_now", name=active.name)).classes("flex-grow text-bold")
+                    ui.label(words("{name} is being recorded now", name=active.name)).classes("flex-grow text-bold")
                     there = address("record", session=active.name)
-                    button(
-                        "", words("record.show"), lambda to=there: ui.navigate.to(to), "unelevated", about=active.name
-                    )
+                    button("", words("Show it"), lambda to=there: ui.navigate.to(to), "unelevated", about=active.name)
             closed = [s for s in sessions if controller.get(s.name) is None]
             if left := [s for s in closed if not s.finished]:
                 with ui.column().classes("ps-card w-full"):
-                    html(words("record.unfinished"), "h2")
+                    html(words("Unfinished sessions"), "h2")
                     for session in left[:_LISTED]:
                         self._unfinished(session)
                     if len(left) > _LISTED:
                         with ui.element("details").classes("w-full"):
-                            summary(words("record.older", n=len(left) - _LISTED))
+                            summary(words("Older ones: {n}", n=len(left) - _LISTED))
                             for session in left[_LISTED:]:
                                 self._unfinished(session)
             if finished := [s for s in closed if s.finished]:
                 with tag(ui.element("details").classes("ps-card w-full"), "finished-sessions"):
-                    summary(words("record.finished_ones", n=len(finished)))
+                    summary(words("Finished sessions: {n}.", n=len(finished)))
                     for session in finished:
                         with ui.row().classes("w-full items-center"):
                             self._describe(session)
@@ -122,14 +155,16 @@ class _SessionLists:
         words, name, controller = self._page.words, session.name, self._controller
         with tag(ui.row().classes("w-full items-center"), f"unfinished-{name}"):
             if session.head is None or session.protocol is None:
-                ui.label(words("sentences.session_damaged", name=name)).classes("flex-grow")
+                ui.label(
+                    words("The session {name} cannot be read. Restore its folder from a copy.", name=name)
+                ).classes("flex-grow")
                 return
             self._describe(session)
             toys = list(dict.fromkeys([session.head.device, *controller.toys()]))
             titles = {u: toy_name(words, u) for u in toys}
-            toy = ui.select(titles, value=toys[0], label=words("record.toy")).style("width: 24rem; max-width: 100%")
-            named(toy.props("outlined dense"), f"{words('record.toy')}: {name}")
-            go_on = button("", words("record.go_on"), None, "unelevated", about=name)
+            toy = ui.select(titles, value=toys[0], label=words("Toy")).style("width: 24rem; max-width: 100%")
+            named(toy.props("outlined dense"), f"{words('Toy')}: {name}")
+            go_on = button("", words("Continue"), None, "unelevated", about=name)
 
             def refused(error: PlushSenseError) -> bool:
                 if _is_of_toy(error):
@@ -145,12 +180,12 @@ class _SessionLists:
 
     def _describe(self, session: SessionSummary) -> None:
         words = self._page.words
-        text = words("record.so_far", name=session.name, done=session.done, steps=session.steps)
+        text = words("{name}: {done} of {steps} recorded", name=session.name, done=session.done, steps=session.steps)
         with ui.column().classes("flex-grow ps-no-gap"):
             ui.label(text).classes("text-bold")
             if session.head is not None and session.protocol is not None:
-                title = words.get(f"record.protocol_{session.protocol.name}", session.protocol.title)
-                title += f" · {words('record.simulated')}" if session.head.simulated else ""
+                title = words(PROTOCOLS.get(session.protocol.name, session.protocol.title))
+                title += f" · {words('simulation')}" if session.head.simulated else ""
                 ui.label(title).classes("ps-dim")
 
     def _menu(self, session: SessionSummary) -> None:
@@ -159,13 +194,15 @@ class _SessionLists:
         subject, finished = session.folder.parent.name, session.finished
 
         async def finish() -> None:
-            message = words("record.reopened" if finished else "record.marked_finished", name=name)
+            message = words(
+                "{name} can be continued again." if finished else "{name} is marked as finished.", name=name
+            )
             await self._change(
                 lambda: controller.finish(name, not finished), message, lambda _: controller.finish(name, finished)
             )
 
         async def rename(code: str) -> None:
-            message = words("record.renamed", name=name, code=code)
+            message = words("{name} now belongs to {code}.", name=name, code=code)
             await self._change(
                 lambda: controller.rename_person(name, code),
                 message,
@@ -173,17 +210,17 @@ class _SessionLists:
             )
 
         async def discard() -> None:
-            message = words("shell.discarded", name=name)
+            message = words("“{name}” is discarded. It can be restored on the home page.", name=name)
             await self._change(lambda: controller.discard(name), message, self._page.workspace.restore)
 
         def ask_code() -> None:
-            title = words("record.rename_title", name=name)
-            ask(words, title, words("record.rename_go"), rename, words("record.code"), subject)
+            title = words("The code of the person in {name}", name=name)
+            ask(words, title, words("Change the code"), rename, words("Code of the person"), subject)
 
         actions = {
-            words("record.reopen_session" if finished else "record.finish"): finish,
-            words("record.rename"): ask_code,
-            words("shell.discard"): discard,
+            words("Not finished yet" if finished else "Finished for this child"): finish,
+            words("Correct the person's code"): ask_code,
+            words("Discard"): discard,
         }
         item_menu(words, name, actions)
 
@@ -209,7 +246,7 @@ async def _open_session(
         refused: shows an error beside the field that it is about; if it returns False, the error is shown as a message.
     """
     begin.disable()
-    page.say(page.words("record.opening"))
+    page.say(page.words("Opening the toy …"))
     try:
         with page.show_errors():
             try:
@@ -231,7 +268,7 @@ class _Form:
     def __init__(self, page: Page, controller: RecordController) -> None:
         self._page, self._controller, words = page, controller, page.words
         with tag(ui.column().classes("ps-card w-full"), "new-session"):
-            html(words("record.new"), "h2")
+            html(words("New session"), "h2")
             with ui.row().classes("w-full items-start"):
                 self._subject = self._input("code", "code_hint")
                 self._consent = self._input("consent", "consent_hint")
@@ -241,30 +278,35 @@ class _Form:
                 self._protocol = self._select(self._titles(), "protocol", PROTOCOL)
                 self._protocol.on_value_change(self._choose_words)
                 self._words = self._select({DEFAULT: DEFAULT}, "wording", DEFAULT)
-                self._discard = button("discard-protocol", words("record.discard_protocol"), self._discard_protocol)
+                self._discard = button("discard-protocol", words("Discard this list"), self._discard_protocol)
             ProtocolForm(page, controller, lambda path: self._list_protocols(str(path)))
             with ui.row().classes("w-full items-start"):
                 self._toy = ToyChoice(page, controller.toys())
             with ui.element("details").classes("w-full"):
-                summary(words("record.more"))
+                summary(words("More settings"))
                 with ui.column():
-                    layouts = {"": words("record.layout_usual")} | controller.layouts()
+                    layouts = {"": words("Default (plush-15)")} | controller.layouts()
                     self._layout = self._select(layouts, "layout", "")
-                    self._simulated = ui.checkbox(words("record.is_virtual"))
-                    self._anew = ui.checkbox(words("record.anew"))
-                    self._mark = tag(ui.checkbox(words("record.mark_first")), "mark-first")
-                    self._lsl = tag(ui.checkbox(words("record.lsl")), "lsl")
+                    self._simulated = ui.checkbox(words("This is a virtual toy: mark the recordings as a simulation"))
+                    self._anew = ui.checkbox(words("Begin a new session even if the person's last one is unfinished"))
+                    self._mark = tag(
+                        ui.checkbox(words("Mark the moment of the first start for the video (white flash and tone)")),
+                        "mark-first",
+                    )
+                    self._lsl = tag(
+                        ui.checkbox(words("Send markers of the recordings by LSL (for LabRecorder)")), "lsl"
+                    )
                     self._lsl.set_visibility(find_spec("pylsl") is not None)
-            self._begin = button("begin", words("record.begin"), self._begin_session, "unelevated size=lg")
+            self._begin = button("begin", words("Begin the session"), self._begin_session, "unelevated size=lg")
         self._choose_words()
 
     def _input(self, key: str, hint: str) -> ui.input:
         words = self._page.words
-        field = ui.input(label=words(f"record.{key}")).props(f'outlined hint="{words(f"record.{hint}")}"')
+        field = ui.input(label=words(_LABELS[key])).props(f'outlined hint="{words(_HINTS[hint])}"')
         return tag(field, key).classes("w-64")
 
     def _select(self, options: dict[str, str], key: str, value: str) -> ui.select:
-        label = self._page.words(f"record.{key}")
+        label = self._page.words(_LABELS[key])
         value = value if value in options else next(iter(options))
         field = ui.select(options, value=value, label=label).props("outlined")
         named(field, label)
@@ -272,7 +314,7 @@ class _Form:
 
     def _titles(self) -> dict[str, str]:
         words = self._page.words
-        return {key: words.get(f"record.protocol_{key}", name) for key, name in self._controller.protocols().items()}
+        return {key: words(PROTOCOLS.get(key, name)) for key, name in self._controller.protocols().items()}
 
     def _list_protocols(self, chosen: str = PROTOCOL) -> None:
         self._protocol.set_options(self._titles(), value=chosen)
@@ -284,7 +326,7 @@ class _Form:
         async def refresh() -> None:
             self._list_protocols(str(chosen) if chosen.is_file() else PROTOCOL)
 
-        message = self._page.words("shell.discarded", name=chosen.stem)
+        message = self._page.words("“{name}” is discarded. It can be restored on the home page.", name=chosen.stem)
         await change_files(self._page, lambda: workspace.discard(chosen), message, refresh, workspace.restore)
 
     def _choose_words(self) -> None:
@@ -298,7 +340,7 @@ class _Form:
             known = (DEFAULT,)
         language = self._page.words.language
         value = language if language in known else DEFAULT
-        self._words.set_options({w: self._page.words.get(f"record.wording_{w}", w) for w in known}, value=value)
+        self._words.set_options({w: self._page.words(_WORDINGS.get(w, w)) for w in known}, value=value)
 
     def _request(self) -> SessionRequest:
         toy = self._toy.url

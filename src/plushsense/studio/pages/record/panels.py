@@ -11,9 +11,29 @@ from nicegui import ui
 
 from plushsense.recording.status import RecorderStatus
 from plushsense.studio.app.shell import LINES, Page, button, named, on_click, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.record.controller import ActiveSession
 from plushsense.studio.widgets.elements import Plot, summary
+
+_KINDS: Texts = {
+    "capacitive": "Touch",
+    "proximity": "Proximity",
+    "acceleration": "Acceleration",
+}
+
+_STEPS: Texts = {
+    "made": "recorded",
+    "skipped": "skipped",
+    "open": "not recorded yet",
+}
+
+_SIGNALS: Texts = {
+    "good": "Good",
+    "fair": "Fair: bring the toy nearer",
+    "poor": "Poor: bring the toy nearer, check its battery",
+    "none": "None: the toy sends nothing",
+    "unreadable": "Unreadable: the toy sends lines that are not frames",
+}
 
 _WINDOW_S = 10.0
 # Figures that change faster cannot be read.
@@ -35,7 +55,7 @@ _SIGNAL_STYLES = {
 def percent(share: float, words: Words) -> str:
     """Format a share (0 to 1) in per cent, with one decimal place if it is below ten per cent."""
     text = words.number(100 * share, 1 if share < 0.1 else 0)
-    return text.removesuffix(f"{words('shell.decimal_point')}0")
+    return text.removesuffix(f"{words.decimal_point}0")
 
 
 class SignalPanel:
@@ -46,13 +66,13 @@ class SignalPanel:
         words = page.words
         with ui.column().classes("ps-current ps-card w-full").style("gap: 6px"):
             with ui.row().classes("items-center w-full").style("gap: 4px 16px"):
-                ui.label(words("record.signal")).classes("text-bold")
+                ui.label(words("Signal")).classes("text-bold")
                 self._quality = tag(ui.label(), "signal").classes("q-px-md q-py-xs rounded-borders text-bold")
                 self._lost = tag(ui.label(), "lost")
                 self._rate = tag(ui.label(), "rate")
             self._counters = tag(ui.label(), "counters").classes("ps-dim")
             with tag(ui.element("details").props("open").classes("w-full"), "live"):
-                summary(words("record.live"))
+                summary(words("Sensor signals"))
                 self._plots = self._build(max(1.0, session.request.speed))
         rate = self._device.layout.rate_hz * max(1.0, session.request.speed)
         self._place = max(0, self._device.buffer.count - int(_WINDOW_S * rate))
@@ -67,9 +87,11 @@ class SignalPanel:
         plots = []
         with ui.row().classes("w-full items-start").style("gap: 8px"):
             for kind, indices in kinds.items():
-                title = words.get(f"record.kind_{kind}", kind)
+                title = words(_KINDS.get(kind, kind))
                 names = [words.channel(channels[n].name) for n in indices]
-                label = words("record.live_label", s=f"{_WINDOW_S * speed:g}", channels=", ".join(names))
+                label = words(
+                    "The last {s} seconds of: {channels}", s=f"{_WINDOW_S * speed:g}", channels=", ".join(names)
+                )
                 series = [{"label": name, "stroke": LINES[i % len(LINES)]} for i, name in enumerate(names)]
                 flex = "2 1 420px" if len(indices) > 5 else "1 1 260px"
                 with ui.column().classes("ps-no-gap").style(f"flex: {flex}; min-width: 0"):
@@ -77,7 +99,7 @@ class SignalPanel:
                     plot = Plot(
                         label,
                         series,
-                        x=words("record.live_x"),
+                        x=words("Time of the toy (s)"),
                         y=words.unit(channels[indices[0]].unit),
                         height=190,
                         window_s=_WINDOW_S * speed,
@@ -95,15 +117,24 @@ class SignalPanel:
         if changed:
             self._drawn_signal = s.signal
             sign, colour = _SIGNAL_STYLES[s.signal]
-            self._quality.text = f"{sign} {words(f'record.signal_{s.signal}')}"
+            self._quality.text = f"{sign} {words(_SIGNALS[s.signal])}"
             self._quality.style(f"background: {colour}; color: #fff").props(f'data-signal="{s.signal}"')
         shares = {"recent": percent(s.bad_share, words), "ever": percent(s.bad_share_total, words)}
         # Without a signal, these figures are meaningless.
         has_signal = s.signal not in ("none", "unreadable")
-        self._lost.text = words("record.signal_lost", **shares) if has_signal else ""
-        self._rate.text = words("record.signal_rate", rate=f"{s.rate_hz:.0f}") if has_signal else ""
+        self._lost.text = (
+            words(
+                "{recent} % of frames lost or damaged in the last 10 s, {ever} % since the session was opened", **shares
+            )
+            if has_signal
+            else ""
+        )
+        self._rate.text = words("{rate} frames a second", rate=f"{s.rate_hz:.0f}") if has_signal else ""
         counts = {k: getattr(s, k) for k in ("lost", "malformed", "garbage", "gaps", "reconnects")}
-        self._counters.text = words("record.signal_more", **counts)
+        self._counters.text = words(
+            "lost {lost} · unreadable {malformed} · out of range {garbage} · gaps {gaps} · reconnected {reconnects}",
+            **counts,
+        )
 
     def push(self) -> None:
         """Append new samples to the plots, at most every `_PLOTS_S`."""
@@ -141,9 +172,9 @@ class StepList:
         words = page.words
         steps = session.recorder.steps()
         with tag(ui.element("details").classes("ps-card w-full"), "steps"):
-            summary(words("record.steps"))
+            summary(words("All recordings: go to one"))
             if len(steps) > _MAX_STEPS:
-                ui.label(words("record.steps_many"))
+                ui.label(words("There are too many recordings to list. Press b to go back and s to skip."))
                 return
             rows: dict[str, list[int]] = {}
             for result in steps:
@@ -174,9 +205,9 @@ class StepList:
             if self._states[n] == key:
                 continue
             self._states[n] = key
-            text = words(f"record.step_{state}") + (f", {words('record.step_now')}" if now else "")
+            text = words(_STEPS[state]) + (f", {words('now')}" if now else "")
             step = result.step
-            repetition = words("record.repetition", n=step.repetition, m=status.repetitions)
+            repetition = words("{n} of {m}", n=step.repetition, m=status.repetitions)
             signs = _SIGNS[state] + (f" {_SIGNS['now']}" if now else "")
             self._buttons[n].text = f"{step.repetition} {signs}"
             label = f"{words.gesture(step.gesture)}, {repetition}: {text}"

@@ -22,8 +22,15 @@ from plushsense.recording.status import RecorderStatus
 from plushsense.recording.takes import duration_s
 from plushsense.reports.quality_figures import line
 from plushsense.studio.app.shell import Page, html, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.record.controller import ActiveSession
+
+_LENGTHS: Texts = {
+    "usual": "{gesture}, {n}: {s} s, a usual length (mean {usual} s)",
+    "short": "{gesture}, {n}: {s} s, TOO SHORT (mean {usual} s)",
+    "long": "{gesture}, {n}: {s} s, TOO LONG (mean {usual} s)",
+    "first": "{gesture}, {n}: {s} s; there is no earlier recording of this gesture to compare it with",
+}
 
 _HEIGHT, _WIDTH = 44, 180
 
@@ -115,7 +122,7 @@ class ResultPanel:
             self._picture = html()
             with ui.column().classes("ps-no-gap ps-result-text"):
                 self._text = tag(ui.label(), "result-text").classes("text-bold").props('role="status"')
-                ui.label(page.words("record.again_key")).classes("ps-dim")
+                ui.label(page.words("r makes it again; the earlier one stays in the folder.")).classes("ps-dim")
                 self._last = tag(ui.label(), "last").classes("ps-dim ps-note ps-break")
         self._box.set_visibility(False)
 
@@ -136,11 +143,13 @@ class ResultPanel:
         words = self._page.words
         self._text.text = _sentence(words, result)
         self._text.props(f'data-length="{result.length}"')
-        self._last.text = words("record.last", file=file)
-        self._picture.content = _drawing(result, words("record.signal_of", gesture=words.gesture(result.gesture)))
+        self._last.text = words("Last: {file}", file=file)
+        self._picture.content = _drawing(
+            result, words("Signal of the last recording: {gesture}", gesture=words.gesture(result.gesture))
+        )
         self._box.set_visibility(True)
 
 
 def _sentence(words: Words, result: RecordingResult) -> str:
     values = {"gesture": words.gesture(result.gesture), "n": result.repetition, "s": words.number(result.seconds, 1)}
-    return words(f"record.length_{result.length}", usual=words.number(result.usual_s, 1), **values)
+    return words(_LENGTHS[result.length], usual=words.number(result.usual_s, 1), **values)

@@ -15,12 +15,45 @@ from plushsense.recording.session_files import SessionHead
 from plushsense.recording.status import RecorderStatus
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs
 from plushsense.studio.app.shell import Keys, Page, address, button, focus, html, named, on_change, on_click, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.record.child import CHILD, ConnectionAlert, gesture_picture, style
-from plushsense.studio.pages.record.choices import ToyChoice
+from plushsense.studio.pages.record.choices import PROTOCOLS, ToyChoice
 from plushsense.studio.pages.record.controller import ActiveSession, RecordController
 from plushsense.studio.pages.record.panels import SignalPanel, StepList
 from plushsense.studio.pages.record.result import ResultPanel
+
+_STATES: Texts = {
+    "countdown": "GET READY",
+    "saving": "SAVING …",
+    "paused": "PAUSED. Press p or the big button to continue",
+    "finished": "ALL DONE",
+    "stopped": "STOPPED",
+}
+
+_MAIN: Texts = {
+    "start": "Start",
+    "cancel": "Cancel",
+    "stop": "Stop",
+    "wait": "Saving …",
+    "resume": "Continue",
+    "end": "End the session",
+    "reopen": "Open it again",
+}
+
+_SMALL: Texts = {
+    "redo": "Record the last one again",
+    "skip": "Skip",
+    "back": "Back",
+    "pause": "Pause",
+}
+
+_NOTICES: Texts = {
+    "no_consent": "There is no consent number. The recordings are marked, and publishing will refuse them.",
+    "pseudo": (
+        "This port is a pseudo terminal. If a virtual toy is behind it, end the session and begin one that is marked "
+        "as a simulation."
+    ),
+}
 
 
 def collect(page: Page, folder: Path) -> None:
@@ -29,16 +62,20 @@ def collect(page: Page, folder: Path) -> None:
     head = SessionHead.read(folder)
     if head is None:
         raise DatasetError(f"'{folder}' holds no session.", reason="session_missing", name=folder.name)
-    place = page.workspace.dataset_for(str(head.layout["name"]), head.simulated, words("home.new_dataset"))
+    place = page.workspace.dataset_for(str(head.layout["name"]), head.simulated, words("recordings"))
     name = page.workspace.title(place)
-    job = jobs.import_sessions([folder], place, words("home.import_title", name=name))
-    page.say(words("record.collecting", name=name))
+    job = jobs.import_sessions([folder], place, words("Import into the data set “{name}”", name=name))
+    page.say(words("The recordings go into the data set “{name}” …", name=name))
 
     def follow() -> None:
         if job.state == DONE:
             ui.navigate.to(address("review", dataset=place))
         elif job.state != RUNNING:
-            page.say(words.explain(job.message, job.reason, job.values) or words("record.not_collected"), "error")
+            page.say(
+                words.explain(job.message, job.reason, job.values)
+                or words("The recordings were not put into a data set: try it again on the home page."),
+                "error",
+            )
 
     on_change(jobs.changed, follow)
 
@@ -61,7 +98,7 @@ class Sounds(Element, component="sounds.js"):
     def __init__(self, words: Words, session: ActiveSession) -> None:
         super().__init__()
         self._session = session
-        texts = {"on": words("record.sound_on"), "off": words("record.sound_off"), "mark": words("record.mark")}
+        texts = {"on": words("Sound: on"), "off": words("Sound: off"), "mark": words("Mark for the video")}
         self._props.update(texts=texts, beat="", mark_first=session.mark_first)
         self.on("mark", self._mark)
 
@@ -93,16 +130,20 @@ def _state_text(page: Page, s: RecorderStatus) -> tuple[str, str]:
     words = page.words
     if s.state == "idle":
         if s.signal in ("none", "unreadable"):
-            return words("record.waiting" if s.signal == "none" else "record.unreadable"), _RED
-        return words("record.ready"), _BLUE
+            return words(
+                "WAITING FOR THE TOY. Switch it on and bring it near"
+                if s.signal == "none"
+                else "THE TOY CANNOT BE READ. Check the chosen layout and the cable"
+            ), _RED
+        return words("READY. Press the space bar or the big button, then wait for the countdown"), _BLUE
     if s.state == "recording":
         if s.away:
-            return words("record.recording_away"), _RED
+            return words("RECORDING, BUT THE TOY IS AWAY. Check the cable and the battery"), _RED
         if s.left_s < _REMIND_S and s.elapsed_s > _REMIND_S:
-            return words("record.recording_long", s=f"{s.left_s:.0f}"), _RED
-        return words("record.recording"), _GREEN
+            return words("STILL RECORDING. Press to stop; it stops by itself in {s} s", s=f"{s.left_s:.0f}"), _RED
+        return words("RECORDING. Press again when the gesture is over"), _GREEN
     colours = {"countdown": _AMBER, "saving": _BLUE, "paused": _GREY, "finished": _GREEN, "stopped": _RED}
-    return words(f"record.{s.state}"), colours[s.state]
+    return words(_STATES[s.state]), colours[s.state]
 
 
 class _View:
@@ -117,11 +158,13 @@ class _View:
         words, head = page.words, session.head
         self._keys = Keys(_KEYS, self._key_pressed, {"n": '[name="note"]'}, _ALIASES)
         with ui.row().classes("w-full items-center").style("gap: 2px 16px"):
-            ui.label(words("record.session", subject=head.subject, session=head.session)).classes("text-bold")
-            title = words.get(f"record.protocol_{head.protocol['name']}", head.protocol["title"])
+            ui.label(words("{subject}, session {session}", subject=head.subject, session=head.session)).classes(
+                "text-bold"
+            )
+            title = words(PROTOCOLS.get(head.protocol["name"], head.protocol["title"]))
             ui.label(title).classes("ps-dim")
             if head.simulated:
-                tag(ui.label(words("record.simulated")).classes("ps-simulated"), "simulation")
+                tag(ui.label(words("simulation")).classes("ps-simulated"), "simulation")
         with ui.element("div").classes("ps-step"):
             self._picture = tag(html().classes("ps-step-picture"), "picture")
             self._prompts()
@@ -137,20 +180,30 @@ class _View:
         with ui.row().classes("w-full items-center"):
             self._sounds = Sounds(words, session)
             child = address("record", session=session.name, view=CHILD)
-            tag(ui.link(words("record.child_screen"), child, new_tab=True).classes("ps-link"), "child-link")
-        ui.label(words("record.keys")).classes("ps-dim")
+            tag(
+                ui.link(words("Screen for the child (new window)"), child, new_tab=True).classes("ps-link"),
+                "child-link",
+            )
+        ui.label(
+            words(
+                "Keys: space (or Page Down or Enter: a clicker or a pedal) starts and stops, r (or Page Up) makes "
+                "the last one again, s skips, b goes back, p pauses, n writes a note"
+            )
+        ).classes("ps-dim")
 
     def _progress_row(self) -> None:
         with ui.column().classes("w-full").style("gap: 4px"):
             self._progress = tag(ui.label(), "progress").classes("text-bold")
             self._bar = ui.element("progress").classes("w-full").style("height: 14px; accent-color: #00805c")
-            named(self._bar, self._page.words("record.progress", done="", steps=""))
+            named(self._bar, self._page.words("{done} of {steps} recorded", done="", steps=""))
             self._next = tag(ui.label(), "next").classes("ps-dim")
 
     def _notices(self) -> None:
         words = self._page.words
-        notices = [words(f"record.{key}") for key in self._session.notices]
-        notices += [words("record.mended", what=words.sentence(repair)) for repair in self._session.repairs]
+        notices = [words(_NOTICES[key]) for key in self._session.notices]
+        notices += [
+            words("Repaired after a crash: {what}.", what=words.sentence(repair)) for repair in self._session.repairs
+        ]
         for text in notices:
             box = ui.row().classes("ps-message ps-message-warning w-full").props('role="status"')
             with tag(box, "notice"):
@@ -183,25 +236,30 @@ class _View:
             on_click(self._main, self._main_clicked, once=True)
             self._small: dict[str, ui.button] = {}
             for key, name in {"r": "redo", "s": "skip", "b": "back", "p": "pause"}.items():
-                self._small[key] = button(name, words(f"record.{name}")).style("min-height: 48px")
+                self._small[key] = button(name, words(_SMALL[name])).style("min-height: 48px")
                 on_click(self._small[key], partial(self._press, key))
-            self._change_toy = button("change-toy", words("record.change_toy"), self._ask_toy, "flat")
+            self._change_toy = button("change-toy", words("Another toy"), self._ask_toy, "flat")
             # The space bar must not start a recording where it seems to press this button.
-            self._end_button = button("end", words("record.end"), self._ask_end, "flat data-own-keys")
+            self._end_button = button("end", words("End the session"), self._ask_end, "flat data-own-keys")
             for late in (self._change_toy, self._end_button):
                 late.style("min-height: 48px")
         ending = ui.row().classes("ps-message ps-message-warning w-full items-center").props("data-own-keys")
         with tag(ending, "ending") as self._ending:
             self._end_text = ui.label().classes("flex-grow")
-            button("end-yes", words("record.end_yes"), self._end, "unelevated", color="deep-orange-10")
-            self._no = button("end-no", words("record.end_no"), self._stay, color=None)
+            button("end-yes", words("End it"), self._end, "unelevated", color="deep-orange-10")
+            self._no = button("end-no", words("Stay"), self._stay, color=None)
         exchange = ui.row().classes("ps-card w-full items-start").props("data-own-keys")
         with tag(exchange, "exchange") as self._exchange:
-            ui.label(words("record.change_toy_hint")).classes("w-full")
+            ui.label(
+                words(
+                    "The session goes on with another toy of the same sensor layout. It is tried first. Everything "
+                    "recorded is kept."
+                )
+            ).classes("w-full")
             urls = list(dict.fromkeys([*self._controller.toys(), self._session.request.device]))
             self._toy = ToyChoice(self._page, urls, "exchange-")
-            self._go_on = button("exchange-go", words("record.change_toy_go"), self._exchange_toy, "unelevated")
-            button("exchange-no", words("shell.cancel"), lambda: self._exchange.set_visibility(False), "flat")
+            self._go_on = button("exchange-go", words("Go on with this toy"), self._exchange_toy, "unelevated")
+            button("exchange-no", words("Cancel"), lambda: self._exchange.set_visibility(False), "flat")
         for box in (self._ending, self._exchange):
             box.set_visibility(False)
 
@@ -210,18 +268,18 @@ class _View:
         self._done = tag(ui.column().classes("ps-card w-full"), "all-done")
         with self._done:
             self._done_text = ui.label().classes("text-bold").style("overflow-wrap: anywhere")
-            ui.label(words("record.what_next"))
+            ui.label(words("Next: look at the recordings. This ends the session and puts them into a data set."))
             with ui.row().classes("items-center"):
-                button("collect", words("record.collect"), self._collect, "unelevated")
-                ui.link(words("record.to_home"), "/").classes("ps-link")
+                button("collect", words("Look at the recordings"), self._collect, "unelevated")
+                ui.link(words("Go to the home page"), "/").classes("ps-link")
         self._done.set_visibility(False)
 
     def _note_row(self) -> None:
         words = self._page.words
         with ui.row().classes("w-full items-center no-wrap"):
-            self._note = tag(ui.input(label=words("record.note")).props("maxlength=500 name=note"), "note")
+            self._note = tag(ui.input(label=words("Note")).props("maxlength=500 name=note"), "note")
             self._note.classes("flex-grow").on("keydown.enter", self._store_note)
-            button("keep-note", words("record.keep_note"), self._store_note)
+            button("keep-note", words("Save the note"), self._store_note)
 
     # Commands -------------------------------------------------------------------------------------------------
 
@@ -235,7 +293,13 @@ class _View:
             if self._session.press(key, seen):
                 self._page.say("")
             else:
-                self._page.say(self._page.words("record.late"), "warning")
+                self._page.say(
+                    self._page.words(
+                        "The press came too late: the state had changed already. Look, and press again if you still "
+                        "want to."
+                    ),
+                    "warning",
+                )
         self.draw()
 
     async def _main_clicked(self, seen: str) -> None:
@@ -257,7 +321,11 @@ class _View:
     def _ask_end(self) -> None:
         words = self._page.words
         recording = self._session.recorder.status().state == "recording"
-        self._end_text.text = words("record.end_running" if recording else "record.end_really")
+        self._end_text.text = words(
+            "A recording is running. Ending the session discards it."
+            if recording
+            else "End the session? All recordings are saved, and you can continue at any time."
+        )
         self._ending.set_visibility(True)
         focus(self._no)
 
@@ -272,7 +340,7 @@ class _View:
     async def _exchange_toy(self) -> None:
         words = self._page.words
         self._go_on.disable()
-        self._page.say(words("record.opening"))
+        self._page.say(words("Opening the toy …"))
         try:
             await run.io_bound(self._controller.exchange, self._session.name, self._toy.url)
         except PlushSenseError as error:
@@ -309,7 +377,7 @@ class _View:
             await run.io_bound(self._controller.resume, self._session.name, self._session.request.device)
             ui.navigate.to(address("record", session=self._session.name))
             return
-        self._main.text = self._page.words("record.all_sessions")
+        self._main.text = self._page.words("All sessions")
 
     # Drawing --------------------------------------------------------------------------------------------------
 
@@ -343,37 +411,43 @@ class _View:
 
     def _draw_plan(self, s: RecorderStatus) -> None:
         words = self._page.words
-        counts = [words("record.progress", done=s.done, steps=s.steps)]
-        counts += [words("record.skipped_too", n=s.skipped)] if s.skipped else []
-        counts += [words("record.redone_too", n=s.redone)] if s.redone else []
+        counts = [words("{done} of {steps} recorded", done=s.done, steps=s.steps)]
+        counts += [words("{n} skipped", n=s.skipped)] if s.skipped else []
+        counts += [words("{n} recorded again", n=s.redone)] if s.redone else []
         if self._progress.text != (text := ", ".join(counts)):
             self._progress.text = text
             self._bar.props(f'max="{s.steps}" value="{s.done + s.skipped}"')
         text = ""
         if (following := s.next_step) is not None and s.state not in ("finished", "stopped"):
             gesture = words.gesture(following.gesture)
-            text = words("record.next", gesture=gesture, n=following.repetition, m=s.repetitions)
+            text = words("Next: {gesture}, {n} of {m}", gesture=gesture, n=following.repetition, m=s.repetitions)
         # Every change of an element renders the whole page again, also one that is taken back.
         self._next.text = text
         if self._gesture != s.step.gesture:
             self._gesture = s.step.gesture
             self._name.content = words.gesture(s.step.gesture)
             self._picture.content = gesture_picture(self._page, s.step.gesture)
-        self._repetition.text = words("record.repetition", n=s.step.repetition, m=s.repetitions)
+        self._repetition.text = words("{n} of {m}", n=s.step.repetition, m=s.repetitions)
         self._prompt.text = s.step.prompt
         for element in (self._picture, self._name, self._repetition, self._prompt):
             element.set_visibility(s.state != "finished")
-        self._again.text = words("record.again") if s.existing and s.state != "finished" else ""
+        self._again.text = (
+            words("This gesture is recorded already. A new recording replaces it.")
+            if s.existing and s.state != "finished"
+            else ""
+        )
         self._steps.draw(s)
 
     def _lost_text(self, s: RecorderStatus) -> str:
         """Return what to display if the connection is lost: what is kept, and what must be made again."""
         words = self._page.words
-        texts = [words("record.lost", done=s.done, steps=s.steps)]
+        texts = [
+            words("CONNECTION LOST, NOT RECORDING. Kept: {done} of {steps} recordings.", done=s.done, steps=s.steps)
+        ]
         if s.state in ("countdown", "recording"):
             gesture, repetition = words.gesture(s.step.gesture), self._repetition.text
-            texts.append(words("record.lost_again", gesture=gesture, repetition=repetition))
-        return " ".join([*texts, words("record.lost_then")])
+            texts.append(words("To be made again: {gesture}, {repetition}.", gesture=gesture, repetition=repetition))
+        return " ".join([*texts, words("Continue when this page shows the session again.")])
 
     def _draw_state(self, s: RecorderStatus) -> None:
         words, state = self._page.words, s.state
@@ -382,7 +456,7 @@ class _View:
         if state == "countdown":
             number = f"{math.ceil(s.countdown_s)}"
         elif state == "recording":
-            number = words("record.seconds", s=words.number(s.elapsed_s, 1))
+            number = words("{s} s", s=words.number(s.elapsed_s, 1))
         self._number.text, self._state.text = number, text
         self._number.set_visibility(bool(number))
         if self._message.text != (message := words.sentence(s.message)):
@@ -392,10 +466,12 @@ class _View:
         self._box.props(f'data-state="{state}"')
         main = {"idle": "start", "countdown": "cancel", "recording": "stop", "saving": "wait", "paused": "resume"}
         main |= {"finished": "end", "stopped": "reopen"}
-        self._main.text = words(f"record.{main[state]}")
+        self._main.text = words(_MAIN[main[state]])
         self._main.style(f"background: {colour} !important; color: #fff !important")
-        self._small["r"].text = words("record.break_off" if state == "recording" else "record.redo")
-        self._small["p"].text = words("record.break_off_pause" if state == "recording" else "record.pause")
+        self._small["r"].text = words(
+            "Discard and record again" if state == "recording" else "Record the last one again"
+        )
+        self._small["p"].text = words("Discard and pause" if state == "recording" else "Pause")
         self._small["p"].set_visibility(state not in ("paused", "finished", "stopped"))
         self._small["s"].set_visibility(state not in ("finished", "stopped"))
         for key in "rb":
@@ -407,7 +483,12 @@ class _View:
         if state == "finished":
             folder = str(self._session.recorder.session.folder.relative_to(self._page.workspace.folder))
             counts = {"done": s.done, "skipped": s.skipped, "redone": s.redone}
-            self._done_text.text = words("record.all_done", folder=folder, **counts)
+            self._done_text.text = words(
+                "All done: {done} recorded, {skipped} skipped, {redone} recorded again. The recordings are in "
+                "{folder}.",
+                folder=folder,
+                **counts,
+            )
         self._done.set_visibility(state == "finished")
         step = f"{words.gesture(s.step.gesture)}, {self._repetition.text}. {s.step.prompt}. "
         announcement = (step if state == "idle" else "") + text

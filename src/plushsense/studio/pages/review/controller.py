@@ -17,7 +17,56 @@ from plushsense.core.errors import PlushSenseError
 from plushsense.dataset.quality.checking import CHECKS, author_name
 from plushsense.dataset.quality.findings import SEVERITIES
 from plushsense.studio.app.shell import Page, address, button, on_change, set_address, tag
-from plushsense.studio.pages.review.review import EXCLUDED, LABELLED, LOOKING, STATES, Review, ReviewedRecording
+from plushsense.studio.app.words import Texts
+from plushsense.studio.pages.review.review import (
+    CHECK_NAMES,
+    EXCLUDED,
+    LABELLED,
+    LOOKING,
+    STATE_TEXTS,
+    STATES,
+    Review,
+    ReviewedRecording,
+)
+
+_VIEWS: Texts = {
+    "table": "Table",
+    "one": "One by one",
+    "overlay": "Overlay",
+    "stream": "Streams",
+    "durations": "Durations",
+}
+
+_SEVERITIES: Texts = {
+    "error": "✖ to decide",
+    "warning": "▲ to look at, or more urgent",
+    "info": "ℹ any finding",
+}
+
+_FILTERS: Texts = {
+    "person": "Person",
+    "gesture": "Gesture",
+    "state": "State",
+    "severity": "Urgency",
+    "check": "Check",
+}
+
+_DID: Texts = {
+    "trim": "trim",
+    "untrim": "removing the trim",
+    "exclude": "excluding",
+    "include": "including again",
+    "accept": "accepting a finding",
+    "unaccept": "reopening a finding",
+    "label": "labelling a stretch",
+    "unlabel": "removing labels",
+    "relabel": "setting another gesture",
+}
+
+_MAKING: Texts = {
+    "suggestions": "Looking for starts: {done} of {of}. You can begin already.",
+    "checks": "Checking: {done} of {of} files.",
+}
 
 TABLE, ONE, OVERLAY, DURATIONS, STREAM = "table", "one", "overlay", "durations", "stream"
 VIEWS = (TABLE, ONE, OVERLAY, DURATIONS, STREAM)
@@ -173,7 +222,14 @@ class ReviewController:
         if not self._query.get("selection"):
             self._query |= {"title": title}
         if missing := [i for i in only if i not in self.only]:
-            self.page.say(self.words("review.not_there", n=len(missing), first=missing[0]), "warning")
+            self.page.say(
+                self.words(
+                    "Linked recordings that are not in this data set: {n}, for example “{first}”.",
+                    n=len(missing),
+                    first=missing[0],
+                ),
+                "warning",
+            )
 
     # Building -----------------------------------------------------------------------------------------------------
 
@@ -183,20 +239,33 @@ class ReviewController:
         with ui.row().classes("w-full items-center ps-small-gap"):
             tag(ui.label(review.dataset.head.name).classes("text-lg text-bold"), "name")
             if review.dataset.head.simulated:
-                tag(ui.label(words("shell.simulation")).classes("ps-message ps-message-warning"), "simulation")
+                tag(
+                    ui.label(words("Simulation: these data say nothing about a real toy.")).classes(
+                        "ps-message ps-message-warning"
+                    ),
+                    "simulation",
+                )
             self.counts = tag(ui.label().props("role=status"), "counts")
             self.making = tag(ui.label().classes("ps-dim").props("role=status"), "making")
             ui.space()
-            self.who = ui.input(words("review.who"), value=self._who(), on_change=lambda e: self._keep_who(e.value))
+            self.who = ui.input(words("Your name"), value=self._who(), on_change=lambda e: self._keep_who(e.value))
             tag(self.who.props("outlined dense").style("width: 170px"), "who")
-            to_train = ui.link(words("review.to_train"), address("train", dataset=review.path)).classes("ps-link")
+            to_train = ui.link(words("Next: train →"), address("train", dataset=review.path)).classes("ps-link")
             tag(to_train, "to-train")
         if review.is_labelled:
-            tag(ui.label(words("review.labelled")).classes("ps-message ps-message-info w-full"), "labelled")
+            tag(
+                ui.label(
+                    words(
+                        "These recordings are cut where the label of the rows changes, so they cannot be trimmed. "
+                        "Findings and exclusion work as usual."
+                    )
+                ).classes("ps-message ps-message-info w-full"),
+                "labelled",
+            )
         with ui.row().classes("w-full items-center ps-small-gap"):
             shown = [v for v in VIEWS if v != STREAM or self.streams]
-            toggle = ui.toggle({v: words(f"review.view_{v}") for v in shown}, value=self.view)
-            toggle.props(f'no-caps unelevated aria-label="{words("review.view")}"').classes("ps-toggle ps-wrap")
+            toggle = ui.toggle({v: words(_VIEWS[v]) for v in shown}, value=self.view)
+            toggle.props(f'no-caps unelevated aria-label="{words("View")}"').classes("ps-toggle ps-wrap")
             self.toggle = tag(toggle, "view")
             self.toggle.on_value_change(lambda e: self.turn_to(str(e.value)))
             self._fold = button("filters", "", self._fold_filters, "outline", icon="filter_list")
@@ -208,8 +277,10 @@ class ReviewController:
         self._label_fold()
         if self.only is not None:
             with tag(ui.row().classes("w-full items-center ps-message ps-message-info"), "selection"):
-                ui.label(words("review.selection", n=len(self.only), title=self.title or "")).classes("flex-grow")
-                ui.link(words("review.show_all"), address("review", dataset=review.path)).style("color: inherit")
+                ui.label(
+                    words("Only the linked recordings ({n}). {title}", n=len(self.only), title=self.title or "")
+                ).classes("flex-grow")
+                ui.link(words("Show all"), address("review", dataset=review.path)).style("color: inherit")
         # Out of the flow, so that it leaves no gap.
         self.page_slot = ui.element("div").style("position: absolute")
         self.views = {name: view(self) for name, view in views.items()}
@@ -225,20 +296,20 @@ class ReviewController:
         options: dict[str, dict[str, str]] = {
             "person": {p: self.person(p) for p in sorted({r.info.subject for r in rows})},
             "gesture": {g: words.gesture(g) for g in self.review.gestures()},
-            "state": {s: words(f"review.state_{s}") for s in states},
+            "state": {s: words(STATE_TEXTS[s]) for s in states},
             "severity": {
-                **{s: words(f"review.from_{s}") for s in SEVERITIES},
-                NO_FINDING: words("review.no_finding"),
+                **{s: words(_SEVERITIES[s]) for s in SEVERITIES},
+                NO_FINDING: words("no finding"),
             },
-            "check": {c: words.get(f"checks.{c}", c) for c in CHECKS if "recording" in CHECKS[c].scope},
+            "check": {c: words(CHECK_NAMES.get(c, c)) for c in CHECKS if "recording" in CHECKS[c].scope},
         }
         self._fields: dict[str, Any] = {}
         for key, choices in options.items():
             value = getattr(self.filter, key)
-            field = ui.select(choices, value=value if value in choices else None, label=words(f"review.{key}"))
+            field = ui.select(choices, value=value if value in choices else None, label=words(_FILTERS[key]))
             field.props("outlined dense clearable options-dense").classes("ps-filter")
             self._fields[key] = field
-        text = ui.input(words("review.text"), value=self.filter.text).props("outlined dense clearable debounce=250")
+        text = ui.input(words("Search"), value=self.filter.text).props("outlined dense clearable debounce=250")
         self._fields["text"] = text.classes("ps-filter")
         for key, field in self._fields.items():
             tag(field, f"filter-{key}")
@@ -253,7 +324,7 @@ class ReviewController:
 
     def _label_fold(self) -> None:
         active = len(self.filter.query())
-        self._fold.set_text(self.words("review.filters_active", n=active) if active else self.words("review.filters"))
+        self._fold.set_text(self.words("Filter ({n} active)", n=active) if active else self.words("Filter"))
 
     async def begin(self, recording: str) -> None:
         """Open the initial view with ``recording``, or the first recording if that is "" or unknown."""
@@ -268,7 +339,7 @@ class ReviewController:
 
     def person(self, subject: str) -> str:
         """Return the text that the page displays for a person's code."""
-        return self.words("review.nobody") if subject == "none" else subject
+        return self.words("nobody") if subject == "none" else subject
 
     def _who(self) -> str:
         request = context.client.request
@@ -364,7 +435,7 @@ class ReviewController:
             await self.go(ahead[0], remember=True)
         else:
             self.views[ONE].draw()
-            self.page.say(self.words("review.last"), "good")
+            self.page.say(self.words("This was the last recording of this list."), "good")
 
     async def back(self) -> None:
         """Return to the recording displayed before, or if there is none, to the previous one in the order."""
@@ -419,8 +490,8 @@ class ReviewController:
         async with self._turn:
             with self.page.show_errors():
                 changed = await run.io_bound(decision)
-                what = self.words(f"review.did_{action}")
-                text = self.words("review.decided_all", what=what, n=changed or 0)
+                what = self.words(_DID[action])
+                text = self.words("Done: {what}. Recordings changed: {n}.", what=what, n=changed or 0)
                 self.page.say(text, "good" if changed else "info", self.undo if changed else None)
                 return True
         return False
@@ -458,16 +529,16 @@ class ReviewController:
                     self.page.say("")
                     self.views[ONE].refresh()
                     return
-                why = self.words("review.taken_back")
+                why = self.words("undone")
                 last = await run.io_bound(self.review.undo, self.visit, self.name, why)
                 if last is None:
-                    self.page.say(self.words("review.nothing_to_undo"))
+                    self.page.say(self.words("There is nothing left to undo in this tab."))
                     return
-                action, n = self.words(f"review.did_{last.action}"), len(last.before)
+                action, n = self.words(_DID[last.action]), len(last.before)
                 if n > 1:
-                    self.page.say(self.words("review.undone_all", what=action, n=n))
+                    self.page.say(self.words("Undone: {what}. Recordings: {n}.", what=action, n=n))
                     return
-                self.page.say(self.words("review.undone", what=action, id=last.recording))
+                self.page.say(self.words("Undone: {what} ({id}).", what=action, id=last.recording))
                 if self.view == ONE and last.recording in self.review.infos:
                     await self.go(last.recording)
 
@@ -495,14 +566,16 @@ class ReviewController:
     def _update_counts(self) -> None:
         rows = self.review.rows.values()
         done = sum(r.done for r in rows)
-        self.counts.set_text(self.words("review.counts", done=done, of=len(rows), left=len(rows) - done))
+        self.counts.set_text(
+            self.words("{done} of {of} decided, {left} to do", done=done, of=len(rows), left=len(rows) - done)
+        )
 
     def _update_progress(self) -> None:
         prepared = self.review.prepared
         text = self.words.error(prepared.error) if prepared.error is not None else ""
         if not text and prepared.progress is not None:
             stage, done, total = prepared.progress
-            text = self.words(f"review.making_{stage}", done=done, of=total)
+            text = self.words(_MAKING[stage], done=done, of=total)
         self.making.set_text(text)
         self.making.set_visibility(bool(text))
 

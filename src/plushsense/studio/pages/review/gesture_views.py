@@ -9,11 +9,23 @@ from nicegui import ui
 
 from plushsense.dataset.statistics import DurationBand, duration_bands
 from plushsense.studio.app.shell import LINES, address, button, tag
+from plushsense.studio.app.words import Texts, in_context
 from plushsense.studio.pages.review.controller import DURATIONS, ReviewController
 from plushsense.studio.pages.review.plot import ReviewPlot
 from plushsense.studio.pages.review.signals import GestureOverlay
 from plushsense.studio.pages.review.table_view import check_name
 from plushsense.studio.widgets.elements import link, table
+
+_HEADS: Texts = {
+    "gesture": "Gesture",
+    "n": "Number",
+    "mean": "Mean",
+    "median": "Median",
+    "sd": "Standard deviation",
+    "least": "Shortest",
+    "most": "Longest",
+    "odd": in_context("column", "Outliers"),
+}
 
 _MAX_OUTLIERS = 30
 _GREY = "#8a9099"
@@ -33,16 +45,23 @@ class GestureOverlayView:
                 self.choice = ui.select(
                     {g: words.gesture(g) for g in labels},
                     value=self._gesture if self._gesture in labels else None,
-                    label=words("review.gesture"),
+                    label=words("Gesture"),
                     on_change=lambda e: self._choose(str(e.value)),
                 )
                 tag(self.choice.props("options-dense").style("min-width: 260px"), "overlay-gesture")
                 self.summary = tag(ui.label().props("role=status"), "overlay-summary")
-                self.plot = ReviewPlot(words("review.overlay_plot"), height=420, legend=False, on_pick=self.picked)
+                self.plot = ReviewPlot(
+                    words("Overlay of the recordings of one gesture"), height=420, legend=False, on_pick=self.picked
+                )
                 tag(self.plot, "overlay-plot")
-                ui.label(words("review.overlay_help")).classes("ps-dim")
+                ui.label(
+                    words(
+                        "Click a curve or a name to open the recording. Excluded recordings are left out, and trims "
+                        "are applied."
+                    )
+                ).classes("ps-dim")
             with ui.column().classes("w-full ps-small-gap"):
-                ui.label(words("review.outliers")).classes("text-bold")
+                ui.label(words("Outliers")).classes("text-bold")
                 self.names = tag(ui.column().classes("w-full ps-no-gap"), "outliers")
 
     async def _choose(self, gesture: str) -> None:
@@ -79,22 +98,24 @@ class GestureOverlayView:
             series.append(look)
             curves.append([None if np.isnan(v) else round(float(v), 3) for v in heights])
         gesture = words.gesture(self._gesture)
-        summary = words("review.overlay_summary", n=len(overlay.drawn), odd=len(outliers), gesture=gesture)
-        self.summary.set_text(summary if overlay.drawn else words("review.overlay_empty"))
+        summary = words(
+            "{gesture}: recordings {n}, outliers {odd}.", n=len(overlay.drawn), odd=len(outliers), gesture=gesture
+        )
+        self.summary.set_text(summary if overlay.drawn else words("There is nothing to draw yet."))
         self.plot.show(
             f"overlay {self._gesture}",
             summary,
             np.round(overlay.x, 4).tolist(),
             curves,
             series,
-            x_title=words("review.x_axis"),
-            y_title=words("review.activity_axis"),
+            x_title=words("Seconds since the first row (grey: outside the recording)"),
+            y_title=words("Deviation from rest (1 = usual)"),
             limits=(0.0, overlay.top),
         )
         self.names.clear()
         with self.names:
             if not outliers:
-                ui.label(words("review.no_outliers")).classes("ps-dim")
+                ui.label(words("There are no outliers.")).classes("ps-dim")
             for c in outliers[:_MAX_OUTLIERS]:
                 with ui.row().classes("items-center no-wrap w-full"):
                     dash = ui.element("span").classes("ps-dash").style("width: 22px; height: 4px; flex: none")
@@ -103,7 +124,7 @@ class GestureOverlayView:
                     name = button("", text, lambda c=c: desk.open(c.recording), "flat dense align=left")
                     name.style("overflow-wrap: anywhere; text-align: left").classes("flex-grow")
             if len(outliers) > _MAX_OUTLIERS:
-                ui.label(words("review.more_outliers", n=len(outliers) - _MAX_OUTLIERS)).classes("ps-dim")
+                ui.label(words("and {n} more: filter by the check", n=len(outliers) - _MAX_OUTLIERS)).classes("ps-dim")
 
     async def picked(self, event: dict[str, Any]) -> None:
         """Open the recording whose curve is nearest to the click."""
@@ -128,19 +149,26 @@ class DurationsView:
         with tag(ui.element("div").classes("ps-two w-full"), "durations") as self.place:
             with ui.column().classes("w-full ps-small-gap no-wrap"):
                 with ui.row().classes("w-full items-center ps-small-gap"):
-                    self.choice = ui.select(
-                        [], label=words("review.gesture"), on_change=lambda e: self._choose(e.value)
-                    )
+                    self.choice = ui.select([], label=words("Gesture"), on_change=lambda e: self._choose(e.value))
                     tag(self.choice.props("options-dense").style("min-width: 220px"), "durations-gesture")
-                    share = ui.number(words("review.band"), value=_PAPER_PERCENT, min=5, max=200, step=5, format="%.0f")
+                    share = ui.number(
+                        words("Band around the mean: ±"), value=_PAPER_PERCENT, min=5, max=200, step=5, format="%.0f"
+                    )
                     share.props('suffix="%"').style("width: 210px").on_value_change(lambda e: self._resize(e.value))
                     tag(share, "band")
                 self.summary = tag(ui.label().props("role=status"), "durations-summary")
-                plot = ReviewPlot(words("review.durations_plot"), height=380, legend=False, on_pick=self.picked)
+                plot = ReviewPlot(
+                    words("Durations of the recordings of one gesture"), height=380, legend=False, on_pick=self.picked
+                )
                 self.plot = tag(plot, "durations-plot")
-                ui.label(words("review.durations_help")).classes("ps-dim")
+                ui.label(
+                    words(
+                        "The line is the mean, the shaded band the durations that differ from it by no more than the "
+                        "percentage. Click a point or a name to open the recording."
+                    )
+                ).classes("ps-dim")
             with ui.column().classes("w-full ps-small-gap"):
-                ui.label(words("review.outliers")).classes("text-bold")
+                ui.label(words("Outliers")).classes("text-bold")
                 select = button("select-outliers", "", self._select, "outline")
                 self.select = select.classes("ps-act")
                 self.names = tag(ui.column().classes("w-full ps-no-gap"), "duration-outliers")
@@ -184,10 +212,16 @@ class DurationsView:
     def _plot(self) -> None:
         words, band = self.desk.words, self._band
         if band is None:
-            self.summary.set_text(words("review.overlay_empty"))
+            self.summary.set_text(words("There is nothing to draw yet."))
             return
         n, outliers = len(band.seconds), set(band.outliers)
-        summary = words("review.durations_summary", n=n, odd=len(outliers), **_numbers(self.desk, band))
+        summary = words(
+            "Recordings: {n}. Mean {mean} s, median {median} s, standard deviation {sd} s, from {least} s to {most} "
+            "s. Outside the band: {odd}.",
+            n=n,
+            odd=len(outliers),
+            **_numbers(self.desk, band),
+        )
         self.summary.set_text(summary)
         seconds = [(s, i in outliers) for i, s in band.seconds.items()]
         points = [[s if odd is out else None for s, odd in seconds] for out in (False, True)]
@@ -203,8 +237,8 @@ class DurationsView:
                 {"label": "", "stroke": _GREY, "width": 2},
                 *({"label": "", "stroke": _GREY, "width": 1, "dash": [6, 4]} for _ in range(2)),
             ],
-            x_title=words("review.durations_axis"),
-            y_title=words("review.seconds_axis"),
+            x_title=words("Recordings, in the order of recording"),
+            y_title=words("Duration (s)"),
             limits=(0.0, 1.08 * max(band.high_s, band.statistics.max)),
             bands=[{"series": [5, 4], "fill": "rgba(0,114,178,0.14)"}],
         )
@@ -213,17 +247,17 @@ class DurationsView:
         words, band = self.desk.words, self._band
         outliers = band.outliers if band is not None else []
         self.select.set_visibility(bool(outliers))
-        self.select.set_text(words("review.select_outliers", n=len(outliers)))
+        self.select.set_text(words("Select all outliers ({n})", n=len(outliers)))
         self.names.clear()
         with self.names:
             if not outliers:
-                ui.label(words("review.no_outliers")).classes("ps-dim")
+                ui.label(words("There are no outliers.")).classes("ps-dim")
             for i in outliers[:_MAX_OUTLIERS]:
                 text = f"{i}: {words.number(band.seconds[i], 2) if band else ''} s"
                 name = button("", text, lambda i=i: self.desk.open(i), "flat dense align=left")
                 name.style("overflow-wrap: anywhere; text-align: left").classes("w-full")
             if len(outliers) > _MAX_OUTLIERS:
-                ui.label(words("review.more_durations", n=len(outliers) - _MAX_OUTLIERS)).classes("ps-dim")
+                ui.label(words("and {n} more", n=len(outliers) - _MAX_OUTLIERS)).classes("ps-dim")
 
     def _fill_table(self, bands: dict[str, DurationBand]) -> None:
         desk, words = self.desk, self.desk.words
@@ -239,10 +273,13 @@ class DurationsView:
                     str(len(band.outliers)),
                 )
             )
-        head = [words(f"review.stat_{key}") for key in ("gesture", "n", "mean", "median", "sd", "least", "most", "odd")]
+        head = [words(head) for head in _HEADS.values()]
         self.all.clear()
         with self.all:
-            tag(table(words("review.durations_caption"), head, rows, range(1, len(head))), "durations-table")
+            tag(
+                table(words("Durations of all gestures, in seconds"), head, rows, range(1, len(head))),
+                "durations-table",
+            )
 
     async def picked(self, event: dict[str, Any]) -> None:
         """Open the recording whose point is nearest to the click."""

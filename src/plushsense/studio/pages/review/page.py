@@ -43,10 +43,12 @@ async def show(page: Page) -> None:
         place = str(page.workspace.inside(place)) if place else ""
     _choice_of_dataset(page, datasets, place)
     if not place:
-        ui.label(words("review.no_dataset")).classes("ps-dim")
-        ui.link(words("pages.home"), "/").classes("ps-link")
+        ui.label(words("There is no data set yet. Record a session, or import recordings on the home page.")).classes(
+            "ps-dim"
+        )
+        ui.link(words("Home"), "/").classes("ps-link")
         return
-    opening = tag(ui.label(words("review.opening")).props("role=status"), "opening")
+    opening = tag(ui.label(words("Opening the data set …")).props("role=status"), "opening")
     await context.client.connected()
     with page.show_errors():
         reviews = page.workspace.part(Reviews)
@@ -83,7 +85,7 @@ def _choice_of_dataset(page: Page, datasets: list[Path], place: str) -> None:
         choice = ui.select(
             options,
             value=place if place in options else None,
-            label=words("review.dataset"),
+            label=words("Data set"),
             on_change=lambda e: ui.navigate.to(address("review", dataset=str(e.value))),
         )
         tag(choice.style("min-width: 280px"), "dataset")

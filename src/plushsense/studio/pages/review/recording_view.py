@@ -7,9 +7,11 @@ from typing import Any
 from nicegui import ui
 
 from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, button, icon_button, named, tag
+from plushsense.studio.app.words import Texts, in_context
 from plushsense.studio.pages.review.controller import ReviewController
 from plushsense.studio.pages.review.plot import ReviewPlot, curve_styles
-from plushsense.studio.pages.review.signals import ACTIVITY, ALL
+from plushsense.studio.pages.review.review import STATE_TEXTS
+from plushsense.studio.pages.review.signals import ACTIVITY, ALL, KINDS
 from plushsense.studio.pages.review.table_view import (
     SIGNS,
     advice,
@@ -19,6 +21,38 @@ from plushsense.studio.pages.review.table_view import (
     finding_text,
     recorded_as,
 )
+
+_ZOOM_TEXTS: Texts = {
+    "in": "Zoom in",
+    "out": "Zoom out",
+    "all": "The whole recording",
+}
+
+_MARKS: Texts = {
+    "start": "start {at} s",
+    "stop": "end {at} s",
+}
+
+_SUGGESTED: Texts = {
+    "start": "suggested start {at} s",
+    "stop": "suggested end {at} s",
+}
+
+_KEY_TEXTS: Texts = {
+    "accept": "accept and go to the next one",
+    "next": "next recording",
+    "back": "back to the one before",
+    "pass": "next, previous, without a decision",
+    "start": "move the start by a row (or click)",
+    "stop": "move the end (or Shift-click, right click)",
+    "ten": "move by ten rows, with Shift the end",
+    "edges": "start at the first row, end at the last",
+    "drop": "reset the start and the end",
+    "exclude": "exclude, or include again",
+    "undo": "undo the last decision, one by one",
+    "zoom": "zoom in, zoom out, whole recording",
+    "relabel": "set another gesture",
+}
 
 START, STOP = "start", "stop"
 KEYS = (
@@ -64,49 +98,59 @@ class RecordingView:
                 self.about = tag(ui.label().classes("ps-dim"), "about")
                 self._actions(trims)
                 self.plot = ReviewPlot(
-                    words("review.plot"), height=_PLOT_HEIGHT, on_pick=self.picked, on_key=self.key, on_zoom=self.zoomed
+                    words("Signals of the recording"),
+                    height=_PLOT_HEIGHT,
+                    on_pick=self.picked,
+                    on_key=self.key,
+                    on_zoom=self.zoomed,
                 )
                 tag(self.plot, "plot")
                 if trims:
                     self._marks()
                 self._views()
             with ui.column().classes("w-full ps-small-gap"):
-                ui.label(words("review.findings")).classes("text-bold")
+                ui.label(words("Findings")).classes("text-bold")
                 self.findings = tag(ui.column().classes("w-full"), "findings")
-                ui.label(words("review.keys")).classes("text-bold q-mt-md")
+                ui.label(words("Keys")).classes("text-bold q-mt-md")
                 with tag(ui.element("dl").classes("ps-keys q-ma-none"), "keys"):
                     for key, does in KEYS:
                         if trims or does in _PLAIN:
                             with ui.element("dt"):
                                 ui.label(key).classes("ps-key").style("display: inline-block")
                             with ui.element("dd"):
-                                ui.label(words(f"review.key_{'next' if does == 'accept' and not trims else does}"))
+                                ui.label(words(_KEY_TEXTS["next" if does == "accept" and not trims else does]))
 
-    def _button(self, key: str, action: Any, name: str, look: str = "outline") -> ui.button:
-        return button(name, self.desk.words(f"review.{key}"), action, look).classes("ps-act")
+    def _button(self, text: str, action: Any, name: str, look: str = "outline") -> ui.button:
+        return button(name, self.desk.words(text), action, look).classes("ps-act")
 
     def _actions(self, trims: bool) -> None:
         desk = self.desk
         with ui.row().classes("w-full items-center ps-small-gap"):
-            self._button("accept" if trims else "next", lambda: self.accept(), "accept", "unelevated color=primary")
-            self._button("back", desk.back, "back")
-            self.exclude = self._button("exclude", self._exclude, "exclude")
-            self._button("relabel", self._relabel, "relabel")
-            self._button("undo", desk.undo, "undo")
+            self._button(
+                "Accept, next" if trims else "Next", lambda: self.accept(), "accept", "unelevated color=primary"
+            )
+            self._button("Back", desk.back, "back")
+            self.exclude = self._button("Exclude …", self._exclude, "exclude")
+            self._button("Another gesture …", self._relabel, "relabel")
+            self._button("Undo", desk.undo, "undo")
 
     def _marks(self) -> None:
         """Build the buttons that set start and stop, as an alternative to the plot and the keyboard."""
         words = self.desk.words
         with ui.row().classes("w-full items-center ps-small-gap"):
-            side = ui.toggle({START: words("review.sets_start"), STOP: words("review.sets_stop")}, value=START)
-            side.props(f'no-caps dense unelevated aria-label="{words("review.sets")}"').classes("ps-toggle")
+            side = ui.toggle({START: words(in_context("edge", "Start")), STOP: words("End")}, value=START)
+            side.props(f'no-caps dense unelevated aria-label="{words("What a click in the plot sets")}"').classes(
+                "ps-toggle"
+            )
             tag(side, "side").on_value_change(lambda e: setattr(self, "side", str(e.value)))
             for sign, by in (("−10", -10), ("−1", -1), ("+1", 1), ("+10", 10)):
                 step = button(f"step{by}", sign, lambda by=by: self.step(by, self.side == STOP), "outline dense")
-                named(step.classes("ps-act"), words("review.step", by=sign))
-            self._button("drop", self._drop, "drop", "outline dense")
-            self.untrim = self._button("untrim", self._untrim, "untrim", "outline dense")
-            ends = ui.switch(words("review.ends"), value=self.desk.ends, on_change=lambda e: self._ends(bool(e.value)))
+                named(step.classes("ps-act"), words("Move by {by} rows", by=sign))
+            self._button("Reset", self._drop, "drop", "outline dense")
+            self.untrim = self._button("Remove the trim", self._untrim, "untrim", "outline dense")
+            ends = ui.switch(
+                words("Use the suggested end, too"), value=self.desk.ends, on_change=lambda e: self._ends(bool(e.value))
+            )
             tag(ends, "ends")
 
     def _views(self) -> None:
@@ -115,14 +159,16 @@ class RecordingView:
         groups = [ALL, *(kinds if len(kinds) > 1 else []), ACTIVITY]
         with ui.row().classes("w-full items-center ps-small-gap"):
             toggle = ui.toggle({g: self._kind(g) for g in groups}, value=ALL)
-            toggle.props(f'no-caps dense unelevated aria-label="{words("review.group")}"').classes("ps-toggle")
+            toggle.props(f'no-caps dense unelevated aria-label="{words("Channels shown")}"').classes("ps-toggle")
             tag(toggle, "group").on_value_change(lambda e: self._grouped(str(e.value)))
             for key, (icon, factor) in _ZOOMS.items():
-                zoom = icon_button(icon, words(f"review.{key}"), lambda factor=factor: self.plot.zoom(factor))
+                zoom = icon_button(
+                    icon, words(_ZOOM_TEXTS[key.removeprefix("zoom_")]), lambda factor=factor: self.plot.zoom(factor)
+                )
                 tag(zoom.classes("ps-act"), key)
 
     def _kind(self, kind: str) -> str:
-        return self.desk.words.get(f"review.kind_{kind}", kind)
+        return self.desk.words(KINDS.get(kind, kind))
 
     # Drawing ------------------------------------------------------------------------------------------------------
 
@@ -132,11 +178,11 @@ class RecordingView:
         identity = desk.current
         self._drawn = None
         if not identity or identity not in desk.review.infos:
-            self.heading.set_text(words("review.none_fit"))
+            self.heading.set_text(words("No recording fits the filter."))
             return
         plotted = desk.review.signals(identity).curves(self.group, low, high)
         series = curve_styles([self._kind(n) if n == ACTIVITY else words.channel(n) for n in plotted["names"]])
-        y_title = words("review.y_axis", unit=words.unit(plotted["unit"])) if plotted["unit"] else ""
+        y_title = words("Value ({unit})", unit=words.unit(plotted["unit"])) if plotted["unit"] else ""
         lanes = [(at, self._kind(kind)) for at, kind in plotted["lanes"]]
         self.plot.show(
             identity,
@@ -144,8 +190,8 @@ class RecordingView:
             plotted["x"],
             plotted["curves"],
             series,
-            x_title=words("review.x_axis"),
-            y_title=words("review.activity_axis") if self.group == ACTIVITY else y_title,
+            x_title=words("Seconds since the first row (grey: outside the recording)"),
+            y_title=words("Deviation from rest (1 = usual)") if self.group == ACTIVITY else y_title,
             lanes=lanes,
             limits=(-1.08 - 2.1 * (len(lanes) - 1), 1.08) if lanes else None,
             marks=self._lines(),
@@ -173,11 +219,11 @@ class RecordingView:
         gesture = f"{AFFECT_SIGNS[row.affect]} {words.gesture(row.info.gesture)}"
         self.affect.set_text(f"{gesture} ({recorded})" if recorded else gesture)
         self.affect.style(f"background: {AFFECT_COLOURS.get(row.affect, '#767676')}")
-        self.state.set_text(f"{SIGNS[row.state]} {words(f'review.state_{row.state}')}")
+        self.state.set_text(f"{SIGNS[row.state]} {words(STATE_TEXTS[row.state])}")
         self.state.props(f'data-state="{row.state}"')
         self.about.set_text(self._about())
         excluded = row.state == "excluded"
-        self.exclude.set_text(words("review.include" if excluded else "review.exclude"))
+        self.exclude.set_text(words("Include again" if excluded else "Exclude …"))
         if not review.is_labelled:
             self.untrim.set_visibility(marks.trimmed)
         self._fill_findings()
@@ -187,20 +233,22 @@ class RecordingView:
         row, at = desk.review.rows[desk.current], desk.review.signals(desk.current).seconds
         place = desk.order.index(row.id) + 1 if row.id in desk.order else 0
         person, seconds = desk.person(row.info.subject), words.number(at[-1], 2)
-        facts = [words("review.about", person=person, seconds=seconds, rows=row.info.rows)]
+        facts = [words("{person} · {seconds} s · rows: {rows}", person=person, seconds=seconds, rows=row.info.rows)]
         if place:
-            facts.append(words("review.place", at=place, of=len(desk.order)))
+            facts.append(words("{at} of {of}", at=place, of=len(desk.order)))
         if not desk.review.is_labelled:
             start, stop = desk.review.kept_rows(row.id, desk.ends)
-            facts.append(words("review.kept", start=words.number(at[start], 2), stop=words.number(at[stop], 2)))
+            facts.append(
+                words("keeps {start} s to {stop} s", start=words.number(at[start], 2), stop=words.number(at[stop], 2))
+            )
             if row.state == "suggested":
-                facts.append(words("review.confidence", percent=f"{100 * row.confidence:.0f}"))
+                facts.append(words("suggestion {percent} % sure", percent=f"{100 * row.confidence:.0f}"))
         return " · ".join(facts)
 
     def _label(self) -> str:
         desk, words = self.desk, self.desk.words
         row = desk.review.rows[desk.current]
-        return f"{row.id}, {words.gesture(row.info.gesture)}, {words(f'review.state_{row.state}')}. {self._about()}"
+        return f"{row.id}, {words.gesture(row.info.gesture)}, {words(STATE_TEXTS[row.state])}. {self._about()}"
 
     def _lines(self) -> list[dict[str, Any]]:
         """Return the vertical lines to plot: dotted for suggestions, solid for drafts and marks."""
@@ -215,13 +263,13 @@ class RecordingView:
             colour = _DRAFT if draft else _SET
             for key, row, edge in ((START, start, 0), (STOP, stop, rows)):
                 if row != edge or (key == START and draft):
-                    label = words(f"review.mark_{key}", at=words.number(at[row], 2))
+                    label = words(_MARKS[key], at=words.number(at[row], 2))
                     lines.append({"x": float(at[row]), "label": label, "stroke": colour, "edge": key})
         taken = {line["x"] for line in lines}
         for key, row, visible in ((START, s.start, s.onset_visible), (STOP, s.stop, s.offset_visible)):
             if visible and float(at[row]) not in taken:
                 used = key == START or desk.ends
-                label = words(f"review.suggested_{key}", at=words.number(at[row], 2)) if used else ""
+                label = words(_SUGGESTED[key], at=words.number(at[row], 2)) if used else ""
                 lines.append({"x": float(at[row]), "label": label, "dash": [2, 4] if used else [1, 7], "edge": key})
         return lines
 
@@ -242,15 +290,15 @@ class RecordingView:
         self.findings.clear()
         with self.findings:
             if not row.findings:
-                key = "no_findings" if desk.review.prepared.checked else "not_checked"
-                ui.label(words(f"review.{key}")).classes("ps-dim")
+                none = "The checks found nothing." if desk.review.prepared.checked else "Not checked yet."
+                ui.label(words(none)).classes("ps-dim")
             for f in row.findings:
                 with ui.column().classes("w-full ps-no-gap").props(f'data-check="{f.check}"'):
                     ui.label(finding_text(words, f)).classes("text-bold")
                     ui.label(words.sentence(f.message))
                     if f.accepted:
                         with ui.row().classes("items-center"):
-                            ui.label(f"✓ {words('review.accepted_finding')}").classes("ps-dim")
+                            ui.label(f"✓ {words('accepted as harmless')}").classes("ps-dim")
                             finding_button(desk, f, row.id).classes("ps-act")
                     else:
                         ui.label(f"→ {advice(words, f)}").classes("ps-dim")

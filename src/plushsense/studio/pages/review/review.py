@@ -31,6 +31,7 @@ from plushsense.dataset.marks import LabelledStretch, Mark, MarkState, apply_mar
 from plushsense.dataset.onset import Suggestion
 from plushsense.dataset.quality.findings import SEVERITIES, Finding
 from plushsense.dataset.store import Dataset, RecordingInfo
+from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import ChangeSignal, Workspace
 from plushsense.studio.pages.review.decisions import Decisions, ReviewDecision
 from plushsense.studio.pages.review.signals import (
@@ -42,6 +43,56 @@ from plushsense.studio.pages.review.signals import (
     read_stream_signals,
     trimmed_curve,
 )
+
+STATE_TEXTS: Texts = {
+    "todo": "to do",
+    "done": "decided",
+    "looking": "being computed",
+    "suggested": "suggested",
+    "none": "no visible start",
+    "draft": "set, not accepted",
+    "accepted": "accepted",
+    "adjusted": "set by hand",
+    "excluded": "excluded",
+    "labelled": "labelled",
+}
+"""Names of the states of a recording, and of the filters on them."""
+
+CHECK_NAMES: Texts = {
+    "never-stopped": "never stopped",
+    "too-short": "too short",
+    "duration": "duration",
+    "no-onset": "no start",
+    "several-gestures": "several gestures",
+    "clock-still": "clock stands still",
+    "clock-reset": "clock reset",
+    "clock-value": "wrong clock values",
+    "out-of-order": "rows out of order",
+    "gaps": "gaps",
+    "lost-frames": "lost frames",
+    "rate": "frame rate",
+    "jitter": "uneven clock",
+    "resumed": "resumed stream",
+    "cut-line": "cut line",
+    "malformed": "malformed lines",
+    "rows": "number of rows",
+    "garbage": "invalid values",
+    "blank-rows": "blank rows",
+    "spikes": "spikes",
+    "flat": "constant channel",
+    "zeroed": "constant zero",
+    "stuck": "stuck channel",
+    "saturated": "saturated channel",
+    "drift": "drift",
+    "duplicate": "duplicate",
+    "overlap": "overlap",
+    "not-in-stream": "not in the stream",
+    "missing": "missing recordings",
+    "label": "unknown label",
+    "class-balance": "balance of gestures",
+    "subject-balance": "balance of people",
+}
+"""Names of the checks."""
 
 LOOKING, NONE, SUGGESTED, DRAFT = "looking", "none", "suggested", "draft"
 ACCEPTED, ADJUSTED, EXCLUDED, LABELLED = "accepted", "adjusted", "excluded", "labelled"

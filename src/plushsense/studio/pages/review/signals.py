@@ -32,7 +32,18 @@ from plushsense.dataset.store import Dataset, RecordingInfo, StreamInfo
 from plushsense.dataset.trimming import row_times_s, suggest_trims
 from plushsense.reports.quality import scale_of
 from plushsense.reports.quality_figures import deviation, line
+from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import ChangeSignal
+
+KINDS: Texts = {
+    "all": "All",
+    "activity": "Activity",
+    "capacitive": "Touch",
+    "proximity": "Proximity",
+    "acceleration": "Acceleration",
+    "angular rate": "Rotation",
+}
+"""Names of the groups of channels."""
 
 ALL, ACTIVITY = "all", "activity"
 BEFORE_S = 2.0

@@ -8,9 +8,17 @@ from nicegui import background_tasks, run, ui
 
 from plushsense.dataset.marks import HANDLING, PRACTICE, REST
 from plushsense.studio.app.shell import button, icon_button, tag
+from plushsense.studio.app.words import Texts
 from plushsense.studio.pages.review.controller import ReviewController
 from plushsense.studio.pages.review.plot import ReviewPlot, curve_styles
-from plushsense.studio.pages.review.signals import ALL, RecordingSignals
+from plushsense.studio.pages.review.signals import ALL, KINDS, RecordingSignals
+
+_LABELS: Texts = {
+    "handling": "Handling",
+    "rest": "Rest",
+    "remove": "Remove labels",
+    "practice": "Practised gesture",
+}
 
 REMOVE = "remove"
 _RECORDED = "rgba(255,193,7,0.30)"
@@ -35,12 +43,12 @@ class StreamView:
         with tag(ui.element("div").classes("ps-one w-full"), "stream") as self.place:
             with ui.column().classes("w-full ps-small-gap no-wrap"):
                 with ui.row().classes("w-full items-center ps-small-gap"):
-                    choice = ui.select(desk.streams, value=desk.stream or None, label=words("review.stream"))
+                    choice = ui.select(desk.streams, value=desk.stream or None, label=words("Stream"))
                     choice.props("outlined dense options-dense").style("min-width: 240px")
                     tag(choice, "stream-choice").on_value_change(lambda e: self._choose(str(e.value)))
                     self.about = tag(ui.label().classes("ps-dim ps-number").props("role=status"), "stream-about")
                 self.plot = ReviewPlot(
-                    words("review.stream_plot"),
+                    words("Signals of the stream"),
                     height=330,
                     on_pick=self.picked,
                     on_key=self.key,
@@ -52,21 +60,27 @@ class StreamView:
                     self.gesture = ui.select(
                         {g: words.gesture(g) for g in gestures},
                         value=gestures[0] if gestures else None,
-                        label=words("review.gesture"),
+                        label=words("Gesture"),
                     )
                     tag(self.gesture.props("outlined dense options-dense").style("min-width: 180px"), "practised")
                     for key, label in _KEYS.items():
                         name = label.rstrip(":")
-                        text = f"{words(f'review.label_{name}')} ({key})"
+                        text = f"{words(_LABELS[name])} ({key})"
                         button(f"label-{name}", text, lambda label=label: self.label(label)).classes("ps-act")
-                    button("stream-undo", words("review.undo"), desk.undo).classes("ps-act")
-                    for icon, key, factor in (("zoom_in", "zoom_in", 0.5), ("zoom_out", "zoom_out", 2.0)):
-                        icon_button(icon, words(f"review.{key}"), lambda f=factor: self.plot.zoom(f)).classes("ps-act")
-                    for icon, key, share in (("chevron_left", "earlier", -0.5), ("chevron_right", "later", 0.5)):
-                        icon_button(icon, words(f"review.{key}"), lambda s=share: self.plot.pan(s)).classes("ps-act")
-                ui.label(words("review.stream_help")).classes("ps-dim")
+                    button("stream-undo", words("Undo"), desk.undo).classes("ps-act")
+                    for icon, text, factor in (("zoom_in", "Zoom in", 0.5), ("zoom_out", "Zoom out", 2.0)):
+                        icon_button(icon, words(text), lambda f=factor: self.plot.zoom(f)).classes("ps-act")
+                    for icon, text, share in (("chevron_left", "Earlier", -0.5), ("chevron_right", "Later", 0.5)):
+                        icon_button(icon, words(text), lambda s=share: self.plot.pan(s)).classes("ps-act")
+                ui.label(
+                    words(
+                        "Drag over a stretch between the recordings, or click its beginning and Shift-click its end; "
+                        "then press a button or its key. Keys: + − 0 zoom, ← → move, u undoes, Esc clears the "
+                        "selection."
+                    )
+                ).classes("ps-dim")
             with ui.column().classes("w-full ps-small-gap"):
-                ui.label(words("review.stretches")).classes("text-bold")
+                ui.label(words("Labelled stretches")).classes("text-bold")
                 self.names = tag(ui.column().classes("w-full ps-no-gap"), "stretches")
 
     # Drawing ------------------------------------------------------------------------------------------------------
@@ -83,15 +97,15 @@ class StreamView:
             if signals is None or stream != desk.stream:
                 return
             plotted = signals.curves(ALL, low, high)
-            lanes = [(at, words.get(f"review.kind_{kind}", kind)) for at, kind in plotted["lanes"]]
+            lanes = [(at, words(KINDS.get(kind, kind))) for at, kind in plotted["lanes"]]
             self.plot.show(
                 stream,
                 self._about(signals),
                 plotted["x"],
                 plotted["curves"],
                 curve_styles([words.channel(n) for n in plotted["names"]]),
-                x_title=words("review.stream_axis"),
-                y_title=words("review.y_axis", unit=words.unit(plotted["unit"])) if plotted["unit"] else "",
+                x_title=words("Seconds since the first row of the stream"),
+                y_title=words("Value ({unit})", unit=words.unit(plotted["unit"])) if plotted["unit"] else "",
                 lanes=lanes,
                 limits=(-1.08 - 2.1 * (len(lanes) - 1), 1.08) if lanes else None,
                 cut=self._shaded(signals),
@@ -119,29 +133,29 @@ class StreamView:
         self.names.clear()
         with self.names:
             if not stretches:
-                ui.label(desk.words("review.no_stretches")).classes("ps-dim")
+                ui.label(desk.words("Nothing is labelled yet.")).classes("ps-dim")
             for s in stretches[:_MAX_LISTED]:
                 first, last = float(at[s.start]), float(at[s.stop])
                 text = f"{desk.words.number(first, 2)} – {desk.words.number(last, 2)} s: {self._name(s.label)}"
                 look = button("", text, lambda a=first, b=last: self.plot.look(a - 3, b + 3), "flat dense align=left")
                 look.style("text-align: left")
             if len(stretches) > _MAX_LISTED:
-                ui.label(desk.words("review.more_stretches", n=len(stretches) - _MAX_LISTED)).classes("ps-dim")
+                ui.label(desk.words("and {n} more", n=len(stretches) - _MAX_LISTED)).classes("ps-dim")
 
     def _name(self, label: str) -> str:
         words = self.desk.words
         if label.startswith(PRACTICE):
-            return f"{words('review.label_practice')}: {words.gesture(label.removeprefix(PRACTICE))}"
-        return words(f"review.label_{label}")
+            return f"{words(_LABELS['practice'])}: {words.gesture(label.removeprefix(PRACTICE))}"
+        return words(_LABELS[label])
 
     def _about(self, signals: RecordingSignals) -> str:
         words, review = self.desk.words, self.desk.review
         n = len(review.stretches(signals.info.id))
-        text = words("review.stream_about", seconds=words.number(signals.seconds[-1], 0), n=n)
+        text = words("{seconds} s · labelled stretches: {n}", seconds=words.number(signals.seconds[-1], 0), n=n)
         if self._selection is None:
             return text
         low, high = (words.number(each, 2) for each in self._selection)
-        return f"{text} · {words('review.stream_selected', start=low, stop=high)}"
+        return f"{text} · {words('selected {start} to {stop} s', start=low, stop=high)}"
 
     def _shaded(self, signals: RecordingSignals) -> list[tuple[float, float, str, str]]:
         """Return the ranges to shade: recordings, labelled stretches and the selection."""
@@ -204,7 +218,7 @@ class StreamView:
             return
         start, stop = (signals.row_at(each) for each in self._selection or (0.0, 0.0))
         if start == stop:
-            desk.page.say(desk.words("review.no_selection"), "warning")
+            desk.page.say(desk.words("Select a stretch first: drag over the plot."), "warning")
             return
         kind = f"{PRACTICE}{self.gesture.value}" if label == PRACTICE else "" if label == REMOVE else label
         if await desk.mark(lambda: desk.review.label(desk.visit, stream, (start, stop), kind, desk.name)):

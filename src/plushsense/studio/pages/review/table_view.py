@@ -10,10 +10,75 @@ from nicegui.element import Element
 
 from plushsense.dataset.quality.findings import Finding
 from plushsense.studio.app.shell import AFFECT_SIGNS, button, icon_button, scroll_region, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.pages.review.controller import SORTS, ReviewController
-from plushsense.studio.pages.review.review import ReviewedRecording
+from plushsense.studio.pages.review.review import CHECK_NAMES, STATE_TEXTS, ReviewedRecording
 from plushsense.studio.widgets.elements import on_enter
+
+_HEADS: Texts = {
+    "recording": "Recording",
+    "person": "Person",
+    "gesture": "Gesture",
+    "seconds": "Duration",
+    "findings": "Findings",
+    "state": "State",
+    "path": "Signal",
+}
+
+_SEVERITIES: Texts = {
+    "error": "to decide",
+    "warning": "to look at",
+    "info": "good to know",
+}
+
+_ADVICE: Texts = {
+    "never-stopped": "Trim it to the gesture, or exclude it.",
+    "too-short": "Exclude it, or record it again.",
+    "duration": "Look at its plot; trim or exclude it, or accept the finding.",
+    "no-onset": "Look whether the gesture was made; exclude it if not.",
+    "several-gestures": "Trim it to one gesture, or exclude it.",
+    "clock-still": "Export the file again with all digits of its times, and import it again.",
+    "clock-reset": "Trim it to one side of the reset, or exclude it.",
+    "clock-value": "Check the cable: reading leaves out each such row.",
+    "out-of-order": "Check the radio: reading leaves out a single such row, and starts anew at several.",
+    "gaps": "Exclude it if the gesture is hit, or accept the finding.",
+    "lost-frames": "Check cable and radio; exclude it if the gesture is hit.",
+    "rate": "Check firmware and layout; training resamples it.",
+    "jitter": "Nothing to do: the clock is evened out.",
+    "resumed": "Nothing to do: reading starts anew there.",
+    "cut-line": "Nothing to do: that line is left out.",
+    "malformed": "Nothing to do: these lines are left out.",
+    "rows": "Compare it with the original file, or accept the finding.",
+    "garbage": "Check the sensor; exclude it if the gesture is hit.",
+    "blank-rows": "Check the sensor; exclude it if the gesture is hit.",
+    "spikes": "Check the sensor; exclude it if the gesture is hit.",
+    "flat": "Check the sensor's cable; exclude what it spoiled.",
+    "zeroed": "The values are lost; record again.",
+    "stuck": "Check the sensor; exclude it if the gesture is hit.",
+    "saturated": "Widen the sensor's range, or accept strong touch.",
+    "drift": "Let the toy calibrate again between gestures.",
+    "duplicate": "Exclude one of the two.",
+    "overlap": "Trim or exclude one of the two.",
+    "not-in-stream": "Check that the stream is that of this session.",
+    "missing": "Record them if the person is still there, or accept the finding.",
+    "label": "Set another gesture for these recordings, or import them with a gesture set that has the label.",
+    "class-balance": "Weight the gestures in training, or leave odd ones out.",
+    "subject-balance": "Record more people or recordings.",
+    "clock-reset-stream": "Nothing to do: reading starts anew there.",
+    "gaps-stream": "Nothing to do: reading starts anew there.",
+}
+
+_REASONS: Texts = {
+    "wrong": "wrong gesture",
+    "nothing": "gesture not performed",
+    "disturbed": "disturbed from outside",
+    "sensor": "sensor fault",
+    "twice": "recorded twice",
+    "broken_off": "broken off",
+    "looked": "looked at: it is fine",
+    "person": "this person's way of doing it",
+    "known": "known fault of the device that does not affect the gesture",
+}
 
 
 class ReviewTable(Element, component="review_table.js"):
@@ -36,9 +101,14 @@ class ReviewTable(Element, component="review_table.js"):
         on_page: Callable[[], Any],
     ) -> None:
         super().__init__()
-        columns = [{"key": k, "label": words(f"review.{k}"), "sorts": k in SORTS} for k in (*SORTS, "path")]
-        self._props.update(caption=words("review.table"), columns=columns, rows=[], spark=words("review.spark"))
-        self._props["pick"] = words("review.select")
+        columns = [{"key": k, "label": words(_HEADS[k]), "sorts": k in SORTS} for k in (*SORTS, "path")]
+        self._props.update(
+            caption=words("Recordings"),
+            columns=columns,
+            rows=[],
+            spark=words("Deviation of the signals from rest over the recording; the part that is kept is shaded"),
+        )
+        self._props["pick"] = words("Select")
         self.classes("w-full")
         self.on("sort", lambda event: on_sort(str(event.args)))
         self.on("open", lambda event: on_open(str(event.args)))
@@ -58,19 +128,19 @@ _ACCEPTING = ("looked", "person", "known")
 
 def finding_text(words: Words, finding: Finding) -> str:
     """Return a short text for a finding: its sign, severity and check."""
-    severity = words(f"review.severity_{finding.severity}")
+    severity = words(_SEVERITIES[finding.severity])
     return f"{SEVERITY_SIGNS[finding.severity]} {severity}: {check_name(words, finding.check)}"
 
 
 def check_name(words: Words, check: str) -> str:
     """Return the name of a check in this language."""
-    return words.get(f"checks.{check}", check)
+    return words(CHECK_NAMES.get(check, check))
 
 
 def advice(words: Words, finding: Finding) -> str:
     """Return what a check advises to do about a finding, in this language."""
-    of_stream = words.get(f"advice.{finding.check}-stream") if finding.stream else ""
-    return of_stream or words.get(f"advice.{finding.check}", finding.action)
+    of_stream = _ADVICE.get(f"{finding.check}-stream") if finding.stream else None
+    return words(of_stream or _ADVICE.get(finding.check, finding.action))
 
 
 def finding_button(desk: ReviewController, finding: Finding, recording: str = "") -> ui.button:
@@ -79,8 +149,9 @@ def finding_button(desk: ReviewController, finding: Finding, recording: str = ""
     async def reopen() -> None:
         await desk.decide(recording or desk.current, lambda: desk.review.reopen_finding(desk.visit, finding, desk.name))
 
-    key, action = ("reopen", reopen) if finding.accepted else ("accept_finding", lambda: ask_reason(desk, finding))
-    return button("", desk.words(f"review.{key}"), action, "flat dense")
+    if finding.accepted:
+        return button("", desk.words("Reopen"), reopen, "flat dense")
+    return button("", desk.words("Harmless …"), lambda: ask_reason(desk, finding), "flat dense")
 
 
 def ask_reason(
@@ -93,16 +164,16 @@ def ask_reason(
     """
     words, recording = desk.words, desk.current
     if excluded is not None:
-        title = words("review.why_exclude_all", n=len(desk.selected))
+        title = words("Why are the selected recordings ({n}) excluded?", n=len(desk.selected))
     elif finding is None:
-        title = words("review.why_exclude", id=recording)
+        title = words("Why is {id} excluded?", id=recording)
     else:
         about = finding.about or desk.review.dataset.head.name
-        title = words("review.why_accept", check=check_name(words, finding.check), about=about)
+        title = words("Why is “{check}” harmless in {about}?", check=check_name(words, finding.check), about=about)
 
     async def answer(why: str) -> None:
         if not why.strip():
-            field.error = words("review.reason_needed")
+            field.error = words("A reason is missing. Give it in a few words.")
             field.run_method("focus")
             return
         dialog.close()
@@ -116,19 +187,19 @@ def ask_reason(
 
     with desk.page_slot, ui.dialog() as dialog:
         # Close without a transition, because the next key press is a command of the page again.
-        dialog.props(f'aria-label="{words("review.reason")}" transition-duration=0')
+        dialog.props(f'aria-label="{words("Reason")}" transition-duration=0')
         with tag(ui.card().classes("w-full"), "reason"):
             ui.label(title).classes("text-lg text-bold").style("overflow-wrap: anywhere")
             with ui.row().classes("ps-small-gap"):
                 for number, key in enumerate(_EXCLUDING if finding is None else _ACCEPTING):
-                    reason = words(f"review.because_{key}")
+                    reason = words(_REASONS[key])
                     look = "outline autofocus" if number == 0 else "outline"
                     button("", reason, lambda reason=reason: answer(reason), look)
-            field = ui.input(words("review.own_reason")).classes("w-full")
+            field = ui.input(words("Another reason")).classes("w-full")
             on_enter(tag(field, "own-reason"), lambda: answer(field.value or ""))
             with ui.row().classes("w-full justify-end"):
-                button("", words("review.cancel"), dialog.close, "flat")
-                go = words("review.exclude_go") if finding is None else words("review.accept_finding")
+                button("", words("Cancel"), dialog.close, "flat")
+                go = words("Exclude") if finding is None else words("Harmless …")
                 button("reason-go", go, lambda: answer(field.value or ""), "unelevated")
     dialog.on("hide", dialog.delete)
     dialog.open()
@@ -138,7 +209,7 @@ def recorded_as(words: Words, row: ReviewedRecording) -> str:
     """Return a text that names the recorded gesture if marks state another one, else ""."""
     if row.info.gesture == row.info.recorded:
         return ""
-    return words("review.recorded_as", gesture=words.gesture(row.info.recorded))
+    return words("recorded as {gesture}", gesture=words.gesture(row.info.recorded))
 
 
 def ask_gesture(
@@ -149,32 +220,37 @@ def ask_gesture(
     rows = [desk.review.rows[i] for i in identities]
     now = rows[0].info.gesture if len({r.info.gesture for r in rows}) == 1 else None
     title = (
-        words("review.which_gesture_all", n=len(rows))
+        words("Which gesture was made in the selected recordings ({n})?", n=len(rows))
         if len(rows) > 1
-        else words("review.which_gesture", id=rows[0].id)
+        else words("Which gesture was made in {id}?", id=rows[0].id)
     )
     options = {g: words.gesture(g) for g in desk.review.dataset.gestures.labels}
 
     async def done(gesture: str | None) -> None:
         if gesture is None:
-            choice.error = words("review.gesture_needed")
+            choice.error = words("Choose the gesture that was made.")
             return
         dialog.close()
         await answer(gesture, (why.value or "").strip())
 
     with desk.page_slot, ui.dialog() as dialog:
-        dialog.props(f'aria-label="{words("review.relabel_title")}" transition-duration=0')
+        dialog.props(f'aria-label="{words("Another gesture")}" transition-duration=0')
         with tag(ui.card().classes("w-full"), "relabelling"):
             ui.label(title).classes("text-lg text-bold").style("overflow-wrap: anywhere")
-            choice = ui.select(options, value=now if now in options else None, label=words("review.gesture"))
+            choice = ui.select(options, value=now if now in options else None, label=words("Gesture"))
             tag(choice.props("options-dense").classes("w-full"), "new-gesture")
-            why = tag(ui.input(words("review.why_optional")).classes("w-full"), "relabel-why")
-            ui.label(words("review.relabel_about")).classes("ps-dim")
+            why = tag(ui.input(words("Reason (optional)")).classes("w-full"), "relabel-why")
+            ui.label(
+                words(
+                    "The recording itself is not changed: the name of its file still says what was asked for. "
+                    "Checks, training and publishing use the new gesture."
+                )
+            ).classes("ps-dim")
             with ui.row().classes("w-full justify-end"):
-                button("", words("review.cancel"), dialog.close, "flat")
+                button("", words("Cancel"), dialog.close, "flat")
                 if any(r.info.gesture != r.info.recorded for r in rows):
-                    button("relabel-restore", words("review.relabel_restore"), lambda: done(""), "flat")
-                button("relabel-go", words("review.relabel_go"), lambda: done(choice.value), "unelevated")
+                    button("relabel-restore", words("As recorded"), lambda: done(""), "flat")
+                button("relabel-go", words("Set the gesture"), lambda: done(choice.value), "unelevated")
     dialog.on("hide", dialog.delete)
     dialog.open()
 
@@ -203,27 +279,27 @@ class RecordingTableView:
         words = desk.words
         with tag(ui.column().classes("w-full"), "list") as self.place:
             with ui.row().classes("w-full items-center ps-small-gap"):
-                button("start", words("review.start"), self._start, "unelevated color=primary")
+                button("start", words("Review one by one"), self._start, "unelevated color=primary")
                 self.range = tag(ui.label().classes("ps-number").props("role=status"), "range")
-                before, after = words("review.page_before"), words("review.page_after")
+                before, after = words("Previous page"), words(in_context("table", "Next page"))
                 self.before = icon_button("chevron_left", before, lambda: self.turn(-1), "flat round")
                 self.after = icon_button("chevron_right", after, lambda: self.turn(1), "flat round")
                 ui.space()
                 if not desk.review.is_labelled:
                     self._sure()
-                button("undo-list", words("review.undo"), desk.undo)
+                button("undo-list", words("Undo"), desk.undo)
                 self.again = button("check-again", "", self._check)
             with ui.row().classes("w-full items-center ps-small-gap"):
                 self.chosen = tag(ui.label().props("role=status"), "chosen")
                 self.all = button("select-all", "", self._select_all, "flat dense")
                 with ui.row().classes("items-center ps-small-gap") as self.acts:
                     if not desk.review.is_labelled:
-                        button("accept-selected", words("review.accept_selected"), self._accept)
-                    button("exclude-selected", words("review.exclude"), lambda: ask_reason(desk, None, self._exclude))
-                    button("include-selected", words("review.include"), self._include)
-                    button("relabel-selected", words("review.relabel"), self._relabel)
-                    button("select-none", words("review.select_none"), self._select_none, "flat")
-            with scroll_region(words("review.table")):
+                        button("accept-selected", words("Accept suggestions"), self._accept)
+                    button("exclude-selected", words("Exclude …"), lambda: ask_reason(desk, None, self._exclude))
+                    button("include-selected", words("Include again"), self._include)
+                    button("relabel-selected", words("Another gesture …"), self._relabel)
+                    button("select-none", words("Clear the selection"), self._select_none, "flat")
+            with scroll_region(words("Recordings")):
                 self.table = tag(ReviewTable(words, self._sort, desk.open, self._pick, self._pick_page), "table")
             with tag(ui.expansion().classes("w-full"), "elsewhere") as self.elsewhere:
                 self.others = ui.column().classes("w-full")
@@ -236,7 +312,11 @@ class RecordingTableView:
         first = desk.first_row = max(0, min(desk.first_row, (n - 1) // PER_PAGE * PER_PAGE))
         ids = desk.order[first : first + PER_PAGE]
         rows = desk.review.rows
-        text = words("review.range", first=first + 1, last=first + len(ids), n=n) if n else words("review.none_fit")
+        text = (
+            words("{first}–{last} of {n}", first=first + 1, last=first + len(ids), n=n)
+            if n
+            else words("No recording fits the filter.")
+        )
         self.range.set_text(text)
         self.before.set_enabled(first > 0)
         self.after.set_enabled(first + PER_PAGE < n)
@@ -244,7 +324,7 @@ class RecordingTableView:
         self.table.show([self._cells(rows[i]) for i in ids if i in rows], desk.by, desk.down, desk.current)
         unchecked = desk.review.unchecked
         self.again.set_visibility(unchecked > 0)
-        self.again.set_text(words("review.check_again", n=unchecked))
+        self.again.set_text(words("Check again (changed: {n})", n=unchecked))
         self._fill_others()
 
     refresh = draw
@@ -267,7 +347,7 @@ class RecordingTableView:
         by_check = {f.check: f for f in reversed(row.findings) if not f.accepted}
         findings = [{"severity": f.severity, "text": finding_text(words, f)} for f in reversed(by_check.values())]
         if not findings and row.findings:
-            findings = [{"severity": "", "text": words("review.all_accepted", n=len(row.findings))}]
+            findings = [{"severity": "", "text": words("✓ {n} accepted", n=len(row.findings))}]
         return {
             "id": row.id,
             "person": desk.person(row.info.subject),
@@ -277,7 +357,7 @@ class RecordingTableView:
             "seconds": f"{desk.words.number(row.seconds, 2)} s",
             "findings": findings,
             "state": row.state,
-            "state_text": f"{SIGNS[row.state]} {words(f'review.state_{row.state}')}",
+            "state_text": f"{SIGNS[row.state]} {words(STATE_TEXTS[row.state])}",
             "points": points,
             "kept": kept_range,
         }
@@ -290,13 +370,13 @@ class RecordingTableView:
         if content == self._others_content:
             return
         self._others_content = content
-        self.elsewhere.set_text(words("review.elsewhere", n=len(findings)))
+        self.elsewhere.set_text(words("Findings about sessions, people and the whole data set: {n}", n=len(findings)))
         self.others.clear()
         with self.others:
             for f in findings:
                 with ui.row().classes("w-full items-center ps-small-gap ps-row"):
                     ui.label(finding_text(words, f)).classes("text-bold")
-                    ui.label(f"{f.about or words('review.dataset')}: {words.sentence(f.message)}").classes(
+                    ui.label(f"{f.about or words('Data set')}: {words.sentence(f.message)}").classes(
                         "flex-grow ps-break"
                     )
                     finding_button(desk, f)
@@ -306,7 +386,7 @@ class RecordingTableView:
     def _sure(self) -> None:
         """Add the field for a confidence, and the button that accepts all suggestions that are surer."""
         words = self.desk.words
-        self.percent = ui.number(words("review.sure"), value=_SURE_PERCENT, min=0, max=100, step=5, format="%.0f")
+        self.percent = ui.number(words("Surer than"), value=_SURE_PERCENT, min=0, max=100, step=5, format="%.0f")
         self.percent.props('suffix="%"').style("width: 130px").on_value_change(self._show_selection)
         tag(self.percent, "sure")
         self.accept_sure = button("accept-sure", "", self._accept_sure)
@@ -325,13 +405,13 @@ class RecordingTableView:
         for gone in [i for i in desk.selected if i not in desk.review.infos]:
             del desk.selected[gone]
         n, fitting = len(desk.selected), len(desk.order)
-        self.chosen.set_text(words("review.selected", n=n) if n else words("review.none_selected"))
-        self.all.set_text(words("review.select_all", n=fitting))
+        self.chosen.set_text(words("Selected: {n}", n=n) if n else words("Nothing selected"))
+        self.all.set_text(words("Select all in the list ({n})", n=fitting))
         self.all.set_visibility(fitting > 0 and any(i not in desk.selected for i in desk.order))
         self.acts.set_visibility(n > 0)
         if not desk.review.is_labelled:
             surer = len(self._surer())
-            self.accept_sure.set_text(words("review.accept_sure", n=surer))
+            self.accept_sure.set_text(words("Accept suggestions: {n}", n=surer))
             self.accept_sure.set_enabled(surer > 0)
 
     def _pick(self, identity: str, through: bool) -> None:

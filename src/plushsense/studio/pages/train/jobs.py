@@ -10,9 +10,10 @@ from nicegui import ui
 
 from plushsense.studio.app.jobs import DONE, REFUSED, RUNNING, STOPPED, Jobs, StudioJob
 from plushsense.studio.app.shell import LINES, Page, address, button, html, moment, named, section, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.train.requests import KINDS, MAKE, SEARCH, SWEEP, TRAIN
 from plushsense.studio.pages.train.results import (
+    LINKS,
     ResultRow,
     StoredResults,
     counted,
@@ -21,7 +22,59 @@ from plushsense.studio.pages.train.results import (
     whole,
 )
 from plushsense.studio.pages.train.verdict import figures, headline, limits, people_table
-from plushsense.studio.widgets.elements import Plot
+from plushsense.studio.widgets.elements import KINDS_OF_TRAINING, Plot
+
+_CURVES_ABOUT: Texts = {
+    "make": (
+        "The first network, while it was trained without the people held back for validation, who are not those of "
+        "the score above. The saved network was then trained on everybody."
+    ),
+    "train": (
+        "The network that was scored, while it was trained. Validation: the people or recordings held back, on whom "
+        "the score above was measured."
+    ),
+    "evaluate": "The mean loss of all trainings.",
+    "sweep": "The best score after each training.",
+    "search": "The best score after each training.",
+}
+
+_METRICS: Texts = {
+    "loss": "Loss",
+    "accuracy": "Accuracy",
+    "best": "Best so far",
+}
+
+_LINES: Texts = {
+    "training": "training data",
+    "accuracy": "accuracy",
+    "macro_f1": "macro-F1",
+    "held_back": "validation",
+}
+
+_CUTS: Texts = {
+    "epochs": "The trainings were shortened to {epochs} epochs instead of {usual}, so the network may be less good.",
+    "folds": "People were left out in {folds} groups, not one by one.",
+    "learning": "What more people would add was not measured.",
+    "longer": "It took {minutes}, longer than the {budget} that were given.",
+}
+
+_STAGES: Texts = {
+    "reading": "reading the data",
+    "training": "training",
+    "refitting": "training again, on everybody",
+    "fine-tuning": "fine-tuning for 8 bits",
+    "deciding": "fitting the decision settings",
+    "first_network": "training a first network to find difficult moments",
+    "evaluating": "testing on people left out",
+    "learning": "measuring what more people would add",
+}
+
+_STATES: Texts = {
+    "running": "running",
+    "done": "done",
+    "refused": "failed",
+    "stopped": "stopped",
+}
 
 LOSS, ACCURACY, BEST = "loss", "accuracy", "best"
 
@@ -104,7 +157,7 @@ class JobsSection:
         self._cards: dict[str, _Card] = {}
         self._built: Any = None
         self._done: set[str] = set()
-        with section(self._words("train.work"), classes=""):
+        with section(self._words("Jobs"), classes=""):
             self._place = ui.column().classes("w-full")
         self.refresh()
 
@@ -135,11 +188,11 @@ class JobsSection:
         w = self._words
         with self._place:
             if not opened and not rest:
-                ui.label(w("train.no_work")).classes("ps-dim")
+                ui.label(w("Nothing has been trained here yet.")).classes("ps-dim")
             for job in opened:
                 self._cards[job.id] = _Card(self, job)
             if rest:
-                with ui.expansion(w("train.earlier"), icon="history").classes("w-full") as earlier:
+                with ui.expansion(w("Earlier jobs"), icon="history").classes("w-full") as earlier:
                     tag(earlier, "earlier")
                     for job in rest:
                         self._line(job)
@@ -148,9 +201,9 @@ class JobsSection:
         w = self._words
         with ui.row().classes("w-full items-center"):
             _badge(w, job.state)
-            ui.label(f"{w(f'train.kinds.{job.task}')}: {job.title}").classes("flex-grow")
+            ui.label(f"{w(KINDS_OF_TRAINING[job.task])}: {job.title}").classes("flex-grow")
             ui.label(moment(job.begun_s)).classes("ps-dim")
-            button("", w("train.show"), lambda: self.open(job.id), "flat dense", about=job.title)
+            button("", w("Show"), lambda: self.open(job.id), "flat dense", about=job.title)
 
     def open(self, identity: str) -> None:
         """Move a job from the list to a card."""
@@ -189,16 +242,16 @@ class _Card:
             named(box.props(f'data-job="{job.id}" data-state="{job.state}"'), job.title)
             with ui.row().classes("w-full items-center"):
                 tag(_badge(w, job.state), "state")
-                ui.label(f"{w(f'train.kinds.{job.task}')}: {job.title}").classes("text-bold")
+                ui.label(f"{w(KINDS_OF_TRAINING[job.task])}: {job.title}").classes("text-bold")
                 ui.space()
                 ui.label(moment(job.begun_s)).classes("ps-dim")
             if job.state == RUNNING:
                 self._bar = ui.linear_progress(0.0, show_value=False, size="14px").classes("w-full")
-                named(self._bar.props("instant-feedback"), w("train.progress", title=job.title))
+                named(self._bar.props("instant-feedback"), w("Progress of {title}", title=job.title))
                 tag(self._bar, "progress")
                 self._text = tag(ui.label(), "at")
             elif job.state == STOPPED:
-                ui.label(w("train.stopped_about"))
+                ui.label(w("Stopped. What is finished is saved; press “Continue” to go on."))
                 self._saved_network()
             elif job.state == REFUSED:
                 with ui.element("div").classes("ps-message ps-message-error w-full").props('role="alert"'):
@@ -209,8 +262,8 @@ class _Card:
             if job.state == RUNNING:
                 self._curves(charts)
             elif any(len(chart.x) > 1 for chart in charts):
-                with tag(ui.expansion(w("train.curves"), icon="show_chart").classes("w-full"), "curves"):
-                    ui.label(w(f"train.curves_about.{job.task}")).classes("ps-dim")
+                with tag(ui.expansion(w("How the training went"), icon="show_chart").classes("w-full"), "curves"):
+                    ui.label(w(_CURVES_ABOUT[job.task])).classes("ps-dim")
                     self._curves(charts)
             self._warnings = ui.column().classes("w-full")
             self._buttons()
@@ -224,19 +277,18 @@ class _Card:
 
     def _plot(self, chart: ProgressChart) -> None:
         w = self._words
-        title = w(f"train.{chart.metric}") if chart.metric != BEST else w("train.best")
+        title = w(_METRICS[chart.metric])
         unit = {LOSS: "", ACCURACY: " (0–1)", BEST: " (0–1)"}[chart.metric]
-        x = w("train.trainings") if chart.metric == BEST else w("train.epoch")
+        x = w("Trainings done") if chart.metric == BEST else w("Epoch")
         drawn = self._lines(chart)
         plot = Plot(f"{title}: {self._job.title}", drawn, x=x, y=title + unit, height=220)
         tag(plot, f"curve-{chart.metric}").begin(chart.x, chart.lines)
         self._plots.append((chart.metric, plot, chart.names))
 
     def _lines(self, chart: ProgressChart) -> list[dict[str, Any]]:
-        words = {name: self._words(f"train.lines.{name}") for name in ("training", "held_back", "accuracy", "macro_f1")}
         return [
             {
-                "label": words.get(name, name),
+                "label": self._words(_LINES.get(name, name)),
                 "stroke": LINES[i % len(LINES)],
                 "width": 2,
                 "points": len(chart.x) < 3,
@@ -265,7 +317,7 @@ class _Card:
             self._warned = len(job.warnings)
             self._warnings.clear()
             if job.warnings:
-                with self._warnings, ui.expansion(w("train.warnings", n=len(job.warnings)), icon="info") as more:
+                with self._warnings, ui.expansion(w("Good to know ({n})", n=len(job.warnings)), icon="info") as more:
                     tag(more.classes("w-full"), "warnings")
                     for sentence in warning_texts(w, job):
                         ui.label(f"• {sentence}").classes("ps-break")
@@ -274,30 +326,30 @@ class _Card:
         job, w = self._job, self._words
         with ui.row():
             if job.state == RUNNING:
-                button("stop", w("train.stop"), lambda: self._jobs.stop(job.id), icon="stop")
+                button("stop", w("Stop"), lambda: self._jobs.stop(job.id), icon="stop")
             else:
                 if job.state in (STOPPED, REFUSED):
-                    button("resume", w("train.resume"), lambda: self._jobs.resume(job.id), icon="play_arrow")
-                button("", w("train.hide"), lambda: self._jobs.close(job.id), "flat", about=job.title)
+                    button("resume", w("Continue"), lambda: self._jobs.resume(job.id), icon="play_arrow")
+                button("", w("Hide"), lambda: self._jobs.close(job.id), "flat", about=job.title)
 
     def _result(self) -> None:
         job, w = self._job, self._words
         identity = _identity(job)
         row = self._jobs.results.find(identity)
         if row is None:
-            tag(ui.label(w("train.result_removed")).classes("ps-dim"), "result")
+            tag(ui.label(w("The result was removed or cannot be read.")).classes("ps-dim"), "result")
         else:
             self._verdict(row)
         cut = [self._cut(one) for one in job.result.get("cut", ())]
         if cut:
             with tag(ui.column().classes("ps-no-gap"), "cut"):
-                ui.label(w("train.cut.title")).classes("text-bold")
+                ui.label(w("What did not fit into the time:")).classes("text-bold")
                 for sentence in cut:
                     ui.label(f"• {sentence}")
         with ui.row().classes("items-center"):
             self._links()
             if row is not None:
-                show = w("train.open_result")
+                show = w("Open in the results")
                 button("open-result", show, lambda: self._jobs.open_result(identity), "flat dense", about=job.title)
 
     def _verdict(self, row: ResultRow) -> None:
@@ -309,10 +361,12 @@ class _Card:
         for sentence in limits(w, row):
             ui.label(sentence)
         if row.simulated:
-            ui.label(w("shell.simulation"))
+            ui.label(w("Simulation: these data say nothing about a real toy."))
         tag(ui.label(figures(w, row)).classes("ps-dim"), "result")
         if row.people:
-            with tag(ui.expansion(w("train.people"), icon="groups", value=True).classes("w-full"), "people-bars"):
+            with tag(
+                ui.expansion(w("Scores of each person"), icon="groups", value=True).classes("w-full"), "people-bars"
+            ):
                 html(people_table(w, row)).classes("ps-scroll-x")
 
     def _cut(self, cut: dict[str, Any]) -> str:
@@ -320,13 +374,21 @@ class _Card:
         values = {key: value for key, value in cut.items() if key != "kind"}
         if cut["kind"] == "longer":
             values = {key: counted(w, "minutes", n) for key, n in values.items()}
-        return w(f"train.cut.{cut['kind']}", **values)
+        return w(_CUTS[cut["kind"]], **values)
 
     def _saved_network(self) -> None:
         """Name the network that a stopped job has saved already."""
         bundle = _saved_bundle(self._job)
         if bundle:
-            tag(ui.label(self._words("train.saved_already", name=Path(bundle).stem)), "saved")
+            tag(
+                ui.label(
+                    self._words(
+                        "The network “{name}” is saved and can be used. Its test on people left out is not finished.",
+                        name=Path(bundle).stem,
+                    )
+                ),
+                "saved",
+            )
             with ui.row():
                 self._links()
 
@@ -334,8 +396,8 @@ class _Card:
         job, w = self._job, self._words
         bundle = job.result.get("bundle") or _saved_bundle(job)
         if bundle and Path(bundle).is_file():
-            for to in ("live", "export"):
-                link = ui.link(w(f"train.to_{to}"), address(to, model=bundle)).classes("ps-link")
+            for to, text in LINKS.items():
+                link = ui.link(w(text), address(to, model=bundle)).classes("ps-link")
                 tag(link, f"to-{to}")
 
 
@@ -362,23 +424,25 @@ def warning_texts(w: Words, job: StudioJob) -> list[str]:
 
 def _progress_text(w: Words, at: dict[str, Any]) -> str:
     """Describe the progress of a job in words."""
-    parts = [w(f"train.stages.{at.get('stage', 'reading')}")]
+    parts = [w(_STAGES[at.get("stage", "reading")])]
     at = {key: whole(w, value) if key in ("networks", "trainings") else value for key, value in at.items()}
     if "rung" in at:
-        parts.append(w("train.at_rung", **{key: at[key] for key in ("rung", "rungs", "networks")}))
+        parts.append(
+            w("round {rung} of {rungs}, {networks} networks", **{key: at[key] for key in ("rung", "rungs", "networks")})
+        )
     if "folds" in at:
-        parts.append(w("train.at_folds", done=at["done"], folds=at["folds"]))
+        parts.append(w("groups of people: {done} of {folds}", done=at["done"], folds=at["folds"]))
     if "trainings" in at:
-        parts.append(w("train.at_trainings", done=at["done"], trainings=at["trainings"]))
+        parts.append(w("trainings: {done} of {trainings}", done=at["done"], trainings=at["trainings"]))
     if at.get("resumed"):
-        parts.append(w("train.resumed", n=at["resumed"]))
+        parts.append(w("{n} done before", n=at["resumed"]))
     if at.get("epoch") and at.get("stage") != "deciding" and "folds" not in at and "trainings" not in at:
-        parts.append(w("train.at_epoch", epoch=at["epoch"], epochs=at["epochs"]))
+        parts.append(w("epoch {epoch} of {epochs}", epoch=at["epoch"], epochs=at["epochs"]))
     if at.get("left_s") is not None:
-        parts.append(w("train.left", time=duration_text(w, at["left_s"])))
+        parts.append(w("{time} left", time=duration_text(w, at["left_s"])))
     return " · ".join(parts)
 
 
 def _badge(w: Words, state: str) -> ui.label:
-    badge = ui.label(w(f"train.states.{state}")).classes("q-px-sm rounded-borders")
+    badge = ui.label(w(_STATES[state])).classes("q-px-sm rounded-borders")
     return badge.style(f"background: {_BADGES[state]}; color: #fff; font-weight: 600")

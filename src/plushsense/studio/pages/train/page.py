@@ -14,7 +14,7 @@ from plushsense.models.arch import DEFAULT_FILTERS, DEFAULT_SYMBOL, NORMS, PADDI
 from plushsense.scoring.splits import parse_split
 from plushsense.studio.app.jobs import DONE, RUNNING, Jobs, StudioJob
 from plushsense.studio.app.shell import Page, add_style, button, focus, html, on_change, query_path, section, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.train.jobs import JobsSection, warning_texts
 from plushsense.studio.pages.train.requests import (
     EVALUATE,
@@ -33,9 +33,81 @@ from plushsense.studio.pages.train.requests import (
 from plushsense.studio.pages.train.results import StoredResults, counted, duration_text, score_labels, whole
 from plushsense.studio.pages.train.results_section import ResultsSection
 from plushsense.studio.pages.train.verdict import FEW_PEOPLE
-from plushsense.studio.widgets.elements import scroll_to
+from plushsense.studio.widgets.elements import KINDS_OF_TRAINING, scroll_to
 from plushsense.training.spec import DEVICES, PRESETS
 from plushsense.windows.cut import ANYWHERE, CONTEXTS, TRAIN_CONTEXTS
+
+_KINDS_ABOUT: Texts = {
+    "sweep": (
+        "Every network of a list is trained and scored. This can take hours, so look at the cost first. You can stop "
+        "and continue at any time."
+    ),
+    "search": (
+        "Finds the best network within your size limits without training all networks to the end. Look at the cost "
+        "first."
+    ),
+    "train": (
+        "One network is trained on all people except a few, who are used to check it. It is ready for the live page "
+        "and for the toy."
+    ),
+    "evaluate": (
+        "The network is trained several times, each time without some of the people, and tested on exactly those. "
+        "Report this score."
+    ),
+}
+
+_LABELS: Texts = {
+    "name": "Name of the result",
+    "context": "What comes before a gesture",
+    "preset": "Schedule",
+    "epochs": "Epochs (empty: as in the schedule)",
+    "seed": "Seed",
+    "split": "Who is left out",
+    "grid": "List of networks",
+    "grid_epochs": "Epochs, separated by commas",
+    "max_parameters": "Maximum number of parameters",
+    "max_state_bytes": "Maximum bytes of state",
+    "max_macs_per_step": "Maximum MAC per step of 50 ms",
+    "seeds": "Seeds (number of trainings of each)",
+    "arch": "Network (kernel lengths)",
+    "architectures": "Only these networks",
+    "filters": "Filters",
+    "padding": "Padding",
+    "norm": "Normalisation",
+    "batch": "Windows per batch",
+    "batches": "Windows per batch, separated by commas",
+    "classes": "Gestures (shared, all, or names separated by commas)",
+    "device": "Train on",
+    "quantize_aware": "Epochs of fine-tuning for 8 bits",
+    "fit_decisions": "Fit the decision settings",
+    "int8": "Also score in 8 bits",
+    "train_context": "Context to train on",
+    "share": "Share of the full cost (0 to 1)",
+}
+
+_CONTEXTS: Texts = {
+    "default": "as in the schedule",
+    "anywhere": "anywhere: for live use, also learns idleness",
+    "stream": "stream: the real past in the session",
+    "loop": "loop: the gesture repeated",
+    "rows": "rows: the same, as the authors' scripts cut it",
+}
+
+_PRESETS: Texts = {
+    "people": "people: best for new people (60 epochs)",
+    "loso": "loso: as in the paper, stops by itself",
+    "paper": "paper: network and windows as in the paper",
+    "search": "search: 250 epochs, random windows (leaky)",
+}
+
+_SPLITS: Texts = {
+    "leave-one-subject-out": "each person once (leave-one-subject-out)",
+    "by-subject:5": "people in 5 groups (by-subject:5)",
+    "by-recording:5": "recordings in 5 groups, known people (by-recording:5)",
+    "windows:5": "windows in 5 groups (windows:5), leaky",
+    "windows:holdout": "15 % of the windows (windows:holdout), leaky",
+    "default": "as in the list",
+}
 
 # Budget of *Make a network*, if nothing else is given.
 _MINUTES = 10
@@ -93,15 +165,17 @@ class TrainingForm:
         self._usual: dict[str, Any] = {}
         self._minutes: Any = _MINUTES
         w = self._words
-        with section(w("train.new")):
+        with section(w("Make a network")):
             if not self._datasets:
-                ui.label(w("train.no_data"))
+                ui.label(w("There is no data set yet. Record a session, or import recordings on the home page."))
                 return
             self._usual_fields()
-            with tag(ui.expansion(w("train.more"), icon="tune").classes("w-full"), "more") as self._more:
-                kinds = {kind: w(f"train.kinds.{kind}") for kind in KINDS}
+            with tag(
+                ui.expansion(w("More settings and other jobs"), icon="tune").classes("w-full"), "more"
+            ) as self._more:
+                kinds = {kind: w(KINDS_OF_TRAINING[kind]) for kind in KINDS}
                 radio = ui.radio(kinds, value=self._kind, on_change=self._choose_kind).props("inline")
-                tag(radio, "kind").props(f'aria-label="{w("train.kind")}"')
+                tag(radio, "kind").props(f'aria-label="{w("What to do")}"')
                 self._kind_about = tag(ui.label().classes("ps-dim"), "kind-about")
                 self._fields = ui.column().classes("w-full ps-small-gap")
                 self._buttons()
@@ -109,22 +183,27 @@ class TrainingForm:
 
     def _usual_fields(self) -> None:
         w = self._words
-        ui.label(w("train.make_about"))
+        ui.label(
+            w(
+                "Choose the data set and press the button. The network is trained for live use, then tested on "
+                "people that it never met."
+            )
+        )
         with ui.row().classes("w-full items-start"):
-            box = ui.select(self._datasets, label=w("train.data"), value=self._dataset, on_change=self._choose_dataset)
+            box = ui.select(self._datasets, label=w("Data set"), value=self._dataset, on_change=self._choose_dataset)
             self._usual["dataset"] = tag(box.classes(_FIELD), "dataset")
-            minutes = ui.input(w("train.minutes"), value=str(_MINUTES), on_change=self._choose_minutes)
+            minutes = ui.input(w("Minutes, at most"), value=str(_MINUTES), on_change=self._choose_minutes)
             self._usual["minutes"] = tag(minutes.props('inputmode="numeric"').classes("w-36"), "minutes")
-            button("make", w("train.make"), self._make, "unelevated", icon="auto_awesome")
+            button("make", w("Make a network"), self._make, "unelevated", icon="auto_awesome")
         self._facts = tag(ui.row().classes("items-center"), "facts")
 
     def _buttons(self) -> None:
         w = self._words
         with ui.row().classes("items-center"):
-            button("estimate", w("train.estimate"), self._estimate, icon="schedule")
-            button("start", w("train.start"), self._start, "unelevated", icon="play_arrow")
+            button("estimate", w("How long will it take?"), self._estimate, icon="schedule")
+            button("start", w("Start"), self._start, "unelevated", icon="play_arrow")
         self._plan = tag(ui.column().classes("w-full ps-small-gap").props('role="status"'), "plan")
-        with ui.expansion(w("train.command"), icon="terminal").classes("w-full"):
+        with ui.expansion(w("The same job on the command line"), icon="terminal").classes("w-full"):
             self._command = tag(ui.label().classes("ps-code"), "command")
 
     async def read(self) -> None:
@@ -142,14 +221,16 @@ class TrainingForm:
                 ui.label(", ".join(counted(w, kind, n) for kind, n in counts.items()))
                 if facts.simulated:
                     html(score_labels(w, False, True))
-                    ui.label(w("shell.simulation")).classes("ps-dim")
+                    ui.label(w("Simulation: these data say nothing about a real toy.")).classes("ps-dim")
                 if 0 < facts.people < FEW_PEOPLE:
-                    ui.label(w("train.few_people")).classes("ps-dim")
+                    ui.label(w("With so few people, every score is uncertain.")).classes("ps-dim")
             if not facts.streams and self._values[TRAIN]["context"] == ANYWHERE:
                 self._values[TRAIN]["context"] = "loop"
                 self._build()
                 with self._facts:
-                    ui.label(w("train.no_streams")).classes("ps-dim")
+                    ui.label(
+                        w("This data set has no continuous sessions, so the network learns from repeated gestures.")
+                    ).classes("ps-dim")
 
     async def _choose_dataset(self, event: Any) -> None:
         self._dataset = str(event.value)
@@ -172,12 +253,12 @@ class TrainingForm:
 
     def _build(self) -> None:
         """Build the fields for the chosen kind of job."""
-        self._kind_about.set_text(self._words(f"train.kind_about.{self._kind}"))
+        self._kind_about.set_text(self._words(_KINDS_ABOUT[self._kind]))
         self._fields.clear()
         self._boxes = dict(self._usual)
         with self._fields:
             {TRAIN: self._of_train, EVALUATE: self._of_evaluate}.get(self._kind, self._of_grid)()
-            with ui.expansion(self._words("train.advanced"), icon="tune").classes("w-full") as self._advanced:
+            with ui.expansion(self._words("Advanced settings"), icon="tune").classes("w-full") as self._advanced:
                 tag(self._advanced, "advanced")
                 with ui.row().classes("w-full"):
                     for key in _ADVANCED[self._kind]:
@@ -189,39 +270,45 @@ class TrainingForm:
         self._values[TRAIN].setdefault("name", free_name(self._page.workspace, self._jobs, title))
         with ui.row().classes("w-full"):
             self._field("name")
-            self._select("context", self._texts("contexts", ("", *TRAIN_CONTEXTS)))
-            self._select("preset", self._texts("presets", PRESETS))
+            self._select("context", self._texts(_CONTEXTS, ("", *TRAIN_CONTEXTS)))
+            self._select("preset", self._texts(_PRESETS, PRESETS))
             self._field("epochs")
             self._field("seed")
 
     def _of_evaluate(self) -> None:
         with ui.row().classes("w-full"):
-            self._select("split", self._texts("splits", SPLITS))
-            self._select("preset", self._texts("presets", PRESETS))
-            self._select("context", self._texts("contexts", ("", *TRAIN_CONTEXTS)))
+            self._select("split", self._texts(_SPLITS, SPLITS))
+            self._select("preset", self._texts(_PRESETS, PRESETS))
+            self._select("context", self._texts(_CONTEXTS, ("", *TRAIN_CONTEXTS)))
             self._field("epochs")
             self._field("seed")
         self._split_line()
 
     def _of_grid(self) -> None:
         w = self._words
-        options = {PAPER: w("train.grids.paper" if self._kind == SWEEP else "train.grids.search")}
+        options = {
+            PAPER: w(
+                "of the paper: 13 networks × 4 sizes × 3 epochs × 3 batches = 468 trials"
+                if self._kind == SWEEP
+                else "of the paper: 52 networks"
+            )
+        }
         options |= {str(path): path.name for path in grids(self._page.workspace)}
         with ui.row().classes("w-full"):
             self._select("grid", options)
-            self._select("split", self._texts("splits", ("", *SPLITS)))
+            self._select("split", self._texts(_SPLITS, ("", *SPLITS)))
             if self._kind == SWEEP:
                 self._field("grid_epochs", key="epochs")
             else:
                 for key in ("max_parameters", "max_state_bytes", "max_macs_per_step"):
                     self._field(key)
             self._field("seeds")
-        ui.label(w("train.grids_about", folder=self._page.workspace.folder)).classes("ps-dim")
+        ui.label(w("Your own lists: TOML files in {folder}.", folder=self._page.workspace.folder)).classes("ps-dim")
         self._split_line()
 
-    def _texts(self, table: str, keys: Iterable[str]) -> dict[str, str]:
+    def _texts(self, table: Texts, keys: Iterable[str]) -> dict[str, str]:
         """Return the text of each option; the key "" stands for the default."""
-        return {key: self._words(f"train.{table}.{key or 'default'}") for key in keys}
+        return {key: self._words(table[key or "default"]) for key in keys}
 
     def _split_line(self) -> None:
         self._split_row = tag(ui.row().classes("items-center"), "split-about")
@@ -238,9 +325,14 @@ class TrainingForm:
         with self._split_row:
             if parse_split(split).leaky:
                 html(score_labels(self._words, True, False))
-                ui.label(self._words("train.leaky_about"))
+                ui.label(
+                    self._words(
+                        "Leaky: parts of one recording are on both sides of this split, so the score is too good. "
+                        "Never report it as the score for new people."
+                    )
+                )
             elif split.startswith("by-recording"):
-                ui.label(self._words("train.known_about"))
+                ui.label(self._words("The network knows these people: expect lower scores for new people."))
 
     def _field(self, text: str, *, key: str = "") -> None:
         """Build the field of a setting: a selection, a number, a checkbox or a text.
@@ -250,10 +342,10 @@ class TrainingForm:
             key: name of the setting, if it differs from ``text``.
         """
         name = key or text
-        label = self._words(f"train.{text}")
+        label = self._words(_LABELS[text])
         value = self._values[self._kind].get(name)
         if text in _CHOICES:
-            self._select(text, {"": self._words("train.as_default"), **{one: one for one in _CHOICES[text]}})
+            self._select(text, {"": self._words("default"), **{one: one for one in _CHOICES[text]}})
         elif text in ("fit_decisions", "int8"):
             tag(ui.checkbox(label, value=bool(value), on_change=self._store(name)), name)
         else:
@@ -265,7 +357,7 @@ class TrainingForm:
     def _select(self, key: str, options: Mapping[str, str]) -> None:
         stored = self._values[self._kind].get(key, "")
         value = stored if stored in options else next(iter(options))
-        label = self._words(f"train.{key}")
+        label = self._words(_LABELS[key])
         box = ui.select(dict(options), label=label, value=value, on_change=self._store(key))
         self._boxes[key] = tag(box.classes(_FIELD), key)
 
@@ -328,7 +420,9 @@ class TrainingForm:
 
     def _begin(self, request: JobRequest) -> None:
         self._jobs.start(request.task, request.spec, request.title)
-        self._page.say(self._words("train.begun"), "good")
+        self._page.say(
+            self._words("The work has begun: its progress is under “Jobs” below. You may close this page."), "good"
+        )
         scroll_to("job")
 
     def _estimate(self) -> None:
@@ -340,14 +434,21 @@ class TrainingForm:
             self._plan.clear()
             with self._plan, ui.row().classes("items-center"):
                 ui.spinner(size="sm")
-                ui.label(self._words("train.estimating"))
+                ui.label(self._words("Reading the data and measuring the speed of this computer …"))
 
     def _start(self) -> None:
         self._page.say("")
         with self._show_errors():
             request = self._request()
             if request.task in (SWEEP, SEARCH) and self._estimated != request.key:
-                self._page.say(self._words("train.changed" if self._estimated else "train.look_first"), "warning")
+                self._page.say(
+                    self._words(
+                        "The settings have changed since then. Estimate again."
+                        if self._estimated
+                        else "Look at the cost first: press “How long will it take?”, then start."
+                    ),
+                    "warning",
+                )
                 return
             self._begin(request)
             self._estimated = ""
@@ -381,7 +482,7 @@ class TrainingForm:
             for sentence in warning_texts(self._words, job):
                 ui.label(f"• {sentence}").classes("ps-dim")
             if not same:
-                ui.label(self._words("train.changed"))
+                ui.label(self._words("The settings have changed since then. Estimate again."))
         if same and not job.result.get("problems"):
             self._estimated = request.key
 
@@ -389,14 +490,15 @@ class TrainingForm:
         w = self._words
         if plan.get("problems"):
             with ui.element("div").classes("ps-message ps-message-error w-full").props('role="alert"'):
-                ui.label(w("train.problems"))
+                ui.label(w("This cannot be trained:"))
                 for problem in plan["problems"]:
                     ui.label(f"• {w.explain(problem)}")
             return
         html(score_labels(w, plan["leaky"], plan["simulated"]))
         if task in (TRAIN, EVALUATE):
             text = w(
-                "train.plan_one",
+                "{people}, {gestures}, {windows} windows; {trainings} of at most {epochs}; {parameters} parameters, "
+                "{macs} multiply-accumulates.",
                 people=counted(w, "people", plan["people"]),
                 gestures=counted(w, "gestures", plan["classes"]),
                 trainings=counted(w, "networks", plan["folds"]),
@@ -406,10 +508,16 @@ class TrainingForm:
             )
         elif task == SWEEP:
             counts = {key: plan[key] for key in ("trials", "trainings", "folds", "seeds", "held", "split")}
-            text = w("train.plan_grid", **counts, macs=_power(w, plan["macs"]))
+            text = w(
+                "{trials} trials in {trainings} trainings (folds: {folds}, seeds: {seeds}), {held} done before; "
+                "split {split}; {macs} multiply-accumulates.",
+                **counts,
+                macs=_power(w, plan["macs"]),
+            )
         else:
             text = w(
-                "train.plan_search",
+                "{candidates} networks compared after {rungs} epochs, {left_out} beyond the limits; split {split}; "
+                "at most {share} % of the whole list’s cost, {macs} multiply-accumulates.",
                 candidates=plan["candidates"],
                 rungs=", ".join(map(str, plan["rungs"])),
                 left_out=len(plan["left_out"]),
@@ -418,7 +526,16 @@ class TrainingForm:
                 macs=_power(w, plan["bound_macs"]),
             )
         tag(ui.label(text), "plan-text")
-        tag(ui.label(w("train.about", time=duration_text(w, plan["seconds"]))), "plan-time")
+        tag(
+            ui.label(
+                w(
+                    "This takes {time} on this computer, as measured just now. Reading the data and fitting "
+                    "decisions take additional time.",
+                    time=duration_text(w, plan["seconds"]),
+                )
+            ),
+            "plan-time",
+        )
 
 
 def _power(words: Words, value: float) -> str:
@@ -448,7 +565,12 @@ async def show(page: Page) -> None:
     """Build the page."""
     add_style(_CSS.read_text(encoding="utf-8"))
     jobs, results = page.workspace.part(Jobs), page.workspace.part(StoredResults)
-    ui.label(page.words("train.intro")).classes("ps-dim")
+    ui.label(
+        page.words(
+            "A network learns from recordings to tell gestures apart. Here you train networks, test them on new "
+            "people, and compare them."
+        )
+    ).classes("ps-dim")
     rows = await run.io_bound(results.rows)
     form = TrainingForm(page, jobs, results)
     job_list = JobsSection(page, jobs, results, lambda identity: table.open(identity))

@@ -21,11 +21,12 @@ from plushsense.studio.app.shell import (
     scroll_region,
     tag,
 )
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.review.review import Reviews
 from plushsense.studio.pages.train.results import (
     EVALUATION,
     HELD_BACK,
+    LINKS,
     TRAINING,
     Confusion,
     MisreadRecording,
@@ -43,6 +44,19 @@ from plushsense.studio.pages.train.results import (
 )
 from plushsense.studio.pages.train.verdict import figures, headline, limits
 from plushsense.studio.widgets.elements import table_html
+
+_HEADS: Texts = {
+    "person": "Person",
+    "recordings": "Recordings",
+    "windows": "Windows",
+    "accuracy": "Accuracy",
+    "macro_f1": "Macro-F1",
+    "by_recording": "Accuracy by recording",
+    "gesture": "Gesture",
+    "predicted": "Read as",
+    "of_windows": "Windows with this answer",
+    "person_of": "Recording",
+}
 
 _CLICKS = '(e) => { const b = e.target.closest("[data-cell]"); if (b) emit(b.dataset.cell); }'
 
@@ -74,28 +88,43 @@ class ResultDetailsView:
             return
         row = d.row
         with self._place, ui.element("section").classes("ps-card w-full column no-wrap ps-small-gap") as card:
-            card.props(f'aria-label="{w("train.details")}"')
+            card.props(f'aria-label="{w("Details")}"')
             with ui.row().classes("w-full items-center"):
                 title = " · ".join((row.data, row.network, split_text(w, row.split), context_text(w, row.context)))
                 heading(title, 3).classes("text-bold", remove="text-lg")
                 html(score_labels(w, row.leaky, row.simulated))
                 ui.space()
-                icon_button("close", w("train.close"), self._close, color=None)
+                icon_button("close", w("Close"), self._close, color=None)
             if row.leaky:
-                ui.label(w("train.leaky_about"))
+                ui.label(
+                    w(
+                        "Leaky: parts of one recording are on both sides of this split, so the score is too good. "
+                        "Never report it as the score for new people."
+                    )
+                )
             tag(ui.label(headline(w, row)).classes("text-bold"), "details-verdict")
             for sentence in limits(w, row):
                 ui.label(sentence)
             tag(ui.label(figures(w, row)).classes("ps-dim"), "details-figures")
-            ui.label(w("train.size", parameters=whole(w, row.parameters), macs=whole(w, row.macs))).classes("ps-dim")
+            ui.label(
+                w(
+                    "{parameters} parameters, {macs} multiply-accumulates in 50 ms.",
+                    parameters=whole(w, row.parameters),
+                    macs=whole(w, row.macs),
+                )
+            ).classes("ps-dim")
             if row.kind == TRAINING:
                 self._training(d)
             if d.by_gesture is not None:
                 self._confusions(d)
             elif d.later:
-                button("show-confusions", w("train.confusion_later"), self._compute, icon="grid_on")
+                button(
+                    "show-confusions", w("Show the confusions of the validation people"), self._compute, icon="grid_on"
+                )
             else:
-                ui.label(w("train.confusion_none")).classes("ps-dim")
+                ui.label(w("No confusions are stored for this result. Evaluate the network to see them.")).classes(
+                    "ps-dim"
+                )
             if d.people:
                 self._people(d)
 
@@ -104,7 +133,7 @@ class ResultDetailsView:
         d = self._details
         if d is None:
             return
-        self._page.say(self._words("train.confusion_computing"))
+        self._page.say(self._words("Reading the recordings of the validation people …"))
         with self._page.show_errors():
             found = await run.io_bound(self._results.with_predictions, d)
             self._page.say("")
@@ -115,32 +144,54 @@ class ResultDetailsView:
     def _training(self, d: ResultDetails) -> None:
         w, facts = self._words, d.facts
         checked = sorted(known_people(facts, ["validation_subjects"]))
-        held_back = "train.facts_refit" if facts.get("refit") else "train.facts_training"
+        held_back = (
+            "Checked on {checked} ({names}) before it was trained again on all {trained}."
+            if facts.get("refit")
+            else "Trained on {trained}, checked on {checked}: {names}."
+        )
         text = w(
-            held_back if d.row.spread == HELD_BACK else "train.facts_same",
+            held_back
+            if d.row.spread == HELD_BACK
+            else "Trained on {trained}, and checked on recordings of the same people.",
             trained=counted(w, "with_people", len(known_people(facts, ["subjects"]))),
             checked=counted(w, "with_people", len(checked)),
             names=", ".join(checked) or "–",
         )
         ui.label(text)
         with ui.row():
-            for to in ("live", "export"):
-                ui.link(w(f"train.to_{to}"), address(to, model=d.row.path)).classes("ps-link")
+            for to, text in LINKS.items():
+                ui.link(w(text), address(to, model=d.row.path)).classes("ps-link")
 
     # Confusions -----------------------------------------------------------------------------------------------
 
     def _confusions(self, d: ResultDetails) -> None:
         w = self._words
-        heading(w("train.confusion"), 4)
-        ui.label(w("train.confusion_about" if d.clickable else "train.confusion_kept")).classes("ps-dim")
+        heading(w("Confusions"), 4)
+        ui.label(
+            w(
+                "Rows: the true gesture. Columns: the answer of the network. Each cell has the number of windows and "
+                "their share of the row. Click a number to see the recordings."
+                if d.clickable
+                else "For this network only the counts are stored. Evaluate it to see the recordings behind them."
+            )
+        ).classes("ps-dim")
         if d.pooled is not None and d.row.rest is not None:
-            tag(ui.label(w("train.confusion_pooled", pooled=figure(w, d.pooled))).classes("ps-dim"), "pooled")
-        choices = {"gesture": w("train.by_gesture"), "affect": w("train.by_affect")}
+            tag(
+                ui.label(
+                    w(
+                        "Pooled over all windows at once, with recordings at rest, the accuracy is {pooled}. The "
+                        "matrix counts in this way.",
+                        pooled=figure(w, d.pooled),
+                    )
+                ).classes("ps-dim"),
+                "pooled",
+            )
+        choices = {"gesture": w("By gesture"), "affect": w("By affect")}
         radio = ui.radio(choices, value=self._by, on_change=self._group).props("inline")
-        tag(radio, "by").props(f'aria-label="{w("train.confusion")}"')
+        tag(radio, "by").props(f'aria-label="{w("Confusions")}"')
         self._worst = html().on("click", self._clicked, js_handler=_CLICKS)
         tag(self._worst, "worst")
-        box = tag(scroll_region(w("train.confusion")).classes("ps-desk"), "confusion")
+        box = tag(scroll_region(w("Confusions")).classes("ps-desk"), "confusion")
         with box.on("click", self._clicked, js_handler=_CLICKS):
             self._table = html()
         self._cell = tag(ui.column().classes("w-full").props('aria-live="polite"'), "cell")
@@ -182,7 +233,11 @@ class ResultDetailsView:
             name = self._words.affect if self._by == "affect" else self._words.gesture
             windows = sum(row.windows for row in rows)
             title = self._words(
-                "train.cell_title", truth=name(truth), predicted=name(predicted), n=len(rows), windows=windows
+                "{truth} read as {predicted} (recordings: {n}, windows: {windows})",
+                truth=name(truth),
+                predicted=name(predicted),
+                n=len(rows),
+                windows=windows,
             )
             link = await run.io_bound(self._link, d.row.dataset, [row.recording for row in rows], title)
             # Ignore this answer if another cell was clicked or another result opened in the meantime.
@@ -208,7 +263,7 @@ class ResultDetailsView:
         with self._cell:
             tag(heading(title, 5), "cell-title")
             if link:
-                tag(ui.link(w("train.all_in_review"), link).classes("ps-link"), "cell-all")
+                tag(ui.link(w("All of them in Review"), link).classes("ps-link"), "cell-all")
             with scroll_region(title):
                 tag(html(_recordings(w, d.row.dataset, rows)), "cell-list")
 
@@ -216,11 +271,12 @@ class ResultDetailsView:
 
     def _people(self, d: ResultDetails) -> None:
         w, row = self._words, d.row
-        heading(w("train.people"), 4)
+        heading(w("Scores of each person"), 4)
         scores = [one["macro_f1"] for one in d.people if one["macro_f1"] is not None]
         if row.kind == EVALUATION and scores:
             text = w(
-                "train.spread",
+                "Accuracy {accuracy}, macro-F1 {macro_f1} (mean ± standard deviation over {over}); macro-F1 of "
+                "single people from {low} to {high}.",
                 accuracy=score_text(w, row.accuracy, row.accuracy_sd),
                 macro_f1=score_text(w, row.macro_f1, row.macro_f1_sd),
                 over=averaged_over(w, row.spread, row.units),
@@ -228,10 +284,10 @@ class ResultDetailsView:
                 high=figure(w, max(scores)),
             )
             tag(ui.label(text), "spread")
-        head = [w(f"train.{k}") for k in ("person", "recordings", "windows", "accuracy", "macro_f1", "by_recording")]
+        head = [w(_HEADS[k]) for k in ("person", "recordings", "windows", "accuracy", "macro_f1", "by_recording")]
         keys = ("accuracy", "macro_f1", "by_recording_accuracy")
         cells = [(p["subject"], p["recordings"], p["windows"], *(figure(w, p[key]) for key in keys)) for p in d.people]
-        with scroll_region(w("train.people")):
+        with scroll_region(w("Scores of each person")):
             table = html(table_html(head, cells, numbers=range(1, 6), row_heads=True)).classes("ps-people")
             tag(table, "people")
 
@@ -254,11 +310,16 @@ def confusion_table(w: Words, confusion: Confusion, by_affect: bool, clickable: 
             text = Markup("{}<small>{:.0f} %</small>").format(n, 100 * share)
             if clickable:
                 button = Markup('<button data-cell="{},{}">{}<span class="ps-visually-hidden">{}</span></button>')
-                text = button.format(i, j, text, w("train.cell", truth=names[i], predicted=names[j]))
+                text = button.format(
+                    i,
+                    j,
+                    text,
+                    w("{truth} read as {predicted}. Show the recordings", truth=names[i], predicted=names[j]),
+                )
             shade = f"background: rgba(0, 114, 178, {0.06 + 0.44 * share:.2f})"
             cells.append(Markup('<td class="{}" style="{}">{}</td>').format(kind, shade, text))
         rows.append(Markup('<tr><th scope="row">{}</th>{}</tr>').format(names[i], Markup("").join(cells)))
-    corner = f"{w('train.truth')} ↓ / {w('train.network_answer')} →"
+    corner = f"{w('True gesture')} ↓ / {w('Answer')} →"
     return Markup(
         '<table class="ps-table ps-confusion"><thead><tr><th scope="col">{}</th>{}</tr></thead>'
         "<tbody>{}</tbody></table>"
@@ -277,12 +338,12 @@ def worst_table(w: Words, confusion: Confusion, by_affect: bool, clickable: bool
         found += [(n / sum(counts), n, i, j) for j, n in enumerate(counts) if n and i != j]
     rows = []
     for share, n, i, j in sorted(found, key=lambda one: (-one[0], one[2:]))[:_WORST]:
-        text = w("train.worst", truth=names[i], predicted=names[j])
+        text = w("{truth} read as {predicted}", truth=names[i], predicted=names[j])
         if clickable:
             button = Markup('<button data-cell="{},{}">{}</button>')
             text = button.format(i, j, text)
         rows.append((text, f"{n}", f"{100 * share:.0f} %"))
-    head = [w("train.worst_title"), w("train.windows"), w("train.worst_share")]
+    head = [w("Most frequent confusions"), w("Windows"), w("Of this gesture")]
     return table_html(head, rows, numbers=(1, 2)) if rows else Markup("")
 
 
@@ -299,9 +360,9 @@ def _recordings(w: Words, dataset: str, rows: Sequence[MisreadRecording]) -> Mar
         link = Markup('<span data-recording="{0}">{0}</span>').format(row.recording)
         if dataset:
             link = Markup('<a data-recording="{0}" href="{1}" aria-label="{2}: {0}">{0}</a>').format(
-                row.recording, address("review", dataset=dataset, recording=row.recording), w("train.in_review")
+                row.recording, address("review", dataset=dataset, recording=row.recording), w("Review")
             )
         predicted = ", ".join(w.gesture(label) for label in row.predicted)
         cells.append((row.subject, w.gesture(row.gesture), predicted, f"{row.windows} / {row.of}", link))
-    head = [w(f"train.{key}") for key in ("person", "gesture", "predicted", "of_windows", "person_of")]
+    head = [w(_HEADS[key]) for key in ("person", "gesture", "predicted", "of_windows", "person_of")]
     return table_html(head, cells)

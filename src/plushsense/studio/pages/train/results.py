@@ -21,13 +21,49 @@ from plushsense.evaluation.scores import Predictions, read_predictions
 from plushsense.models.bundle import Bundle, known_people
 from plushsense.scoring import metrics
 from plushsense.studio.app.shell import AFFECT_SIGNS
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.app.workspace import Workspace, file_stamps
 from plushsense.trials.tables import SUMMARY as SWEEP
 from plushsense.trials.tables import TRIALS_CSV, prediction_files
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.preparation import WHOLE_PEOPLE
 from plushsense.workflow.reporting import LEARNING, PREDICTIONS, SCORES, load_evaluation
+
+_OVER: Texts = {
+    "subjects": "{n}",
+    "folds": "{n}",
+    "trainings": "{n} (folds × seeds)",
+    "held_back": "{n} held back",
+}
+
+_MARKS: Texts = {
+    "simulation": "simulation",
+    "leaky": "leaky",
+}
+
+_SPLITS: Texts = {
+    "leave-one-subject-out": "each person left out",
+    "by-subject": "people in {k} groups",
+    "by-recording": "recordings in {k} groups, known people",
+    "windows": "windows in {k} groups",
+    "windows:holdout": "15 % of the windows",
+    "validation-subjects": "people held back",
+    "validation-recordings": "recordings held back, known people",
+}
+
+_CONTEXTS: Texts = {
+    "stream": "real past",
+    "loop": "repeated gesture",
+    "rows": "repeated rows",
+    "anywhere": "for live use",
+    "inside": "within the gesture",
+}
+
+LINKS: Texts = {
+    "live": "Try it live",
+    "export": "Export for the toy",
+}
+"""Links from a network to the pages that use it."""
 
 
 def figure(words: Words, value: float | None) -> str:
@@ -42,52 +78,62 @@ def score_text(words: Words, mean: float | None, sd: float | None) -> str:
 
 def whole(words: Words, n: int) -> str:
     """Format a whole number with groups of three digits."""
-    return f"{n:,}" if words("shell.decimal_point") == "." else f"{n:,}".replace(",", "\u00a0")
+    return words.count(n)
 
 
 def counted(words: Words, kind: str, n: int) -> str:
     """Return a number with its noun in the right form, such as 5 folds, or 21 cilvēks."""
-    one = n % 10 == 1 and n % 100 != 11 if words.language == "lv" else n == 1
-    return words(f"train.count.{kind}{'_one' if one else ''}", n=n)
+    return words.plural(*_COUNTS[kind], n)
 
 
 def duration_text(words: Words, seconds: float) -> str:
     """Describe a duration in words, in minutes or hours."""
     if seconds < 60:
-        return words("train.time.short")
+        return words("under a minute")
     minutes = round(seconds / 60)
     if minutes < 90:
-        return words("train.time.min", n=minutes)
-    return words("train.time.hours", h=minutes // 60, n=minutes % 60)
+        return words("about {n} min", n=minutes)
+    return words("about {h} h {n} min", h=minutes // 60, n=minutes % 60)
 
 
 def score_labels(words: Words, leaky: bool, simulated: bool) -> Markup:
     """Render the labels *simulation* and *leaky* if they apply to a score."""
     kinds = [kind for kind, true in (("simulation", simulated), ("leaky", leaky)) if true]
     mark = Markup('<span class="ps-mark ps-mark-{}">{}</span>')
-    return Markup(" ").join(mark.format(kind, words(f"train.{kind}")) for kind in kinds)
+    return Markup(" ").join(mark.format(kind, words(_MARKS[kind])) for kind in kinds)
 
 
 def averaged_over(words: Words, kind: str, units: int) -> str:
     """Describe over what a mean was computed, such as 5 folds."""
-    return words(f"train.over.{kind}", n=counted(words, _UNITS[kind], units))
+    return words(_OVER[kind], n=counted(words, _UNITS[kind], units))
 
 
 def split_text(words: Words, split: str) -> str:
     """Describe in a few words how people, recordings or windows were left out."""
     kind, _, k = split.partition(":")
-    text = words.get(f"train.split_short.{split}") or words.get(f"train.split_short.{kind}", "")
-    # The split is text of a file, which must not be taken for a format.
-    return text.format(k=k) if text else split
+    text = _SPLITS.get(split) or _SPLITS.get(kind)
+    return words(text, k=k) if text else split
 
 
 def context_text(words: Words, context: str) -> str:
     """Describe what comes before the scored gestures, and before those to train on if that differs."""
-    return " → ".join(words.get(f"train.context_short.{part}", part) for part in context.split(" → "))
+    return " → ".join(words(_CONTEXTS.get(part, part)) for part in context.split(" → "))
 
 
 EVALUATION, TRIAL, TRAINING = "evaluation", "trial", "training"
 SUBJECTS, FOLDS, TRAININGS, HELD_BACK = "subjects", "folds", "trainings", "held_back"
+_COUNTS = {
+    "people": ("{n} person", "{n} people"),
+    "with_people": (in_context("dative", "{n} person"), "{n} people"),
+    "more_people": ("{n} more person", "{n} more people"),
+    "recordings": ("{n} recording", "{n} recordings"),
+    "gestures": ("{n} gesture", "{n} gestures"),
+    "folds": ("{n} fold", "{n} folds"),
+    "trainings": ("{n} training", "{n} trainings"),
+    "networks": ("{n} network", "{n} networks"),
+    "epochs": ("{n} epoch", "{n} epochs"),
+    "minutes": ("{n} minute", "{n} minutes"),
+}
 _UNITS = {SUBJECTS: "people", FOLDS: "folds", TRAININGS: "trainings", HELD_BACK: "people"}
 _HASH = 6
 # Limits of results that are read: a folder of results may come from elsewhere.

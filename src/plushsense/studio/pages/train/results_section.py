@@ -14,7 +14,7 @@ from nicegui import run, ui
 
 from plushsense.scoring.metrics import pareto_front
 from plushsense.studio.app.shell import Page, heading, html, named, scroll_region, section, tag
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words, in_context
 from plushsense.studio.pages.train.result_details import ResultDetailsView
 from plushsense.studio.pages.train.results import (
     EVALUATION,
@@ -30,6 +30,28 @@ from plushsense.studio.pages.train.results import (
     whole,
 )
 from plushsense.studio.widgets.elements import table_html
+
+_COLUMNS_TEXTS: Texts = {
+    "data": "Data",
+    "kind": "Kind",
+    "network": "Network",
+    "schedule": "Schedule, epochs (batch)",
+    "split": "Split",
+    "context": "Context",
+    "seeds": "Seeds",
+    "over": "Over",
+    "accuracy": "Accuracy",
+    "macro_f1": "Macro-F1",
+    "parameters": "Parameters",
+    "when": "Date",
+    "open": "Open",
+}
+
+_KINDS: Texts = {
+    "evaluation": "evaluation",
+    "trial": "sweep",
+    "training": in_context("result", "training"),
+}
 
 _MAX_ROWS = 60
 _NONE = float("-inf")
@@ -65,16 +87,21 @@ class ResultsSection:
         self._all = False
         self._open = ""
         w = self._words
-        with section(w("train.results"), classes=""):
-            ui.label(w("train.results_about")).classes("ps-dim")
+        with section(w("Results"), classes=""):
+            ui.label(
+                w(
+                    "Compare scores only if data, split and context are the same. A training has one seed and was "
+                    "checked on a few people: do not report its score."
+                )
+            ).classes("ps-dim")
             with ui.row().classes("items-center"):
-                self._by_data = ui.select({"": w("train.all_data")}, value="", label=w("train.data"))
+                self._by_data = ui.select({"": w("all data sets")}, value="", label=w("Data set"))
                 tag(self._by_data.classes("w-64"), "filter-data").on_value_change(self._filtered)
-                kinds = {"": w("train.all_kinds")}
-                kinds |= {kind: w(f"train.rows.{kind}") for kind in (EVALUATION, TRIAL, TRAINING)}
-                self._by_kind = ui.select(kinds, value="", label=w("train.filter_kind"))
+                kinds = {"": w("everything")}
+                kinds |= {kind: w(_KINDS[kind]) for kind in (EVALUATION, TRIAL, TRAINING)}
+                self._by_kind = ui.select(kinds, value="", label=w("Kind"))
                 tag(self._by_kind.classes("w-64"), "filter-kind").on_value_change(self._filtered)
-            table = tag(scroll_region(w("train.results")), "results")
+            table = tag(scroll_region(w("Results")), "results")
             with table.on("click", self._clicked, js_handler=_CLICKS):
                 self._html = html()
             self._pareto = ui.column().classes("w-full")
@@ -121,7 +148,7 @@ class ResultsSection:
 
     def _fill(self) -> None:
         names = {row.data: row.data for row in self._rows}
-        self._by_data.set_options({"": self._words("train.all_data"), **names}, value=self._data)
+        self._by_data.set_options({"": self._words("all data sets"), **names}, value=self._data)
         self._draw()
 
     # The table ------------------------------------------------------------------------------------------------
@@ -129,34 +156,36 @@ class ResultsSection:
     def _draw(self) -> None:
         chosen = [r for r in self._rows if self._data in ("", r.data) and self._kind in ("", r.kind)]
         chosen.sort(key=_SORTS[self._sort], reverse=self._down)
-        empty = Markup('<p class="ps-dim">{}</p>').format(self._words("train.no_results"))
+        empty = Markup('<p class="ps-dim">{}</p>').format(
+            self._words("There are no results yet. Train or evaluate a network above.")
+        )
         self._html.set_content(self._as_table(chosen) if chosen else empty)
         self._draw_pareto(chosen)
 
     def _as_table(self, rows: list[ResultRow]) -> Markup:
         w = self._words
-        head = [Markup('<th scope="col">{}</th>').format(w("train.columns.open"))]
+        head = [Markup('<th scope="col">{}</th>').format(w("Open"))]
         for key in _SORTS:
             sorts = key == self._sort
             state = f' aria-sort="{"descending" if self._down else "ascending"}"' if sorts else ""
             arrow = (" ▼" if self._down else " ▲") if sorts else ""
             kind = ' class="ps-number"' if key in _NUMBERS else ""
             cell = Markup(f'<th scope="col"{kind}{state}><button data-do="sort:{key}">{{}}{arrow}</button></th>')
-            head.append(cell.format(w(f"train.columns.{key}")))
+            head.append(cell.format(w(_COLUMNS_TEXTS[key])))
         body = Markup("").join(self._as_row(row) for row in (rows if self._all else rows[:_MAX_ROWS]))
         more = Markup("")
         if len(rows) > _MAX_ROWS and not self._all:
-            more = Markup('<p><button data-do="all">{}</button></p>').format(w("train.all_rows", n=len(rows)))
+            more = Markup('<p><button data-do="all">{}</button></p>').format(w("Show all {n} rows", n=len(rows)))
         return Markup(
             '<table class="ps-table ps-stacked"><caption>{}</caption><thead><tr>{}</tr></thead>'
             "<tbody>{}</tbody></table>{}"
-        ).format(w("train.table"), Markup("").join(head), body, more)
+        ).format(w("Results, one per row; click a heading to sort"), Markup("").join(head), body, more)
 
     def _as_row(self, row: ResultRow) -> Markup:
         w = self._words
         cells = {
             "data": Markup("{} {}").format(row.data, score_labels(w, False, row.simulated)),
-            "kind": w(f"train.rows.{row.kind}"),
+            "kind": w(_KINDS[row.kind]),
             "network": row.network,
             "schedule": row.schedule,
             "split": Markup("{} {}").format(split_text(w, row.split), score_labels(w, row.leaky, False)),
@@ -171,7 +200,7 @@ class ResultsSection:
         name = row.path.stem if row.kind == TRAINING else row.network
         columns = Markup("").join(
             Markup('<td class="{}" data-column="{}" data-label="{}">{}</td>').format(
-                "ps-number" if key in _NUMBERS else "", key, w(f"train.columns.{key}"), text
+                "ps-number" if key in _NUMBERS else "", key, w(_COLUMNS_TEXTS[key]), text
             )
             for key, text in cells.items()
         )
@@ -181,8 +210,8 @@ class ResultsSection:
             "</td>{columns}</tr>"
         ).format(
             id=row.id,
-            label=w("train.open_row", network=f"{name}, {split_text(w, row.split)}"),
-            open=w("train.columns.open"),
+            label=w("Open {network}", network=f"{name}, {split_text(w, row.split)}"),
+            open=w("Open"),
             columns=columns,
         )
 
@@ -198,21 +227,34 @@ class ResultsSection:
         if self._group not in groups:
             self._group = max(groups, key=lambda name: len(groups[name]))
         with self._pareto:
-            heading(w("train.pareto"), 3)
+            heading(w("Score and size"), 3)
             with ui.row().classes("items-center"):
-                box = ui.select(list(groups), value=self._group, label=w("train.pareto_group"))
+                box = ui.select(list(groups), value=self._group, label=w("Compare within"))
                 tag(box.classes("w-96"), "pareto-group")
                 labels = tag(html(), "pareto-marks")
             plot = ui.echart({}, renderer="svg").classes("ps-pareto")
             tag(plot, "pareto").props('role="img"')
-            ui.label(w("train.pareto_about")).classes("ps-dim")
-            with tag(ui.expansion(w("train.pareto_table"), icon="table_rows").classes("w-full"), "pareto-data"):
+            ui.label(
+                w(
+                    "Only results on the same people and gestures of the same data. Bars: standard deviation. Bold: "
+                    "no other network is both as good and smaller."
+                )
+            ).classes("ps-dim")
+            with tag(
+                ui.expansion(w("The data of the plot as a table"), icon="table_rows").classes("w-full"), "pareto-data"
+            ):
                 table = tag(html().classes("ps-scroll-x"), "pareto-table")
 
         def draw() -> None:
             group = groups[self._group]
             labels.set_content(score_labels(w, group[0].leaky, group[0].simulated))
-            named(plot, w("train.pareto_drawn", n=len(group)))
+            named(
+                plot,
+                w(
+                    "Macro-F1 against the number of parameters, {n} networks; the front is joined by a line",
+                    n=len(group),
+                ),
+            )
             plot.options.clear()
             plot.options.update(pareto_options(w, group))
             plot.update()
@@ -241,7 +283,7 @@ def comparable_groups(w: Words, rows: Sequence[ResultRow]) -> dict[str, list[Res
         if len(group) < 2:
             continue
         data, which, split, context = key[:4]
-        name = " · ".join((data, w(f"train.rows.{which}"), split_text(w, split), context_text(w, context)))
+        name = " · ".join((data, w(_KINDS[which]), split_text(w, split), context_text(w, context)))
         numbered = (f"{name} ({number})" for number in itertools.count(2))
         groups[next(n for n in itertools.chain((name,), numbered) if n not in groups)] = group
     return groups
@@ -300,13 +342,13 @@ def pareto_options(w: Words, rows: Sequence[ResultRow]) -> dict[str, Any]:
             "max": high_x,
             "axisLabel": {"customValues": _ticks(low_x, high_x), ":formatter": _SHORT, "color": _INK},
             "axisTick": {"customValues": _ticks(low_x, high_x)},
-            **_axis(w("train.pareto_x"), 32),
+            **_axis(w("Parameters (logarithmic)"), 32),
         },
         "yAxis": {
             "type": "value",
             "scale": True,
-            "axisLabel": {":formatter": _SCORE % w("shell.decimal_point"), "color": _INK},
-            **_axis(w("train.pareto_y"), 48),
+            "axisLabel": {":formatter": _SCORE % w.decimal_point, "color": _INK},
+            **_axis(w("Macro-F1 (0 to 1)"), 48),
         },
         "series": [
             {**line, "data": bars, "lineStyle": {"color": _DIM, "width": 1.5}},
@@ -324,18 +366,18 @@ def pareto_options(w: Words, rows: Sequence[ResultRow]) -> dict[str, Any]:
 def pareto_table(w: Words, rows: Sequence[ResultRow]) -> Markup:
     """Render the data of the plot as a table, smallest network first."""
     ids = {row.id for row in pareto_rows(rows)}
-    head = [w(f"train.columns.{key}") for key in ("network", "schedule", "parameters", "macro_f1")]
+    head = [w(_COLUMNS_TEXTS[key]) for key in ("network", "schedule", "parameters", "macro_f1")]
     cells = [
         (
             row.network,
-            f"{row.schedule} ({w('train.leaky')})" if row.leaky else row.schedule,
+            f"{row.schedule} ({w('leaky')})" if row.leaky else row.schedule,
             whole(w, row.parameters),
             score_text(w, row.macro_f1, row.macro_f1_sd),
             "✓" if row.id in ids else "–",
         )
         for row in sorted(rows, key=lambda row: row.parameters)
     ]
-    return table_html([*head, w("train.pareto_front")], cells, numbers=(2, 3))
+    return table_html([*head, w("On the front")], cells, numbers=(2, 3))
 
 
 _SCORE = "(v) => v.toFixed(3).replace('.', '%s')"
@@ -345,7 +387,7 @@ _SHORT = "(v) => v >= 1000 ? `${v / 1000}k` : `${v}`"
 def _point(w: Words, row: ResultRow, front: bool, middle: float) -> dict[str, Any]:
     name = f"{row.network.rpartition(' ')[0]}, {row.schedule.partition(', ')[2]}"
     if row.leaky:
-        name = f"{name} ({w('train.leaky')})"
+        name = f"{name} ({w('leaky')})"
     text = f"{name}: {whole(w, row.parameters)}, {score_text(w, row.macro_f1, row.macro_f1_sd)}"
     hollow = {"color": _BACKGROUND, "borderColor": _FRONT, "borderWidth": 2.5}
     return {

@@ -7,7 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from plushsense.studio.app.words import Words
+from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.train.results import (
     EVALUATION,
     HELD_BACK,
@@ -22,6 +22,18 @@ from plushsense.studio.pages.train.results import (
 )
 from plushsense.studio.widgets.elements import table_html
 
+_VERDICTS: Texts = {
+    "new": "It reads about {right} of 10 touches of people it never met; guessing gives {chance} of 10.",
+    "known": (
+        "It reads about {right} of 10 moments, with those at rest, of people it knows; guessing gives {chance} of "
+        "10. Expect less with new people."
+    ),
+    "leaky": (
+        "Here it reads about {right} of 10 moments, with those at rest, but this test is too easy: parts of the same "
+        "touches were trained on. Guessing gives {chance} of 10."
+    ),
+}
+
 FEW_PEOPLE = 10
 """With fewer people than this, a score may be far from that of others."""
 
@@ -34,9 +46,9 @@ def of_ten(w: Words, share: float) -> str:
 def headline(w: Words, row: ResultRow) -> str:
     """Return the main sentence on a result."""
     if row.accuracy is None or not row.classes:
-        return w("train.verdict.none")
+        return w("This result has no score.")
     kind = "leaky" if row.leaky else "new" if _is_apart(row) else "known"
-    return w(f"train.verdict.{kind}", right=of_ten(w, row.accuracy), chance=of_ten(w, 1 / row.classes))
+    return w(_VERDICTS[kind], right=of_ten(w, row.accuracy), chance=of_ten(w, 1 / row.classes))
 
 
 def limits(w: Words, row: ResultRow) -> list[str]:
@@ -47,13 +59,25 @@ def limits(w: Words, row: ResultRow) -> list[str]:
     people = row.units if row.spread in (SUBJECTS, HELD_BACK) else 0
     if row.interval is not None and row.spread == SUBJECTS:
         low, high = (w.number(10 * max(0.0, edge), 1) for edge in row.interval)
-        found.append(w("train.verdict.interval", people=counted(w, "people", people), low=low, high=high))
+        found.append(
+            w(
+                "Measured on {people}. For other people like them, the average is probably between {low} and {high} "
+                "of 10 (95 % interval).",
+                people=counted(w, "people", people),
+                low=low,
+                high=high,
+            )
+        )
     if 0 < people < FEW_PEOPLE:
-        found.append(w("train.verdict.few", people=counted(w, "people", people)))
+        found.append(
+            w("This figure is uncertain: it was measured on only {people}.", people=counted(w, "people", people))
+        )
     if row.kind == TRIAL:
-        found.append(w("train.verdict.chosen"))
+        found.append(w("It is the best of several networks on the same people, so its score is slightly too good."))
     if row.kind == TRAINING:
-        found.append(w("train.verdict.training"))
+        found.append(
+            w("This is the check during training. Report the score of an evaluation, which tests every person.")
+        )
     if row.kind == EVALUATION and _is_apart(row):
         found.append(_more_people(w, row.learning))
     return found
@@ -67,7 +91,7 @@ def _is_apart(row: ResultRow) -> bool:
 def _more_people(w: Words, learning: Mapping[str, Any] | None) -> str:
     """Return what more people to train on would add, with its uncertainty, or that it was not measured."""
     if learning is None or learning.get("ci95") is None:
-        return w("train.verdict.not_measured")
+        return w("What more people would add was not measured.")
     low, high = learning["ci95"]
     values = {
         "people": counted(w, "more_people", learning["more"]),
@@ -75,20 +99,30 @@ def _more_people(w: Words, learning: Mapping[str, Any] | None) -> str:
         "high": w.number(10 * high, 1),
     }
     if low <= 0:
-        return w("train.verdict.more_unsure", **values)
-    return w("train.verdict.more", gain=w.number(10 * learning["gain"], 1), **values)
+        return w(
+            "Whether training with {people} would help cannot be told yet: the effect is between {low} and {high} of "
+            "10 (95 % interval).",
+            **values,
+        )
+    return w(
+        "Training with {people} would add about {gain} of 10 (95 % interval: {low} to {high}).",
+        gain=w.number(10 * learning["gain"], 1),
+        **values,
+    )
 
 
 def figures(w: Words, row: ResultRow) -> str:
     """Return the exact figures of a result, and how they are counted."""
     text = w(
-        "train.figures",
+        "Accuracy {accuracy}, macro-F1 {macro_f1}; mean over {over}, counted in windows.",
         accuracy=score_text(w, row.accuracy, row.accuracy_sd),
         macro_f1=score_text(w, row.macro_f1, row.macro_f1_sd),
         over=averaged_over(w, row.spread, row.units),
     )
     if row.rest is not None:
-        text += " " + w("train.at_rest", accuracy=figure(w, row.rest))
+        text += " " + w(
+            "Recordings at rest are not included: their accuracy is {accuracy}.", accuracy=figure(w, row.rest)
+        )
     return text
 
 
@@ -101,6 +135,6 @@ def people_table(w: Words, row: ResultRow) -> Markup:
 
     rows = [line(name, value) for name, value in row.people]
     if row.spread == SUBJECTS:
-        rows.append(line(w("train.mean"), row.accuracy))
-    rows.append(line(w("train.guessing"), 1 / row.classes if row.classes else None))
-    return table_html([w("train.person"), w("train.accuracy"), ""], rows, numbers=(1,), row_heads=True)
+        rows.append(line(w("Mean"), row.accuracy))
+    rows.append(line(w("Guessing"), 1 / row.classes if row.classes else None))
+    return table_html([w("Person"), w("Accuracy"), ""], rows, numbers=(1,), row_heads=True)
