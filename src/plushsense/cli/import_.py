@@ -28,8 +28,10 @@ def _columns(texts: list[str]) -> dict[str, str]:
 
 def _report(result: dict[str, Any], names: str) -> None:
     """Print warnings, and what was left out or rejected, on standard error; ``names`` says where all warnings are."""
+    from plushsense.dataset.importing.importers import ADOPTED
+
     for line in result["warnings"][:_MOST_WARNINGS]:
-        say(line if getattr(line, "reason", "") == "adopted" else f"warning: {line}")
+        say(line if getattr(line, "template", "") == ADOPTED else f"warning: {line}")
     if len(result["warnings"]) > _MOST_WARNINGS:
         say(f"... and {len(result['warnings']) - _MOST_WARNINGS} more warnings{names}")
     for sensor in result.get("sensors", ()):

@@ -112,7 +112,7 @@ def _notices(request: SessionRequest, head: SessionHead, fresh: bool) -> list[st
 def _drive(recorder: Recorder, typed: KeySource, screen: Screen, auto: bool) -> None:  # noqa: C901
     """Run the commands of pressed keys and update the screen until the session ends."""
     from plushsense.cli.terminal import END, KeyRepeatFilter
-    from plushsense.core.sentences import Sentence
+    from plushsense.core.sentences import Message
 
     note: str | None = None
     confirming = False
@@ -151,8 +151,8 @@ def _drive(recorder: Recorder, typed: KeySource, screen: Screen, auto: bool) -> 
         elif key in "qQ":
             if status.state == "recording" and not confirming:
                 confirming = True
-                sentence = "Recording: press q again to quit and discard it, or SPACE to stop it first."
-                recorder.show_message(Sentence(sentence))
+                text = "Recording: press q again to quit and discard it, or SPACE to stop it first."
+                recorder.show_message(Message(text))
                 continue
             return
         elif typed.script and key == ".":

@@ -11,6 +11,7 @@
     │   ├── BundleError         a model bundle
     │   ├── ArrayError          arrays given from Python; also a ValueError
     │   └── ConfigError         a setting, a flag, a configuration file
+    │       └── AddressError    the URL of a toy
     ├── DeviceError             a toy that cannot be opened or disconnected
     ├── TrainingError           a training that cannot start or continue
     │   └── DivergedError       its loss is not a number
@@ -33,12 +34,12 @@ import warnings
 from collections.abc import Iterable
 from types import ModuleType
 
+from plushsense.core.sentences import Message
+
 # Control characters, with which a text could command a terminal, and line separators and marks that reverse the order
 # of what follows.
 _CONTROLS = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 _LONGEST_COMPARED = 200
-# Not that of a path, as in '../a', or of an ellipsis.
-_DOUBLED_STOP = re.compile(r"(?<=[\w)\]}'\"”’»])\.\.(?=\s|$)")
 
 
 def printable(text: str, *, lines: bool = False) -> str:
@@ -50,11 +51,6 @@ def printable(text: str, *, lines: bool = False) -> str:
     return plain if lines else plain.replace("\n", "\\u000a").replace("\t", "\\u0009")
 
 
-def single_stops(text: str) -> str:
-    """Return a text with one full stop where a part that ends with one, such as a further sentence, left two."""
-    return _DOUBLED_STOP.sub(".", text)
-
-
 class PlushSenseError(Exception):
     """An error of PlushSense, whose message is one sentence for the user.
 
@@ -62,14 +58,14 @@ class PlushSenseError(Exception):
     such as a caret under the place, are notes (`add_note`).
 
     Args:
-        message: the sentence.
-        reason: key of the sentence in other languages, "" for none; the studio has texts ``sentences.<reason>``.
-        values: values that are filled into that text.
+        template: the sentence, with ``{name}`` in place of each of the values, see `Message`.
+        values: what is filled in; they stay in the attribute ``message``, for the sentence in other languages.
     """
 
-    def __init__(self, message: str = "", *, reason: str = "", **values: object) -> None:
-        super().__init__(printable(single_stops(message)))
-        self.reason, self.values = reason, values
+    def __init__(self, template: str = "", /, **values: object) -> None:
+        filled = Message(template, **values)
+        self.message = Message.restored(printable(filled), template, values)
+        super().__init__(self.message)
 
 
 class PlushSenseWarning(UserWarning):
@@ -127,6 +123,10 @@ class ConfigError(BadInput):
     """A setting that is unknown or out of range."""
 
 
+class AddressError(ConfigError):
+    """A URL of a toy that is missing or cannot be understood."""
+
+
 class DeviceError(PlushSenseError):
     """A toy that cannot be opened, or that disconnected."""
 
@@ -142,8 +142,8 @@ class DivergedError(TrainingError):
 class ToolError(PlushSenseError):
     """A compiler or emulator that is missing or fails."""
 
-    def __init__(self, message: str, output: str = "", *, reason: str = "", **values: object) -> None:
-        super().__init__(message, reason=reason, **values)
+    def __init__(self, template: str, output: str = "", /, **values: object) -> None:
+        super().__init__(template, **values)
         self.output = output
         """The tool's complete output."""
 
@@ -204,7 +204,7 @@ def need(module: str, extra: str) -> ModuleType:
         if error.name is not None and error.name.split(".")[0] != top:
             raise
         raise MissingExtraError(
-            f"This needs the package '{top}', which is not installed: run  pip install 'plushsense[{extra}]'",
-            reason="missing_package",
+            "This needs the package '{package}', which is not installed: run  pip install 'plushsense[{extra}]'",
             package=top,
+            extra=extra,
         ) from error

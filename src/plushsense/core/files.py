@@ -132,9 +132,9 @@ def _open_regular(path: Path) -> BinaryIO:
 def foreign_link(folder: Path, entry: Path, error: type[BadInput]) -> BadInput:
     """Return the error for an entry of ``folder`` that is neither one of its files nor one of its folders."""
     return error(
-        f"'{entry}' is a link to another place, or neither a file nor a folder: put what it leads to in its place, or "
+        "'{entry}' is a link to another place, or neither a file nor a folder: put what it leads to in its place, or "
         "remove it.",
-        reason="foreign_link",
+        entry=entry,
         file=entry.relative_to(folder).as_posix(),
     )
 
@@ -308,8 +308,9 @@ def new_folder(
             raise error(f"'{dest}' is a broken link: give a new or empty folder.")
         real = dest.resolve()
         if real.exists() and (not real.is_dir() or any(real.iterdir())):
-            message = f"'{dest}' already holds something: give a new or empty folder, nothing is overwritten."
-            raise error(message, reason="name_exists", name=dest.name)
+            raise error(
+                "'{path}' already holds something: give a new or empty folder, nothing is overwritten.", path=dest
+            )
         real.parent.mkdir(parents=True, exist_ok=True)
         with work_folder(real) as scratch:
             work = scratch / (real.name or "folder")
@@ -326,10 +327,7 @@ def new_folder(
     except OSError as cause:
         where, why = f" at '{cause.filename}'" if cause.filename else "", cause.strerror or str(cause)
         raise error(
-            f"'{dest}' cannot be created ({why}{where}): check the path and the disk.",
-            reason="not_created",
-            name=dest.name,
-            why=why,
+            "'{path}' cannot be created ({why}{where}): check the path and the disk.", path=dest, why=why, where=where
         ) from None
 
 

@@ -117,10 +117,11 @@ class GestureSet:
         found = self.find(label)
         if found is None:
             raise GestureError(
-                f"'{label}' is not in the gesture set '{self.name}', which has: {', '.join(self.labels)}."
-                f"{nearest(label, self.labels)}",
-                reason="gesture_unknown",
+                "'{gesture}' is not in the gesture set '{name}', which has: {labels}.{hint}",
                 gesture=label,
+                name=self.name,
+                labels=", ".join(self.labels),
+                hint=nearest(label, self.labels),
             )
         return found
 

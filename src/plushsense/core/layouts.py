@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.errors import ArrayError, LayoutError, nearest
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.core.toml import builtin_names, load_table, read_named
 
 DEVICE_MS = "device_ms"
@@ -162,12 +162,12 @@ class StreamColumns(NamedTuple):
 
     channels: tuple[int, ...]
     clock: int | None = None
-    notes: tuple[Sentence, ...] = ()
+    notes: tuple[Message, ...] = ()
 
     @property
     def by_number(self) -> bool:
         """Whether only the number of channels fits, since they have no labels."""
-        return any(note.reason == "stream_unnamed" for note in self.notes)
+        return any("channels" in note.values for note in self.notes)
 
 
 @dataclass(frozen=True)
@@ -474,8 +474,13 @@ class Layout:
         elif width in (self.n_channels, len(self.wire)):
             keys = list(self.names if width == self.n_channels else self.wire)
             listed = ", ".join(keys)
-            message = f"its channels have no names: its {width} values are taken for {listed}, in this order"
-            notes.append(Sentence(message, reason="stream_unnamed", n=width, channels=listed))
+            notes.append(
+                Message(
+                    "its channels have no names: its {n} values are taken for {channels}, in this order",
+                    n=width,
+                    channels=listed,
+                )
+            )
         else:
             return (
                 f"it has {width} channels, and layout '{self.name}' needs {self.n_channels}, or the {len(self.wire)} "
@@ -484,8 +489,12 @@ class Layout:
         clock = keys.index(DEVICE_MS) if DEVICE_MS in keys else None
         if clock is not None and not exact:
             clock = None
-            message = f"its {DEVICE_MS} is float32, which is exact for 4.7 hours only: the time stamps are the clock"
-            notes.append(Sentence(message, reason="stream_clock", column=DEVICE_MS))
+            notes.append(
+                Message(
+                    "its {column} is float32, which is exact for 4.7 hours only: the time stamps are the clock",
+                    column=DEVICE_MS,
+                )
+            )
         return StreamColumns(tuple(keys.index(n) for n in self.names), clock, tuple(notes))
 
     def samples(self, seconds: float) -> int:

@@ -135,9 +135,10 @@ def parse_table(
         if rows:
             return np.array(rows), np.array(labels), malformed
     raise FileFormatError(
-        f"'{path.name}' has no usable row: each must hold {len(keys)} numbers ({', '.join(keys)}).",
-        reason="rows_unusable",
+        "'{path}' has no usable row: each must hold {n} numbers ({keys}).",
+        path=path.name,
         n=len(keys),
+        keys=", ".join(keys),
     )
 
 
@@ -266,12 +267,14 @@ def column_keys(first: bytes, layout: Layout, path: Path) -> tuple[list[str], bo
     if len(cells) == len(columns) - 1 and columns[-1] == "label":
         return columns[:-1], header
     raise FileFormatError(
-        f"'{path.name}' has {len(cells)} columns, but a file of layout '{layout.name}' has {len(columns)} "
-        f"({', '.join(columns)}): choose another --layout.{_suggest_layout(len(cells), layout)}",
-        reason="columns_differ",
+        "'{path}' has {n} columns, but a file of layout '{layout}' has {expected} ({columns}): choose another "
+        "--layout.{suggest_layout}",
+        path=path.name,
         n=len(cells),
         layout=layout.name,
         expected=len(columns),
+        columns=", ".join(columns),
+        suggest_layout=_suggest_layout(len(cells), layout),
     )
 
 
@@ -299,8 +302,7 @@ def read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as cause:
-        message = f"'{path}' cannot be read: {cause.strerror or cause}."
-        raise FileFormatError(message, reason="file_unreadable") from None
+        raise FileFormatError("'{path}' cannot be read: {why}.", path=path, why=cause.strerror or cause) from None
 
 
 def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool = False) -> ReadResult:  # noqa: C901
@@ -310,25 +312,25 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if b"\x00" in data[:4096]:
-        message = f"'{path.name}' is not a text file: a recording is a CSV file in UTF-8."
-        raise FileFormatError(message, reason="file_no_recording")
+        raise FileFormatError("'{path}' is not a text file: a recording is a CSV file in UTF-8.", path=path.name)
     data = data.lstrip()
     cut = whole_lines and b"\n" in data and not data.endswith(b"\n")
     if cut:
         data = data[: data.rfind(b"\n") + 1]
     if not data:
-        raise FileFormatError(f"'{path.name}' is empty: a recording has one row a sample.", reason="file_empty")
+        raise FileFormatError("'{path}' is empty: a recording has one row a sample.", path=path.name)
     end = data.find(b"\n")
     first = data if end < 0 else data[:end]
     if len(first) > LONGEST_LINE:
-        message = f"'{path.name}' begins with a line of {len(first)} characters: it is not a recording."
-        raise FileFormatError(message, reason="file_no_recording")
+        raise FileFormatError(
+            "'{path}' begins with a line of {n} characters: it is not a recording.", path=path.name, n=len(first)
+        )
     keys, header = column_keys(first, layout, path)
     if header and (end < 0 or not data[end:].strip()):
         raise FileFormatError(
-            f"'{path.name}' has a header but no row: the authors' recorder writes such files if the toy sends fewer "
-            "than 14 integers a line.",
-            reason="file_empty",
+            "'{path}' has a header but no row: the authors' recorder writes such files if the toy sends fewer than "
+            "14 integers a line.",
+            path=path.name,
         )
     table, labels, malformed = parse_table(data, keys, 1 if header else 0, path)
     numeric = [k for k in keys if k != "label"]
@@ -348,8 +350,13 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
     steps = np.array([c.step for c in layout.channels])
     missing = [n for n in layout.names if n not in numeric]
     if missing:
-        message = f"'{path.name}' has no column for {', '.join(missing)} of layout '{layout.name}'."
-        raise FileFormatError(message, reason="column_missing", column=missing[0])
+        raise FileFormatError(
+            "'{path}' has no column for {missing} of layout '{layout}'.",
+            path=path.name,
+            missing=", ".join(missing),
+            layout=layout.name,
+            column=missing[0],
+        )
     values = table[:, [numeric.index(n) for n in layout.names]]
     host = column(HOST_MS)
     clock = column(DEVICE_MS)
@@ -365,8 +372,13 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
             clock = host
             warnings.append("no device clock: the host's time is used")
         else:
-            message = f"'{path.name}' has no clock column: {DEVICE_MS}, {DELAY_MS} or {HOST_MS}."
-            raise FileFormatError(message, reason="column_missing", column=DEVICE_MS)
+            raise FileFormatError(
+                "'{path}' has no clock column: {column}, {delay_ms} or {host_ms}.",
+                path=path.name,
+                column=DEVICE_MS,
+                delay_ms=DELAY_MS,
+                host_ms=HOST_MS,
+            )
     frames = Frames(as_whole(values if np.all(steps == 1.0) else values / steps), clock, host, labels)
     return ReadResult(frames, warnings, malformed + cut, header, integrated, cut)
 

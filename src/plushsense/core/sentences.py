@@ -1,48 +1,84 @@
-"""Sentences for the user that the library writes in English, and that can be worded in other languages."""
+"""Sentences for the user in English, with named values, so that they can be shown in other languages."""
 
 from __future__ import annotations
 
+import re
+import string
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, Self
 
-from plushsense.core.errors import PlushSenseError, single_stops
+# Not that of a path, as in '../a', or of an ellipsis.
+_DOUBLED_STOP = re.compile(r"(?<=[\w)\]}'\"”’»])\.\.(?=\s|$)")
+_NOUN = re.compile(r"[a-z][a-z -]{2,}")
 
 
-class Sentence(str):
-    """An English sentence, with the key and the values of its text in other languages.
+def single_stops(text: str) -> str:
+    """Return a text with one full stop where a part that ends with one, such as a further sentence, left two."""
+    return _DOUBLED_STOP.sub(".", text)
 
-    It is a plain string wherever nothing else is needed. The studio has a text ``sentences.<reason>`` for each.
+
+class Filler(string.Formatter):
+    """Fill values into a template as `str.format` does; lists are joined, and a noun as format counts: ``{n:row}``."""
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if isinstance(value, list | tuple):
+            return ", ".join(self.format_field(each, format_spec) for each in value)
+        return plural(value, format_spec) if _NOUN.fullmatch(format_spec) else format(value, format_spec)
+
+
+_FILLER = Filler()
+
+
+class Message(str):
+    """An English sentence, with the template and the values that it was made of.
+
+    It is a plain string wherever nothing else is needed. The studio looks up the translation of the template and fills
+    in the values.
 
     Attributes:
-        reason: key of the text, "" for none.
-        values: values that are filled into the text: numbers (rounded as they are to be displayed), strings, further
-            sentences, and lists of these.
+        template: the sentence with ``{name}`` in place of each value, see `Filler`. Without values, it is the sentence
+            itself, in which braces mean nothing.
+        values: numbers, strings, paths, further messages, and lists of these. A translation may use only some of them.
     """
 
-    reason: str
+    template: str
     values: dict[str, Any]
 
-    def __new__(cls, message: str = "", /, reason: str = "", **values: Any) -> Self:
-        sentence = super().__new__(cls, single_stops(message))
-        sentence.reason, sentence.values = reason, values
-        return sentence
+    def __new__(cls, template: str = "", /, **values: Any) -> Self:
+        return cls.restored(_FILLER.vformat(template, (), values) if values else template, template, values)
+
+    @classmethod
+    def restored(cls, text: str, template: str, values: dict[str, Any]) -> Self:
+        """Return a message with the given text, which is not made anew."""
+        message = super().__new__(cls, single_stops(text))
+        message.template, message.values = template, values
+        return message
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self).from_dict, (self.to_dict(),)
+        return type(self).restored, (str(self), self.template, self.values)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values for JSON, from which `from_json` restores the message."""
+        return {"message": str(self), "template": self.template, "values": plain(self.values)}
 
     @classmethod
-    def of(cls, error: PlushSenseError) -> Self:
-        """Return the sentence of an error."""
-        return cls(str(error), error.reason, **error.values)
+    def from_json(cls, table: Mapping[str, Any]) -> Self:
+        """Return the message of which ``table`` is the `to_json`."""
+        return cls.restored(table["message"], table["template"], dict(table["values"]))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON, from which `from_dict` restores the sentence."""
-        return {"message": str(self), "reason": self.reason, "values": self.values}
 
-    @classmethod
-    def from_dict(cls, table: Mapping[str, Any]) -> Self:
-        """Return the sentence of which ``table`` is the `to_dict`."""
-        return cls(table["message"], table["reason"], **table["values"])
+def plain(value: object) -> Any:
+    """Return a value for JSON: the table of each message in it, and of each path the name."""
+    if isinstance(value, Message):
+        return value.to_json()
+    if isinstance(value, Path):
+        return value.name
+    if isinstance(value, Mapping):
+        return {key: plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
 def join_names(names: Iterable[object], none: str = "none", most: int | None = None) -> str:

@@ -82,22 +82,27 @@ def read_toml(path: Path, kind: str, error: type[BadInput]) -> dict[str, Any]:
     try:
         return tomllib.loads(read_bytes(path, _MOST_BYTES).decode("utf-8-sig"))
     except FileNotFoundError:
-        raise error(f"There is no {kind} file '{path}': check the path.", reason="no_file", name=path.name) from None
+        raise error("There is no {kind} file '{path}': check the path.", kind=kind, path=path) from None
     except (OSError, UnicodeDecodeError) as cause:
-        message = f"The {kind} file '{path}' cannot be read ({cause}): give a UTF-8 TOML file."
-        raise error(message, reason="file_broken", name=path.name) from None
+        raise error(
+            "The {kind} file '{path}' cannot be read ({cause}): give a UTF-8 TOML file.",
+            kind=kind,
+            path=path,
+            cause=cause,
+        ) from None
     except (tomllib.TOMLDecodeError, RecursionError) as cause:
-        message = f"The {kind} file '{path}' is not valid TOML: {cause}."
-        raise error(message, reason="file_broken", name=path.name) from None
+        raise error("The {kind} file '{path}' is not valid TOML: {cause}.", kind=kind, path=path, cause=cause) from None
 
 
-def load_table(table: object, kind: type[T], where: str, error: type[BadInput], reason: str = "", text: str = "") -> T:
+def load_table(
+    table: object, kind: type[T], where: str, error: type[BadInput], template: str = "", text: str = ""
+) -> T:
     """Create an instance of the dataclass ``kind`` from a table.
 
     Args:
         table: its keys are the fields of ``kind``; inner tables become dataclasses, and lists become tuples.
         where: name of the table in messages, such as "layout 'plush-15'".
-        reason: that of the error.
+        template: sentence of the error with ``{problem}`` in it, "" for the problem alone.
         text: the TOML that ``table`` was read from, so that messages name the line.
 
     Raises:
@@ -109,7 +114,8 @@ def load_table(table: object, kind: type[T], where: str, error: type[BadInput], 
         steps, leaf, expected = next(_leaves(cause, (), kind))
         line = line_of(text, (*steps, *_wrong_key(leaf, table, steps)))
         named = f"{where}, line {line}" if line else where
-        raise error(_message(table, steps, leaf, expected, named), reason=reason, where=where) from None
+        problem = _message(table, steps, leaf, expected, named)
+        raise (error(template, problem=problem, where=where) if template else error(problem)) from None
     return made
 
 
@@ -140,7 +146,7 @@ def _wrong_key(cause: Exception, table: object, steps: Steps) -> Steps:
 
     if isinstance(cause, ForbiddenExtraKeysError):
         return (next(key for key in _value(table, steps) if key in cause.extra_fields),)
-    key = cause.values.get("key") if isinstance(cause, BadInput) else None
+    key = cause.message.values.get("key") if isinstance(cause, BadInput) else None
     return (key,) if isinstance(key, str) else ()
 
 

@@ -66,11 +66,10 @@ class Creator:
 
     def __post_init__(self) -> None:
         if not self.name.strip():
-            raise DatasetError("a creator has no name: give one.", reason="creator_without_name")
+            raise DatasetError("a creator has no name: give one.")
         if self.orcid and not _is_orcid(self.orcid):
             raise DatasetError(
-                f"'{self.orcid}' is no ORCID iD: sixteen digits like 0000-0002-1825-0097, the last one a check digit.",
-                reason="no_orcid",
+                "'{orcid}' is no ORCID iD: sixteen digits like 0000-0002-1825-0097, the last one a check digit.",
                 orcid=self.orcid,
             )
 
@@ -89,9 +88,7 @@ class Contact:
 
     def __post_init__(self) -> None:
         if self.email and not _EMAIL.fullmatch(self.email):
-            raise DatasetError(
-                f"'{self.email}' is no e-mail address: name@place.tld is accepted.", reason="no_mail", mail=self.email
-            )
+            raise DatasetError("'{mail}' is no e-mail address: name@place.tld is accepted.", mail=self.email)
 
     def __bool__(self) -> bool:
         return bool(self.name and self.email)
@@ -121,7 +118,7 @@ class Funding:
 
     def __post_init__(self) -> None:
         if not self.funder.strip():
-            raise DatasetError("a funding has no funder: name one.", reason="funding_without_funder")
+            raise DatasetError("a funding has no funder: name one.")
 
 
 @dataclass(frozen=True)

@@ -67,8 +67,7 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
     """
     folder, target = Path(dataset), Path(file)
     if target.exists() or target.is_symlink():
-        message = f"'{target}' exists already: a backup never replaces another; give a new name."
-        raise DatasetError(message, reason="name_exists", name=target.name)
+        raise DatasetError("'{path}' exists already: a backup never replaces another; give a new name.", path=target)
     if folder.resolve() in target.resolve().parents:
         raise DatasetError(f"'{target}' lies in the data set itself: give a place outside of '{folder}'.")
     report = progress or (lambda done, total: None)
@@ -80,8 +79,11 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
         for path in paths:
             if _name_refusal(path.as_posix()):
                 name = path.as_posix().encode(errors="backslashreplace").decode()
-                message = f"'{name}' in '{folder}' has a name that a backup cannot hold on every system: rename it."
-                raise DatasetError(message, reason="backup_name", file=name)
+                raise DatasetError(
+                    "'{file}' in '{folder}' has a name that a backup cannot hold on every system: rename it.",
+                    file=name,
+                    folder=folder,
+                )
         total = 2 * sum((folder / path).stat().st_size for path in paths)
         done = 0
         files: list[dict[str, Any]] = []
@@ -105,15 +107,16 @@ def backup(dataset: str | Path, file: str | Path, progress: Progress | None = No
                 archive.writestr(zip_entry(MANIFEST), text.encode("utf-8"))
             _verify(part, lambda n: report(total // 2 + n, total))
             if target.exists():
-                message = f"'{target}' appeared meanwhile: a backup never replaces another; give a new name."
-                raise DatasetError(message, reason="name_exists", name=target.name)
+                raise DatasetError(
+                    "'{path}' appeared meanwhile: a backup never replaces another; give a new name.", path=target
+                )
     except OSError as cause:
         raise DatasetError(
-            f"The backup '{target}' cannot be written ({cause.strerror or cause}; '{cause.filename or target}'): "
-            "check the path and the disk.",
-            reason="system",
+            "The backup '{target}' cannot be written ({why}; '{file}'): check the path and the disk.",
+            target=target,
+            why=cause.strerror or cause,
+            file=cause.filename or target,
             where=f" ('{cause.filename or target}')",
-            why=cause.strerror or str(cause),
         ) from None
     return _summary(target, manifest, tuple(f.path.as_posix() for f in listed if f.kind == "link"))
 
@@ -168,10 +171,11 @@ def restore(
             again = rebuild_index(work).dataset
             if again.hash != manifest["hash"]:
                 raise DatasetError(
-                    f"The backup '{path}' restores another data set than the saved one ({len(again.recordings)} "
-                    f"recordings of {manifest['recordings']}): restore it with the PlushSense that wrote it.",
-                    reason="backup_other",
-                    name=path.name,
+                    "The backup '{path}' restores another data set than the saved one ({n} recordings of "
+                    "{recordings}): restore it with the PlushSense that wrote it.",
+                    path=path,
+                    n=len(again.recordings),
+                    recordings=manifest["recordings"],
                 )
     return open_dataset(folder)
 
@@ -188,8 +192,11 @@ def _store(archive: zipfile.ZipFile, folder: Path, path: PurePosixPath) -> dict[
                 member.write(chunk)
         after = os.fstat(file.fileno())
     if size != before.st_size or (before.st_mtime_ns, before.st_size) != (after.st_mtime_ns, after.st_size):
-        message = f"'{folder / path}' changed while it was saved: back up when nothing is recorded."
-        raise DatasetError(message, reason="backup_changed", file=path.name)
+        raise DatasetError(
+            "'{folder}' changed while it was saved: back up when nothing is recorded.",
+            folder=folder / path,
+            file=path.name,
+        )
     return {"path": path.as_posix(), "bytes": size, "sha256": digest.hexdigest()}
 
 
@@ -208,37 +215,43 @@ def _summary(file: Path, manifest: dict[str, Any], left_out: tuple[str, ...] = (
 
 
 def _damaged(path: Path, why: object) -> DatasetError:
-    message = f"The backup '{path}' is damaged ({why}): use another copy of it."
-    return DatasetError(message, reason="backup_damaged", name=path.name)
+    return DatasetError("The backup '{path}' is damaged ({why}): use another copy of it.", path=path, why=why)
 
 
 @contextmanager
 def _open_backup(path: Path) -> Iterator[tuple[zipfile.ZipFile, dict[str, Any]]]:
     """Open a backup and check that its members are those of its manifest."""
     if path.exists() and not path.is_file():
-        raise DatasetError(f"'{path}' is no file: give a backup.", reason="backup_damaged", name=path.name)
+        raise DatasetError("'{path}' is no file: give a backup.", path=path)
     try:
         archive = zipfile.ZipFile(path)
     except FileNotFoundError:
-        raise DatasetError(
-            f"There is no backup '{path}': check the path.", reason="file_gone", name=path.name
-        ) from None
+        raise DatasetError("There is no backup '{path}': check the path.", path=path) from None
     except OSError as cause:
-        message = f"The backup '{path}' cannot be read ({cause.strerror or cause})."
-        raise DatasetError(message, reason="backup_damaged", name=path.name) from None
+        raise DatasetError(
+            "The backup '{path}' cannot be read ({why}).", path=path, why=cause.strerror or cause
+        ) from None
     except _BROKEN as cause:
-        message = f"'{path}' is no backup of PlushSense, or a damaged one ({cause})."
-        raise DatasetError(message, reason="backup_damaged", name=path.name) from None
+        raise DatasetError(
+            "'{path}' is no backup of PlushSense, or a damaged one ({cause}).", path=path, cause=cause
+        ) from None
     with archive:
         members = archive.infolist()
         names = [info.filename for info in members]
         if MANIFEST not in names:
-            message = f"'{path}' is no backup of PlushSense (it holds no {MANIFEST}), or a damaged one."
-            raise DatasetError(message, reason="backup_damaged", name=path.name)
+            raise DatasetError(
+                "'{path}' is no backup of PlushSense (it holds no {manifest}), or a damaged one.",
+                path=path,
+                manifest=MANIFEST,
+            )
         for info in members:
             if reason := _refusal(info):
-                message = f"The backup '{path}' is not used: '{info.filename}' in it is {reason}."
-                raise DatasetError(message, reason="backup_damaged", name=path.name)
+                raise DatasetError(
+                    "The backup '{path}' is not used: '{info}' in it is {reason}.",
+                    path=path,
+                    info=info.filename,
+                    reason=reason,
+                )
         if len(set(names)) != len(names):
             raise _damaged(path, "it holds a name twice")
         manifest = _manifest_of(path, archive)
@@ -282,9 +295,10 @@ def _manifest_of(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
             raise ValueError("its manifest has another format")
         if table["version"] != VERSION:
             raise DatasetError(
-                f"The backup '{path}' has version {table['version']!r}; this PlushSense reads {VERSION}: update it.",
-                reason="backup_version",
-                name=path.name,
+                "The backup '{path}' has version {version!r}; this PlushSense reads {known}: update it.",
+                path=path,
+                version=table["version"],
+                known=VERSION,
             )
         kinds = {"name": str, "recordings": int, "subjects": int, "hash": str, "files": list}
         entry_kinds = {"path": str, "bytes": int, "sha256": str}

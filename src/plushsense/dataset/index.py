@@ -20,7 +20,6 @@ from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, Gesture, GestureSet, plain_label
 from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_bytes, read_recording, read_stream
 from plushsense.core.row_times import bridged_ms, stray_rows
-from plushsense.core.sentences import Sentence
 from plushsense.core.simulation import is_marked
 from plushsense.dataset.files import (
     RECORDINGS_INDEX,
@@ -95,18 +94,20 @@ def open_dataset(path: str | Path) -> Dataset:
             return dataset
         if missing := missing_files(folder):
             raise DatasetError(
-                f"'{folder}' lacks {len(missing)} raw file{'s' if len(missing) > 1 else ''} that it had "
-                f"('{missing[0]}'): restore them, or delete {STAMP} there to go on without them.",
-                reason="raw_files_missing",
-                folder=folder.name,
+                "'{folder}' lacks {n} raw file{more} that it had ('{file}'): restore them, or delete {stamp} there "
+                "to go on without them.",
+                folder=folder,
                 n=len(missing),
+                more="s" if len(missing) > 1 else "",
                 file=missing[0],
+                stamp=STAMP,
             )
         if rewritten_marks(folder):
             raise DatasetError(
-                f"Marks that '{folder / MARKS}' had are missing or changed, but marks are only appended: restore the "
-                f"file, or delete {STAMP} there to go on with the marks as they are now.",
-                reason="marks_changed",
+                "Marks that '{path}' had are missing or changed, but marks are only appended: restore the file, or "
+                "delete {stamp} there to go on with the marks as they are now.",
+                path=folder / MARKS,
+                stamp=STAMP,
                 folder=folder.name,
             )
         stamp = current_stamp(folder)
@@ -117,18 +118,18 @@ def open_dataset(path: str | Path) -> Dataset:
         built = build_index(folder, head) if dataset is None else IndexBuild(dataset)
     except OSError as cause:
         raise DatasetError(
-            f"'{folder}' cannot be read: {cause.strerror or cause} ({cause.filename}).",
-            reason="dataset_unreadable",
-            folder=folder.name,
-            why=cause.strerror or str(cause),
+            "'{folder}' cannot be read: {why} ({file}).",
+            folder=folder,
+            why=cause.strerror or cause,
+            file=cause.filename,
         ) from None
     if built.unreadable:
         file, reason = next(iter(built.unreadable.items()))
         raise DatasetError(
-            f"'{folder / file}' can no longer be read"
-            f"{f', nor can {len(built.unreadable) - 1} other files' if len(built.unreadable) > 1 else ''}: "
-            f"restore it, or remove it from the data set. {reason}",
-            reason="raw_file_unreadable",
+            "'{path}' can no longer be read{more}: restore it, or remove it from the data set. {reason}",
+            path=folder / file,
+            more=f", nor can {len(built.unreadable) - 1} other files" if len(built.unreadable) > 1 else "",
+            reason=reason,
             folder=folder.name,
             file=file,
         )
@@ -164,13 +165,13 @@ def _refuse_changed(folder: Path, now: Dataset) -> None:
     changed = sorted(file for file, sha256 in files.items() if before.get(file, sha256) != sha256)
     if changed:
         raise DatasetError(
-            f"{len(changed)} raw file{'s' if len(changed) > 1 else ''} in '{folder}' changed since the import "
-            f"('{changed[0]}'), but raw files are never rewritten: restore them, or delete {STAMP} there to go on with "
-            "what they hold now.",
-            reason="raw_files_changed",
-            folder=folder.name,
+            "{n} raw file{more} in '{folder}' changed since the import ('{file}'), but raw files are never "
+            "rewritten: restore them, or delete {stamp} there to go on with what they hold now.",
             n=len(changed),
+            more="s" if len(changed) > 1 else "",
+            folder=folder,
             file=changed[0],
+            stamp=STAMP,
         )
 
 
@@ -273,7 +274,7 @@ def change_head(folder: Path, change: Callable[[DatasetHead], DatasetHead]) -> D
     except OSError as cause:
         why = cause.strerror or str(cause)
         raise DatasetError(
-            f"'{folder / HEAD}' cannot be written: {why}.", reason="head_not_written", folder=folder.name, why=why
+            "'{path}' cannot be written: {why}.", path=folder / HEAD, why=why, folder=folder.name
         ) from None
     return head
 
@@ -288,14 +289,15 @@ def build_index(folder: Path, head: DatasetHead, progress: Progress | None = Non
     for done, (kind, path) in enumerate(files):
         name = path.relative_to(folder).as_posix()
         if (shown := name.encode(errors="backslashreplace").decode()) != name:
-            message = f"'{shown}' in '{folder}' has a name that is no text: rename it."
-            raise DatasetError(message, reason="name_no_text", file=shown)
+            raise DatasetError(
+                "'{file}' in '{folder}' has a name that is no text: rename it.", file=shown, folder=folder
+            )
         reader = read_stream if kind == STREAMS else read_recording
         try:
             data = read_bytes(path)
             result = reader(path, head.layout, data)
         except FileFormatError as cause:
-            unreadable[name] = Sentence.of(cause)
+            unreadable[name] = cause.message
             continue
         subject = path.relative_to(folder / kind).parts[0]
         read = _RawFile(path, subject, result, hashlib.sha256(data).hexdigest())
@@ -411,9 +413,9 @@ def _recordings_from_files(
         name = parse_name(read.path.name)
         if name is None:
             raise DatasetError(
-                f"'{read.path}' is not named <label>_<epoch ms>_<rows>.csv: move it out of {RECORDINGS}/.",
-                reason="raw_file_name",
-                file=read.path.name,
+                "'{file}' is not named <label>_<epoch ms>_<rows>.csv: move it out of {recordings}/.",
+                file=read.path,
+                recordings=RECORDINGS,
             )
         if name.label not in gestures:
             gestures[name.label] = head.gestures.find(name.label)

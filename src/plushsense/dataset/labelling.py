@@ -68,10 +68,15 @@ def check_label(dataset: Dataset, label: str) -> str:
         return PRACTICE + found.label
     known = [HANDLING, REST, *(PRACTICE + each for each in dataset.gestures.labels)]
     raise DatasetError(
-        f"The label '{label}' is unknown: accepted are {HANDLING}, {REST}, and {PRACTICE} with a gesture of "
-        f"'{dataset.head.name}', such as '{known[-1]}'.{nearest(label, known)}",
-        reason="label_unknown",
+        "The label '{label}' is unknown: accepted are {handling}, {rest}, and {practice} with a gesture of "
+        "'{dataset}', such as '{known}'.{hint}",
         label=label,
+        handling=HANDLING,
+        rest=REST,
+        practice=PRACTICE,
+        dataset=dataset.head.name,
+        known=known[-1],
+        hint=nearest(label, known),
     )
 
 
@@ -83,14 +88,14 @@ def find_streams(dataset: Dataset, pattern: str = "*") -> list[StreamInfo]:
     """
     if dataset.layout.is_labelled:
         raise DatasetError(
-            f"The streams of '{dataset.head.name}' have a label on every row (layout '{dataset.layout.name}'): nothing "
-            "between the recordings is left to label.",
-            reason="stream_labelled",
+            "The streams of '{dataset}' have a label on every row (layout '{layout}'): nothing between the "
+            "recordings is left to label.",
+            dataset=dataset.head.name,
+            layout=dataset.layout.name,
         )
     if not dataset.streams:
         raise DatasetError(
-            f"'{dataset.head.name}' has no streams: labels are for streams, between the recordings.",
-            reason="no_streams",
+            "'{dataset}' has no streams: labels are for streams, between the recordings.", dataset=dataset.head.name
         )
     ids = {s.id: s for s in dataset.streams}
     return [ids[identity] for identity in match_ids(pattern, ids, "stream")]
@@ -138,8 +143,9 @@ def label_stretches(
         (stream,) = find_streams(dataset, s.stream)
         if not 0 <= s.start < s.stop <= stream.rows:
             raise DatasetError(
-                f"'{s.stream}' has rows 0 to {stream.rows}: {s.start} to {s.stop} cannot be labelled.",
-                reason="rows_not_labelled",
+                "'{stream}' has rows 0 to {rows}: {start} to {stop} cannot be labelled.",
+                stream=s.stream,
+                rows=stream.rows,
                 start=s.start,
                 stop=s.stop,
             )
@@ -176,10 +182,11 @@ def relabel(
         found = dataset.gestures.find(gesture)
         if found is None:
             raise DatasetError(
-                f"'{dataset.head.name}' has no gesture '{gesture}': accepted are {', '.join(dataset.gestures.labels)}."
-                f"{nearest(gesture, dataset.gestures.labels)}",
-                reason="unknown_gesture",
+                "'{dataset}' has no gesture '{gesture}': accepted are {labels}.{hint}",
+                dataset=dataset.head.name,
                 gesture=gesture,
+                labels=", ".join(dataset.gestures.labels),
+                hint=nearest(gesture, dataset.gestures.labels),
             )
         label = found.label
     marks = []

@@ -111,10 +111,11 @@ def _refuse_contradictions(mark: Mark, where: str) -> None:
     """Raise DatasetError for a mark whose values contradict each other, or are out of range."""
     if mark.action not in ACTIONS:
         raise DatasetError(
-            f"{where}: unknown mark '{mark.action}': accepted are {', '.join(ACTIONS)}.{nearest(mark.action, ACTIONS)}",
-            reason="marks_unknown",
+            "{where}: unknown mark '{action}': accepted are {actions}.{hint}",
             where=where,
             action=mark.action,
+            actions=", ".join(ACTIONS),
+            hint=nearest(mark.action, ACTIONS),
         )
     for key, low in (("start", 0), ("stop", -1)):
         if (value := getattr(mark, key)) < low:
@@ -152,7 +153,9 @@ def match_ids(pattern: str, known: Iterable[str], kind: str) -> list[str]:
     if not matched:
         hint = nearest(pattern, ids)
         example = f" For example '{ids[0]}', or a pattern such as 'P01/*'." if ids and not hint else ""
-        raise DatasetError(f"There is no {kind} '{pattern}'.{hint}{example}", reason="no_such_id", name=pattern)
+        raise DatasetError(
+            "There is no {kind} '{name}'.{hint}{example}", kind=kind, name=pattern, hint=hint, example=example
+        )
     return matched
 
 
@@ -177,8 +180,9 @@ def locked(folder: Path, timeout_s: float = _LOCK_S) -> Iterator[None]:
         lock.acquire()
     except Timeout:
         raise DatasetError(
-            f"Another program has held '{folder / LOCK}' for {timeout_s:.0f} s: wait for it or end it.",
-            reason="dataset_locked",
+            "Another program has held '{path}' for {timeout_s:.0f} s: wait for it or end it.",
+            path=folder / LOCK,
+            timeout_s=timeout_s,
             folder=folder.name,
         ) from None
     except NotImplementedError:
@@ -228,9 +232,7 @@ def append_marks(folder: Path, marks: Iterable[Mark], check: Callable[[], None] 
             write_marks(folder, marks)
     except OSError as cause:
         raise DatasetError(
-            f"'{folder / MARKS}' cannot be written: {cause.strerror or cause}.",
-            reason="marks_not_written",
-            why=cause.strerror or str(cause),
+            "'{path}' cannot be written: {why}.", path=folder / MARKS, why=cause.strerror or cause
         ) from None
 
 
@@ -296,9 +298,7 @@ class MarksFollower:
                 *whole, rest = file.read().split(b"\n")
         except OSError as cause:
             raise DatasetError(
-                f"'{self._path}' cannot be read: {cause.strerror or cause}.",
-                reason="marks_not_read",
-                why=cause.strerror or str(cause),
+                "'{path}' cannot be read: {why}.", path=self._path, why=cause.strerror or cause
             ) from None
         states = dict(self._states)
         for line in whole:
@@ -322,9 +322,7 @@ class MarksFollower:
             return None
         except OSError as cause:
             raise DatasetError(
-                f"'{self._path}' cannot be read: {cause.strerror or cause}.",
-                reason="marks_not_read",
-                why=cause.strerror or str(cause),
+                "'{path}' cannot be read: {why}.", path=self._path, why=cause.strerror or cause
             ) from None
         return now.st_ino, now.st_size, now.st_mtime_ns
 
@@ -341,7 +339,7 @@ class MarksFollower:
         except (ValueError, RecursionError):
             return
         where = f"'{self._path}' line {number}"
-        mark = load_table(table, Mark, where, DatasetError, "marks_broken")
+        mark = load_table(table, Mark, where, DatasetError, "The marks cannot be read. {problem}")
         _refuse_contradictions(mark, where)
         states[mark.recording] = apply_mark(states.get(mark.recording, MarkState()), mark)
 

@@ -81,24 +81,21 @@ class Generation:
         """Raise ForgottenError if a person has been removed since, or is being removed, or the data set is gone."""
         if not (self.folder / HEAD).is_file():
             raise ForgottenError(
-                f"The data set '{self.folder}' was moved or deleted while this ran, so its results were not written: "
-                "run it again on the data set where it is now.",
-                reason="dataset_moved",
-                folder=self.folder.name,
+                "The data set '{folder}' was moved or deleted while this ran, so its results were not written: run "
+                "it again on the data set where it is now.",
+                folder=self.folder,
             )
         if self.of(self.folder) != self:
             raise ForgottenError(
-                f"A person was removed from '{self.folder}' (plushsense forget) while this ran, so its results were "
-                "not written: run it again on the data set as it is now.",
-                reason="person_removed",
-                folder=self.folder.name,
+                "A person was removed from '{folder}' (plushsense forget) while this ran, so its results were not "
+                "written: run it again on the data set as it is now.",
+                folder=self.folder,
             )
         if (self.folder / UNDER_WAY).exists():
             raise ForgottenError(
-                f"The removal of a person from '{self.folder}' is not finished, so nothing was written: run  "
-                "plushsense forget  there first.",
-                reason="removal_unfinished",
-                folder=self.folder.name,
+                "The removal of a person from '{folder}' is not finished, so nothing was written: run  plushsense "
+                "forget  there first.",
+                folder=self.folder,
             )
 
     @contextmanager
@@ -262,9 +259,9 @@ class DatasetHead:
         for key, text in _texts_by_key(named | {"about": self.about.to_table()}):
             if found := _NO_XML.search(text):
                 raise DatasetError(
-                    f"'{key}' of the data set holds the control character U+{ord(found.group()):04X}: remove it.",
-                    reason="head_control",
+                    "'{key}' of the data set holds the control character U+{ord:04X}: remove it.",
                     key=key,
+                    ord=ord(found.group()),
                 )
 
     def to_toml(self) -> str:
@@ -283,28 +280,25 @@ class DatasetHead:
         """Read the head of the data set in ``folder``; raise DatasetError if the folder is missing or no data set."""
         path = folder / HEAD
         if not folder.is_dir():
-            raise DatasetError(
-                f"There is no folder '{folder}': give the folder of a data set.",
-                reason="no_dataset_folder",
-                folder=folder.name,
-            )
+            raise DatasetError("There is no folder '{folder}': give the folder of a data set.", folder=folder)
         if not path.is_file():
             raise DatasetError(
-                f"'{folder}' is not a data set (it has no {HEAD}): create one with  plushsense import SRC {folder}",
-                reason="not_a_dataset",
-                folder=folder.name,
+                "'{folder}' is not a data set (it has no {head}): create one with  plushsense import SRC {folder}",
+                folder=folder,
+                head=HEAD,
             )
         refuse_special_files(folder, DatasetError)
         table = read_toml(path, "data set", DatasetError)
         version = table.pop("format", None)
         if version != FORMAT_VERSION:
             raise DatasetError(
-                f"'{path}' has the format {version}; this PlushSense reads {FORMAT_VERSION}: update PlushSense.",
-                reason="dataset_format",
-                folder=folder.name,
+                "'{path}' has the format {version}; this PlushSense reads {format_version}: update PlushSense.",
+                path=path,
                 version=version,
+                format_version=FORMAT_VERSION,
+                folder=folder.name,
             )
-        file = load_table(table, HeadFile, f"'{path}'", DatasetError, "head_broken")
+        file = load_table(table, HeadFile, f"'{path}'", DatasetError, "The data set cannot be opened. {problem}")
         values = vars(file) | {
             "layout": Layout.from_dict(file.layout, f"layout in '{path}'"),
             "gestures": GestureSet.from_dict(file.gesture_set, f"gesture set in '{path}'"),
@@ -466,8 +460,10 @@ class Dataset:
         try:
             data = read_bytes(path)
             if hashlib.sha256(data).hexdigest() != info.sha256:
-                message = f"'{path}' is not the file that was imported (its SHA-256 differs): restore it from a backup."
-                raise FileFormatError(message, reason="raw_file_changed", file=path.name)
+                raise FileFormatError(
+                    "'{file}' is not the file that was imported (its SHA-256 differs): restore it from a backup.",
+                    file=path,
+                )
             return read(path, self.layout, data).frames
         except FileFormatError:
             # The file may have been deleted because its person was removed.

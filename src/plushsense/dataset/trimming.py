@@ -107,9 +107,10 @@ def suggest_trims(
     """
     if dataset.layout.is_labelled:
         raise DatasetError(
-            f"The recordings of '{dataset.head.name}' are cut where the label on the rows changes (layout "
-            f"'{dataset.layout.name}'), so there is no reaction time to trim: trim data sets of single recordings.",
-            reason="dataset_not_trimmed",
+            "The recordings of '{dataset}' are cut where the label on the rows changes (layout '{layout}'), so there "
+            "is no reaction time to trim: trim data sets of single recordings.",
+            dataset=dataset.head.name,
+            layout=dataset.layout.name,
         )
     chosen = list(dataset.used if recordings is None else recordings)
     marks = read_marks(dataset.path)
@@ -209,9 +210,9 @@ def set_rows(dataset: Dataset, trim: Trim, start: int, stop: int, who: str, why:
     info = trim.recording
     if not 0 <= start < stop <= info.rows:
         raise DatasetError(
-            f"'{info.id}' has rows 0 to {info.rows}: {start} to {stop} cannot be kept.",
-            reason="rows_not_kept",
+            "'{recording}' has rows 0 to {rows}: {start} to {stop} cannot be kept.",
             recording=info.id,
+            rows=info.rows,
             start=start,
             stop=stop,
         )

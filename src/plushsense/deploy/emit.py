@@ -109,18 +109,28 @@ def read_facts(folder: str | Path) -> dict[str, Any]:
         needed = {"title", "channels", "classes", "memory_bytes", "model_bytes"} - set(facts)
     except (FileNotFoundError, NotADirectoryError):
         problem = f"'{folder}' is no export" if Path(folder).exists() else f"There is no export '{folder}'"
-        message = f"{problem}: make one with plushsense export BUNDLE OUT."
-        raise BadInput(message, reason="export_gone", name=Path(folder).name) from None
+        raise BadInput(
+            "{problem}: make one with plushsense export BUNDLE OUT.", problem=problem, name=Path(folder).name
+        ) from None
     except (OSError, ValueError, TypeError, RecursionError) as cause:
-        message = f"'{path}' cannot be read ({cause}): export the model again."
-        raise BadInput(message, reason="export_damaged", name=Path(folder).name) from None
+        raise BadInput(
+            "'{path}' cannot be read ({cause}): export the model again.", path=path, cause=cause, name=Path(folder).name
+        ) from None
     name = facts.get("name", "")
     if name and not _accepted(name):
-        message = f"'{path}' has the name {name!r}, which no export has: export the model again."
-        raise BadInput(message, reason="export_damaged", name=Path(folder).name)
+        raise BadInput(
+            "'{path}' has the name {file!r}, which no export has: export the model again.",
+            path=path,
+            file=name,
+            name=Path(folder).name,
+        )
     if needed:
-        message = f"'{path}' lacks {', '.join(sorted(needed))}: export the model again."
-        raise BadInput(message, reason="export_damaged", name=Path(folder).name)
+        raise BadInput(
+            "'{path}' lacks {needed}: export the model again.",
+            path=path,
+            needed=", ".join(sorted(needed)),
+            name=Path(folder).name,
+        )
     return dict(facts)
 
 

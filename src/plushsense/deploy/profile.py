@@ -528,9 +528,8 @@ def profile(
     if not installed:
         packages = " ".join(dict.fromkeys(p for lacks in missing.values() for p in lacks))
         raise ToolError(
-            "No emulator to count on is installed here: install Debian's "
-            f"{packages} (or some of them), or give --target host for sizes on this computer only.",
-            reason="no_emulator",
+            "No emulator to count on is installed here: install Debian's {packages} (or some of them), or give "
+            "--target host for sizes on this computer only.",
             packages=packages,
         )
     costs = {}

@@ -127,16 +127,19 @@ def refuse_undeployable(arch: Arch) -> None:
     """Raise ArchError for a network that cannot run in integers, with the reason and the option to train it with."""
     if arch.padding == "causal":
         raise ArchError(
-            f"{arch.title} has the padding '{arch.padding}', whose zeros cannot be folded with the normalisation: "
-            f"train {arch.symbol} with --padding stream.",
-            reason="arch_padding",
+            "{arch} has the padding '{padding}', whose zeros cannot be folded with the normalisation: train {symbol} "
+            "with --padding stream.",
+            arch=arch.title,
             padding=arch.padding,
+            symbol=arch.symbol,
         )
     if arch.norm == "layer":
         raise ArchError(
-            f"{arch.title} has {arch.norm} normalisation, which cannot be folded into a convolution: "
-            f"train {arch.symbol} with --norm batch or none.",
-            reason="arch_norm",
+            "{arch} has {norm} normalisation, which cannot be folded into a convolution: train {symbol} with --norm "
+            "batch or none.",
+            arch=arch.title,
+            norm=arch.norm,
+            symbol=arch.symbol,
         )
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple, Self
 
 from plushsense.core.errors import python_warning
 from plushsense.core.layouts import Layout
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 
 
 class Frame(NamedTuple):
@@ -184,9 +184,9 @@ class Device(ABC):
         """
 
     @property
-    def mismatch(self) -> Sentence:
+    def mismatch(self) -> Message:
         """Why lines of the toy cannot be read, with the first of them, and what to do; "" if they can, or none came."""
-        return Sentence()
+        return Message()
 
     def reopen(self) -> Device | None:
         """Return a device that continues, or ends, after a lost connection; None: it must be opened anew by its URL.
@@ -210,9 +210,9 @@ class Device(ABC):
         reported = {""}
         while not self.closed:
             frames = self.read()
-            mismatch = self.mismatch if not frames else Sentence()
-            if mismatch.reason not in reported:
-                reported.add(mismatch.reason)
+            mismatch = self.mismatch if not frames else Message()
+            if mismatch.template not in reported:
+                reported.add(mismatch.template)
                 warn(mismatch)
             if frames is None:
                 return

@@ -18,7 +18,7 @@ from urllib.parse import unquote
 
 from plushsense.core.errors import ConfigError, DeviceError, need
 from plushsense.core.layouts import Layout
-from plushsense.core.sentences import Sentence, join_names
+from plushsense.core.sentences import Message, join_names
 from plushsense.devices.base import Device, Frame, now_ms
 from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
 from plushsense.devices.wire import LineParser
@@ -139,8 +139,9 @@ class BleDevice(Device):
                 if frames:
                     return frames
                 self._parser.finish()
-                message = f"'{self.url}' went away (disconnected): was it switched off or out of reach?"
-                raise DeviceError(message, reason="toy_gone", url=self.url)
+                raise DeviceError(
+                    "'{url}' went away (disconnected): was it switched off or out of reach?", url=self.url
+                )
             at, host, data = received
             if wait:
                 self.arrived_s = at
@@ -153,10 +154,10 @@ class BleDevice(Device):
         if self._received_s is not None and 0.0 < limit_s <= time.perf_counter() - self._received_s:
             self._parser.finish()
             raise DeviceError(
-                f"'{self.url}' has stopped sending for {limit_s:g} s, so its connection is given up: is it still near, "
-                "and Bluetooth running? For a toy that pauses, write ?silence_s=0.",
-                reason="toy_gone",
+                "'{url}' has stopped sending for {limit_s:g} s, so its connection is given up: is it still near, and "
+                "Bluetooth running? For a toy that pauses, write ?silence_s=0.",
                 url=self.url,
+                limit_s=limit_s,
             )
 
     def _on_notification(self, _: Any, data: bytearray) -> None:
@@ -164,7 +165,7 @@ class BleDevice(Device):
         self._received.put((self._received_s, now_ms(), bytes(data)))
 
     @property
-    def mismatch(self) -> Sentence:
+    def mismatch(self) -> Message:
         """As in `Device`."""
         return self._parser.mismatch(self.url)
 
@@ -197,11 +198,9 @@ class BleDevice(Device):
             if not opened.done():
                 broken = cause
                 if not isinstance(cause, Exception):
-                    message = f"'{self.url}' broke off while it was being connected; try again."
-                    broken = DeviceError(message, reason="toy_unreachable", url=self.url)
+                    broken = DeviceError("'{url}' broke off while it was being connected; try again.", url=self.url)
                 elif not isinstance(cause, DeviceError):
-                    message = f"'{self.url}': {in_words(cause)}."
-                    broken = DeviceError(message, reason="toy_unreachable", url=self.url)
+                    broken = DeviceError("'{url}': {in_words}.", url=self.url, in_words=in_words(cause))
                 opened.set_exception(broken)
         finally:
             self._received.put(None)
@@ -232,9 +231,10 @@ class BleDevice(Device):
             await asyncio.wait_for(client.connect(), _CONNECT_S)
         except TimeoutError:
             raise DeviceError(
-                f"{found} but could not be connected within {_CONNECT_S:g} s: "
-                "is another computer or phone connected to it? Switching it off and on disconnects all.",
-                reason="toy_unreachable",
+                "{found} but could not be connected within {connect_s:g} s: is another computer or phone connected "
+                "to it? Switching it off and on disconnects all.",
+                found=found,
+                connect_s=_CONNECT_S,
                 url=self.url,
             ) from None
         connected = True
@@ -277,9 +277,12 @@ class BleDevice(Device):
             here += f"; still connected to this computer: {still}"
         described = f"named '{target.name}'" if target.address is None else f"with the address {target.address}"
         raise DeviceError(
-            f"'{self.url}': no Bluetooth device {described} advertised within {target.find_s:g} s; {here}; "
-            "is it switched on, near, and not still connected to this computer or to another?",
-            reason="toy_no_bluetooth",
+            "'{url}': no Bluetooth device {described} advertised within {find_s:g} s; {here}; is it switched on, "
+            "near, and not still connected to this computer or to another?",
+            url=self.url,
+            described=described,
+            find_s=target.find_s,
+            here=here,
             name=target.name or target.address,
         )
 
@@ -327,7 +330,7 @@ def scan(seconds: float, backends: BleBackends | None = None) -> list[BleAdverti
         asyncio.run_coroutine_threadsafe(look(), bluetooth_loop()).result()
     except Exception as cause:  # noqa: BLE001, RUF100
         words = in_words(cause)
-        raise DeviceError(f"{words[0].upper()}{words[1:]}.", reason="bluetooth_unusable") from None
+        raise DeviceError("{why}.", why=words[0].upper() + words[1:]) from None
     return sorted(seen.values(), key=lambda s: (-s.rssi, s.name, s.address))
 
 
@@ -338,15 +341,16 @@ def search_bluetooth(scan_s: float, backends: BleBackends | None = None) -> Devi
     for device in seen:
         uart = UART_SERVICE in device.services
         if uart or any(word in device.name.lower() for word in _TOY_WORDS):
-            message = f"{device.rssi} dBm, {'Nordic UART service' if uart else 'advertises no Nordic UART service'}"
-            about = Sentence(message, reason="ble_about" if uart else "ble_about_other", dbm=device.rssi)
+            template = "{dbm} dBm, Nordic UART service" if uart else "{dbm} dBm, advertises no Nordic UART service"
+            about = Message(template, dbm=device.rssi)
             toys.append(DeviceInfo(f"ble://{device.address}", "ble", device.name or device.address, about))
     others = len(seen) - len(toys)
     if not others:
         return DeviceListing(toys)
     who = "1 more device advertises" if others == 1 else f"{others} more devices advertise"
-    message = f"Bluetooth: {who}, by name and service no toy; ble://ADDRESS opens any."
-    return DeviceListing(toys, [Sentence(message, reason="ble_others", n=others)])
+    return DeviceListing(
+        toys, [Message("Bluetooth: {who}, by name and service no toy; ble://ADDRESS opens any.", who=who, n=others)]
+    )
 
 
 async def _connected(bleak: ModuleType, backends: BleBackends, service: str) -> list[Any]:
@@ -406,9 +410,9 @@ def open_ble(address: DeviceAddress, layout: Layout) -> BleDevice:
     by_name = named.lower() == "name" and colon != ""
     if not (name.strip() if by_name else _MAC.match(place) or _UUID.match(place.lower())):
         raise DeviceError(
-            f"'{address.url}' names no Bluetooth toy: write ble://AA:BB:CC:DD:EE:FF, the UUID that macOS gives in its "
-            "place, or ble://name:PlushName (plushsense devices lists them).",
-            reason="toy_ble_address",
+            "'{url}' names no Bluetooth toy: write ble://AA:BB:CC:DD:EE:FF, the UUID that macOS gives in its place, "
+            "or ble://name:PlushName (plushsense devices lists them).",
+            url=address.url,
         )
     service, tx = _uuid(address, "service"), _uuid(address, "tx")
     target = BleTarget(

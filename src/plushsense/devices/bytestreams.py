@@ -16,7 +16,7 @@ from serial.tools import list_ports
 
 from plushsense.core.errors import ConfigError, DeviceError
 from plushsense.core.layouts import Layout
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.devices.base import Device, Frame, now_ms
 from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing, parse_url
 from plushsense.devices.wire import LineParser
@@ -41,7 +41,7 @@ def serial_ports() -> list[tuple[str, str]]:
 def search_serial(_: float) -> DeviceListing:
     """List the serial ports."""
     ports = [(name, "" if about == "n/a" else about) for name, about in serial_ports()]
-    notes: list[str] = [] if ports else [Sentence("This computer has no serial port now.", reason="no_serial_port")]
+    notes: list[str] = [] if ports else [Message("This computer has no serial port now.")]
     return DeviceListing([DeviceInfo(f"serial://{name}", "serial", name, about) for name, about in ports], notes)
 
 
@@ -94,7 +94,7 @@ class LineDevice(Device):
         return self._parser.frames(data, now_ms())
 
     @property
-    def mismatch(self) -> Sentence:
+    def mismatch(self) -> Message:
         """As in `Device`."""
         return self._parser.mismatch(self.url)
 
@@ -134,8 +134,9 @@ class SerialLink(Link):
             raise self._gone(cause) from None
 
     def _gone(self, cause: Exception) -> DeviceError:
-        message = f"'{self.url}' went away ({_reason(cause)}): was it unplugged or switched off?"
-        return DeviceError(message, reason="toy_gone", url=self.url)
+        return DeviceError(
+            "'{url}' went away ({reason}): was it unplugged or switched off?", url=self.url, reason=_reason(cause)
+        )
 
     def close(self) -> None:
         """As in `Link`."""
@@ -152,39 +153,37 @@ def _reason(cause: Exception) -> str:
 def _refusal(url: str, port: str, cause: Exception) -> DeviceError:
     number = getattr(cause, "errno", None)
     cannot = DeviceError(
-        f"'{url}' cannot be opened: {cause if isinstance(cause, ValueError) else _reason(cause)}.",
-        reason="toy_unreachable",
-        url=url,
+        "'{url}' cannot be opened: {cause}.", url=url, cause=cause if isinstance(cause, ValueError) else _reason(cause)
     )
     if isinstance(cause, ValueError):
         return cannot
-    busy = f"'{url}': another program is using {port}; close it first."
+    busy = DeviceError("'{url}': another program is using {port}; close it first.", url=url, port=port)
     if os.name == "posix" and Path(port).exists():
         if number in (13, 1):
-            message = f"'{url}': this user may not open {port}; on Linux join the group dialout and log in again."
-            return DeviceError(message, reason="toy_port_denied", port=port)
+            return DeviceError(
+                "'{url}': this user may not open {port}; on Linux join the group dialout and log in again.",
+                url=url,
+                port=port,
+            )
         if number == 11 or "lock" in str(cause).lower():
-            return DeviceError(busy, reason="toy_port_busy", port=port)
+            return busy
         return cannot
     if "access is denied" in str(cause).lower() or "PermissionError" in str(cause):
-        return DeviceError(busy, reason="toy_port_busy", port=port)
+        return busy
     return _no_port(url, port)
 
 
 def _no_port(url: str, port: str) -> DeviceError:
     ports = ", ".join(name for name, _ in serial_ports())
     here = f"the ports here are {ports}" if ports else "this computer has no serial port now"
-    return DeviceError(
-        f"'{url}': there is no port {port}; {here}.", reason="toy_no_port", port=port, ports=ports or "–"
-    )
+    return DeviceError("'{url}': there is no port {port}; {here}.", url=url, port=port, here=here, ports=ports or "–")
 
 
 def _port_of(address: DeviceAddress) -> str:
     """Return the name of the port; raise an error for an address that is not ``serial://PORT``."""
     address.check_keys(("baud",))
     if not address.place.strip("/"):
-        message = f"'{address.url}' names no port: write serial:///dev/ttyUSB0 or serial://COM3."
-        raise DeviceError(message, reason="toy_serial_address")
+        raise DeviceError("'{url}' names no port: write serial:///dev/ttyUSB0 or serial://COM3.", url=address.url)
     place = address.place
     return place[1:] if place.startswith("/") and place[1:].upper().startswith("COM") else place
 
@@ -218,20 +217,18 @@ class TcpLink(Link):
         try:
             self._socket = socket.create_connection((host, port), timeout=CONNECT_S)
         except socket.gaierror:
-            message = f"'{url}': there is no host '{host}'; check the name."
-            raise DeviceError(message, reason="toy_no_host", host=host) from None
+            raise DeviceError("'{url}': there is no host '{host}'; check the name.", url=url, host=host) from None
         except ConnectionRefusedError:
             raise DeviceError(
-                f"'{url}': nobody listens on port {port} of {host}; start the toy there (plushsense toy --tcp {port}).",
-                reason="toy_refused",
-                host=host,
+                "'{url}': nobody listens on port {port} of {host}; start the toy there (plushsense toy --tcp {port}).",
+                url=url,
                 port=port,
+                host=host,
             ) from None
         except (TimeoutError, OSError, UnicodeError) as cause:
             silent = isinstance(cause, TimeoutError)
             reason = "no answer" if silent else getattr(cause, "strerror", None) or cause
-            message = f"'{url}' cannot be reached: {reason}."
-            raise DeviceError(message, reason="toy_unreachable", url=url) from None
+            raise DeviceError("'{url}' cannot be reached: {reason}.", url=url, reason=reason) from None
         _enable_keepalive(self._socket)
 
     def receive(self, wait_s: float) -> bytes | None:
@@ -257,8 +254,7 @@ class TcpLink(Link):
             raise self._gone(cause) from None
 
     def _gone(self, cause: OSError) -> DeviceError:
-        message = f"'{self.url}' went away: {cause.strerror or cause}."
-        return DeviceError(message, reason="toy_gone", url=self.url)
+        return DeviceError("'{url}' went away: {why}.", url=self.url, why=cause.strerror or cause)
 
     def close(self) -> None:
         """As in `Link`."""
@@ -282,8 +278,7 @@ def check_tcp(address: DeviceAddress) -> tuple[str, int]:
     address.check_keys(())
     match = re.fullmatch(r"(\[[^\]]+\]|[^:/\[\]]+):(\d{1,5})/?", address.place, re.ASCII)
     if match is None or not 1 <= int(match[2]) <= 65535:
-        message = f"'{address.url}': a network toy is tcp://host:port, with a port from 1 to 65535."
-        raise DeviceError(message, reason="toy_tcp_address")
+        raise DeviceError("'{url}': a network toy is tcp://host:port, with a port from 1 to 65535.", url=address.url)
     return match[1].strip("[]"), int(match[2])
 
 

@@ -16,7 +16,7 @@ from urllib.parse import quote, unquote
 
 from plushsense.core.errors import ConfigError, DeviceError, need, python_warning
 from plushsense.core.layouts import DEVICE_MS, Layout
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.devices.base import Device, Frame, LossCounter, now_ms
 from plushsense.devices.opening import DeviceAddress, DeviceInfo, DeviceListing
 from plushsense.devices.reconnect import ReconnectingDevice
@@ -46,8 +46,9 @@ def load_pylsl() -> ModuleType:
         try:
             pylsl = need("pylsl", extra="lsl")
         except RuntimeError as cause:
-            message = f"LSL cannot be used here: {' '.join(str(cause).split()).rstrip('.')}."
-            raise DeviceError(message, reason="lsl_unusable") from None
+            raise DeviceError(
+                "LSL cannot be used here: {split}.", split=" ".join(str(cause).split()).rstrip(".")
+            ) from None
         paths = ("lsl_api.cfg", "~/lsl_api/lsl_api.cfg", "/etc/lsl_api/lsl_api.cfg")
         configured = os.environ.get("LSLAPICFG") or any(Path(p).expanduser().exists() for p in paths)
         if not configured and hasattr(pylsl, "set_config_content") and not hasattr(pylsl, "_plushsense_quiet"):
@@ -104,14 +105,15 @@ class LslDevice(Device):
             return next(iter(found))
         if found:
             choices = ", ".join(f"{u} on {s.hostname()}" for u, s in zip(stream_urls(found), found, strict=True))
-            message = f"'{self.url}' fits {len(found)} streams: open one of {choices}."
-            raise DeviceError(message, reason="toy_several_streams", url=self.url, urls=choices)
+            raise DeviceError("'{url}' fits {n} streams: open one of {urls}.", url=self.url, n=len(found), urls=choices)
         there = ", ".join(f"{s.name()} ({s.type() or 'no type'})" for s in self._pylsl.resolve_streams(0.5))
         raise DeviceError(
-            f"'{self.url}': no LSL stream has the {key} '{value}' within {find_s:g} s; "
-            f"{f'there are {there}' if there else 'there is none on this network'}.",
-            reason="toy_no_lsl",
+            "'{url}': no LSL stream has the {key} '{name}' within {find_s:g} s; {more}.",
+            url=self.url,
+            key=key,
             name=value,
+            find_s=find_s,
+            more=f"there are {there}" if there else "there is none on this network",
         )
 
     def read(self) -> list[Frame] | None:
@@ -125,8 +127,9 @@ class LslDevice(Device):
                     return []
                 samples, stamps = self._inlet.pull_chunk(timeout=0.0, max_samples=512)
             except RuntimeError:
-                message = f"'{self.url}' went away: has its program ended, or is it out of reach?"
-                raise DeviceError(message, reason="toy_gone", url=self.url) from None
+                raise DeviceError(
+                    "'{url}' went away: has its program ended, or is it out of reach?", url=self.url
+                ) from None
         self.arrived_s = time.perf_counter()
         host = now_ms()
         frames = [
@@ -219,11 +222,11 @@ def search_streams(scan_s: float) -> DeviceListing:
             url,
             "lsl",
             s.name(),
-            Sentence(
-                f"{s.type() or 'no type'}, {s.channel_count()} channels, {s.nominal_srate():g} Hz, on {s.hostname()}",
-                reason="lsl_about",
+            Message(
+                "{type}, {n} channels, {hz:g} Hz, on {host}",
+                type=s.type() or "no type",
                 n=s.channel_count(),
-                hz=f"{s.nominal_srate():g}",
+                hz=s.nominal_srate(),
                 host=s.hostname(),
             ),
         )

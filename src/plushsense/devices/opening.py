@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from plushsense.core.errors import ConfigError, DeviceError, MissingExtraError, PlushSenseError, nearest
+from plushsense.core.errors import AddressError, ConfigError, DeviceError, MissingExtraError, PlushSenseError, nearest
 from plushsense.core.layouts import Layout, load_layout
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.devices.base import Device
 from plushsense.devices.reconnect import ReconnectingDevice
 
@@ -65,12 +65,13 @@ class DeviceAddress:
         accepted = ("layout", *known)
         for key in self.query:
             if key not in accepted:
-                raise ConfigError(
-                    f"'{self.url}': unknown setting '{key}' of {self.scheme}://: "
-                    f"accepted are {', '.join(accepted)}.{nearest(key, accepted)}",
-                    reason="toy_setting",
+                raise AddressError(
+                    "'{url}': unknown setting '{key}' of {scheme}://: accepted are {known}.{hint}",
+                    url=self.url,
                     key=key,
+                    scheme=self.scheme,
                     known=", ".join(accepted),
+                    hint=nearest(key, accepted),
                 )
 
     def whole(self, key: str, default: int, low: int = 0, high: int = 2**31 - 1) -> int:
@@ -79,8 +80,14 @@ class DeviceAddress:
         if text is None:
             return default
         if not re.fullmatch(r"\d{1,10}", text, re.ASCII) or not low <= int(text) <= high:
-            message = f"'{self.url}': {key} is '{text}'; accepted is a whole number, {low} to {high}."
-            raise ConfigError(message, reason="toy_number", key=key, low=low, high=high)
+            raise AddressError(
+                "'{url}': {key} is '{text}'; accepted is a whole number, {low} to {high}.",
+                url=self.url,
+                key=key,
+                text=text,
+                low=low,
+                high=high,
+            )
         return int(text)
 
     def number(self, key: str, default: float, low: float = 0.0, high: float = 1e6) -> float:
@@ -93,8 +100,14 @@ class DeviceAddress:
         except ValueError:
             value = math.nan
         if not low <= value <= high:
-            message = f"'{self.url}': {key} is '{text}'; accepted is a number, {low:g} to {high:g}."
-            raise ConfigError(message, reason="toy_number", key=key, low=f"{low:g}", high=f"{high:g}")
+            raise AddressError(
+                "'{url}': {key} is '{text}'; accepted is a number, {low:g} to {high:g}.",
+                url=self.url,
+                key=key,
+                text=text,
+                low=low,
+                high=high,
+            )
         return value
 
 
@@ -106,23 +119,24 @@ def parse_url(url: str) -> DeviceAddress:
     """
     text = os.fspath(url).strip()
     if not text:
-        raise ConfigError(f"No device URL was given; accepted are {EXAMPLES}.", reason="toy_no_address")
+        raise AddressError("No device URL was given; accepted are {examples}.", examples=EXAMPLES)
     match = re.match(r"([A-Za-z][A-Za-z0-9+.\-]+):(//)?", text)
     if match is None or (match[2] is None and match[1].lower() not in SCHEMES):
         if Path(text).is_file():
             return DeviceAddress(text, "replay", text)
         if re.fullmatch(r"/dev/\S+|COM\d+", text):
-            message = f"'{text}' is a port, no recording to replay: write serial://{text}."
-            raise ConfigError(message, reason="toy_is_port", port=text)
+            raise AddressError("'{port}' is a port, no recording to replay: write serial://{port}.", port=text)
         place, query = _split_query(text, text)
         return DeviceAddress(text, "replay", place, query)
     scheme = match[1].lower()
     if scheme not in SCHEMES:
-        raise ConfigError(
-            f"'{text}': there is no scheme '{scheme}'; accepted are {', '.join(SCHEMES)}, as in {EXAMPLES}."
-            f"{nearest(scheme, SCHEMES)}",
-            reason="toy_scheme",
+        raise AddressError(
+            "'{text}': there is no scheme '{scheme}'; accepted are {schemes}, as in {examples}.{hint}",
+            text=text,
             scheme=scheme,
+            schemes=", ".join(SCHEMES),
+            examples=EXAMPLES,
+            hint=nearest(scheme, SCHEMES),
             known=", ".join(f"{known}://" for known in SCHEMES),
         )
     place, query = _split_query(text[match.end() :], text)
@@ -137,11 +151,9 @@ def _split_query(rest: str, url: str) -> tuple[str, dict[str, str]]:
             continue
         key, equals, value = part.partition("=")
         if not equals or not key:
-            message = f"'{url}': '{part}' is no setting; write key=value, joined by &."
-            raise ConfigError(message, reason="toy_query", part=part)
+            raise AddressError("'{url}': '{part}' is no setting; write key=value, joined by &.", url=url, part=part)
         if key in query:
-            message = f"'{url}': the setting '{key}' stands there twice; leave one."
-            raise ConfigError(message, reason="toy_query", part=key)
+            raise AddressError("'{url}': the setting '{part}' stands there twice; leave one.", url=url, part=key)
         query[key] = unquote(value.replace("+", " "))
     return place, query
 
@@ -260,15 +272,14 @@ def list_devices(scan_s: float = SCAN_S, *, network: bool = True) -> DeviceListi
         try:
             results[scheme] = pkgutil.resolve_name(search)(scan_s)
         except MissingExtraError as refusal:
-            note = Sentence(f"{scheme}: not looked at. {refusal}", reason="search_missing", kind=scheme)
+            note = Message("{kind}: not looked at. {refusal}", kind=scheme, refusal=refusal)
             results[scheme] = DeviceListing(notes=[note])
         except PlushSenseError as refusal:
-            reason, values = (refusal.reason, refusal.values) if refusal.reason else ("search_failed", {"kind": scheme})
-            note = Sentence(str(refusal), reason=reason, **values)
-            results[scheme] = DeviceListing(notes=[note])
+            results[scheme] = DeviceListing(notes=[refusal.message])
         except Exception as cause:  # noqa: BLE001, RUF100
-            message = f"{scheme} cannot be used: {' '.join(str(cause).split())}."
-            results[scheme] = DeviceListing(notes=[Sentence(message, reason="search_failed", kind=scheme)])
+            results[scheme] = DeviceListing(
+                notes=[Message("{kind} cannot be used: {split}.", kind=scheme, split=" ".join(str(cause).split()))]
+            )
 
     searches = {scheme: search for scheme, search in SEARCHES.items() if network or scheme not in _SENDING}
     threads = [threading.Thread(target=look, args=item, daemon=True) for item in searches.items()]
@@ -277,7 +288,7 @@ def list_devices(scan_s: float = SCAN_S, *, network: bool = True) -> DeviceListi
     listing = DeviceListing()
     for thread, scheme in zip(threads, searches, strict=True):
         thread.join(scan_s + _GRACE_S)
-        late = Sentence(f"{scheme} did not answer within {scan_s + _GRACE_S:g} s.", reason="search_failed", kind=scheme)
+        late = Message("{kind} did not answer within {scan_s:g} s.", kind=scheme, scan_s=scan_s + _GRACE_S)
         part = results.get(scheme) or DeviceListing(notes=[late])
         listing.devices += part.devices
         listing.notes += part.notes

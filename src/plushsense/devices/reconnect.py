@@ -10,7 +10,7 @@ from typing import Literal
 
 from plushsense.core.errors import DeviceError
 from plushsense.core.layouts import Layout
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.devices.base import Counters, Device, Frame, now_ms
 
 ConnectionState = Literal["connected", "waiting"]
@@ -118,10 +118,10 @@ class ReconnectingDevice(Device):
         return frames
 
     @property
-    def mismatch(self) -> Sentence:
+    def mismatch(self) -> Message:
         """As in `Device`, of the connected toy."""
         inner = self.inner
-        return inner.mismatch if inner is not None else Sentence()
+        return inner.mismatch if inner is not None else Message()
 
     def _count(self) -> None:
         inner = self.inner

@@ -28,7 +28,7 @@ class ReplayDevice(PacedDevice):
         try:
             result = (read_recording if parse_name(path.name) else read_stream)(path, layout)
         except FileFormatError as cause:
-            raise DeviceError(f"'{url}' cannot be replayed: {cause}", reason="replay_unreadable", url=url) from None
+            raise DeviceError("'{url}' cannot be replayed: {cause}", url=url, cause=cause) from None
         self.path = path
         self.warnings = result.warnings
         self.counters.malformed = result.malformed
@@ -70,9 +70,8 @@ def open_replay(address: DeviceAddress, layout: Layout) -> ReplayDevice:
         path = path / "fulldatastream.csv"
     if not address.place or not path.is_file():
         raise DeviceError(
-            f"'{address.url}': there is no file '{path if address.place else ''}' to replay; "
-            "give the path of a recording or of a fulldatastream.csv.",
-            reason="toy_no_file",
+            "'{url}': there is no file '{file}' to replay; give the path of a recording or of a fulldatastream.csv.",
+            url=address.url,
             file=path if address.place else "",
         )
     return ReplayDevice(address.url, layout, path, speed)

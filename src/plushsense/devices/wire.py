@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from plushsense.core.errors import printable
 from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Layout, layout_names, load_layout
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.devices.base import Counters, Frame, LossCounter
 
 _INTEGER = re.compile(rb"[+-]?[0-9]{1,18}\Z")
@@ -25,6 +25,21 @@ _QUOTED = 100  # characters of an unreadable line
 _NAMED = 8  # fields whose names are listed
 _NAME = re.compile(rb"\s*[\"']?[A-Za-z_][^\s,;:=]*[\"']?\s*[:=]")
 _DECIMAL_COMMA, _OTHER_GAP = re.compile(rb"[0-9],[0-9]"), re.compile(rb"[0-9][ ;\t]+[0-9]")
+_UNREADABLE = (
+    "The toy sends lines that cannot be read, the first is '{line}': {why}. Layout '{layout}' expects {n} numbers a "
+    "line, separated by spaces, tabs, commas or semicolons: {names}."
+)
+_OTHER_NUMBERS = (
+    "The toy sends {n} numbers a line, but layout '{layout}' has {needed}: give a layout file that names them "
+    "(?layout=FILE.toml); built-in are {sizes}."
+)
+_OTHER_LAYOUT = (
+    "The toy sends {n} numbers a line, but layout '{layout}' has {needed}; '{fits}' has {n}: open it as {url}"
+)
+_OFTEN_UNREADABLE = (
+    "{bad} of {of} lines of the toy cannot be read, such as '{line}': {why}. Layout '{layout}' expects {n} numbers a "
+    "line, separated by spaces, tabs, commas or semicolons: {names}."
+)
 
 
 @dataclass(frozen=True)
@@ -83,7 +98,7 @@ class LineParser:
         self._unread, self._unreadable = b"", 0
         self._early = 0  # malformed lines before the first frame, as of a board that starts
 
-    def mismatch(self, url: str) -> Sentence:
+    def mismatch(self, url: str) -> Message:
         """Return why lines cannot be read, and what to do; "" if they can.
 
         Ten lines with another number of numbers are of another built-in layout. Before the first frame, one unreadable
@@ -96,18 +111,16 @@ class LineParser:
         if self._others >= _SURE and not comma and self.layout.name in layout_names():
             return self._other_layout(url)
         if self._unreadable >= (_SURE if self._begun else 1):
-            problem, many = "The toy sends lines that cannot be read, the first is", {}
+            template, many = _UNREADABLE, {}
         elif self._begun and bad >= 2 * _SURE and 4 * bad >= lines and self._unread:
-            problem, many = f"{bad} of {lines} lines of the toy cannot be read, such as", {"bad": bad, "of": lines}
+            template, many = _OFTEN_UNREADABLE, {"bad": bad, "of": lines}
         else:
-            return Sentence()
+            return Message()
         layout, names = self.layout, self.layout.wire
         listed = ", ".join(names if len(names) <= _NAMED else (*names[: _NAMED - 1], "…"))
         line, why = _quoted(self._unread), self._fault(self._unread, url)
-        return Sentence(
-            f"{problem} '{line}': {why}. Layout '{layout.name}' expects {len(names)} numbers a line, separated by "
-            f"spaces, tabs, commas or semicolons: {listed}.",
-            "toy_lines_many" if many else "toy_lines",
+        return Message(
+            template,
             line=line,
             why=why,
             layout=layout.name,
@@ -116,55 +129,47 @@ class LineParser:
             **many,
         )
 
-    def _fault(self, line: bytes, url: str) -> Sentence:
+    def _fault(self, line: bytes, url: str) -> Message:
         """Return what is wrong with an unreadable line, without a full stop."""
         fields, needed = line.translate(_SEPARATORS).split(), self._fields
         if sum(not 32 <= byte < 127 and byte != 9 for byte in line) > len(line) // 4:
             baud = ", perhaps because the toy has another baud rate (?baud=115200)" if url.startswith("serial") else ""
-            return Sentence(f"it is no text{baud}", "line_no_text")
+            return Message("it is no text{baud}", baud=baud)
         if len(line) > self.max_line:
-            return Sentence(f"it has more than {self.max_line} bytes without a line end", "line_long", n=self.max_line)
+            return Message("it has more than {n} bytes without a line end", n=self.max_line)
         if line.lstrip().startswith((b"{", b"[")):
-            return Sentence("it is JSON, of which only the numbers are to be sent", "line_json")
+            return Message("it is JSON, of which only the numbers are to be sent")
         if _NAME.match(line):
-            return Sentence("it has names before the numbers, so send the numbers alone", "line_names")
+            return Message("it has names before the numbers, so send the numbers alone")
         if len(fields) != needed:
             if _DECIMAL_COMMA.search(line) and _OTHER_GAP.search(line):
-                message = "a comma separates numbers, so send decimals with a point, as in 1.5"
-                return Sentence(message, "line_decimal_comma")
+                return Message("a comma separates numbers, so send decimals with a point, as in 1.5")
             has = "1 field" if len(fields) == 1 else f"{len(fields)} fields"
-            return Sentence(f"it has {has}, not {needed}", "line_fields", n=len(fields), needed=needed)
+            return Message("it has {has}, not {needed}", has=has, needed=needed, n=len(fields))
         for name, field in zip(self.layout.wire, fields, strict=True):
             text = _quoted(field)
             whole = name not in self.layout.names or self._steps[self.layout.index(name)] == 1.0
             if not (_INTEGER if whole else _DECIMAL).match(field):
-                what = "whole number" if whole and _DECIMAL.match(field) else "number"
-                message = f"'{text}' for {name} is no {what}"
-                return Sentence(message, f"line_no_{what.replace(' ', '_')}", field=text, channel=name)
-        return Sentence("a number is too large, or a clock is negative", "line_range")
+                if whole and _DECIMAL.match(field):
+                    return Message("'{field}' for {channel} is no whole number", field=text, channel=name)
+                return Message("'{field}' for {channel} is no number", field=text, channel=name)
+        return Message("a number is too large, or a clock is negative")
 
-    def _other_layout(self, url: str) -> Sentence:
+    def _other_layout(self, url: str) -> Message:
         """Return which layout has the number of numbers of the last lines."""
         number, layout = self._other_fields, self.layout
         known = [load_layout(name) for name in layout_names()]
         fitting = [other for other in known if len(other.wire) == number]
         # A model reads any layout with its channels.
         fitting = [other for other in fitting if other.channels == layout.channels] or fitting
-        problem = f"The toy sends {number} numbers a line, but layout '{layout.name}' has {self._fields}"
         values = {"n": number, "layout": layout.name, "needed": self._fields}
         if not fitting:
             sizes = ", ".join(f"{other.name} {len(other.wire)}" for other in known)
-            return Sentence(
-                f"{problem}: give a layout file that names them (?layout=FILE.toml); built-in are {sizes}.",
-                "toy_numbers",
-                **values,
-            )
+            return Message(_OTHER_NUMBERS, **values, sizes=sizes)
         place, _, query = url.partition("?")
         kept = [part for part in query.split("&") if part and not part.startswith("layout=")]
-        fits = f"'{fitting[0].name}' has {number}"
         address = f"{place}?{'&'.join([*kept, f'layout={fitting[0].name}'])}"
-        message = f"{problem}; {fits}: open it as {address}"
-        return Sentence(message, "toy_numbers_fit", **values, fits=fitting[0].name, url=address)
+        return Message(_OTHER_LAYOUT, **values, fits=fitting[0].name, url=address)
 
     def feed(self, data: bytes) -> list[ParsedLine]:
         """Return the frames that end within these bytes; keep the rest of the last line for the next call."""

@@ -124,9 +124,11 @@ def _require_windows(fold: Fold, recordings: Fold, split: Split) -> None:
             touched = ": every window that could train touches a tested recording in its stream"
             reason = touched if len(getattr(recordings, name)) else ""
             raise BadInput(
-                f"Split {split.text} leaves {fold.name} no windows to {name} with{reason}: use fewer folds.",
-                reason="fold_empty",
+                "Split {split} leaves {fold} no windows to {name} with{reason}: use fewer folds.",
+                split=split.text,
                 fold=fold.name,
+                name=name,
+                reason=reason,
             )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.gestures import NOBODY
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.quality.outliers import far_inputs
 from plushsense.scoring.splits import Fold, Index
 from plushsense.windows.cut import WindowSet
@@ -112,11 +112,17 @@ def warn_of_copies(audit: Mapping[str, Any], warn: Callable[[str], None]) -> Non
         what = "are copies, or nearly, of training windows of another recording"
         if audit["shared_rows"] > n:
             n, what = audit["shared_rows"], "are of recordings that have rows of one trained on"
-        sentence = (
-            f"{n} of {audit['windows']} scored windows {what} (as {first['scored']} of {first['trained']}), so the "
-            "scores are too high: exclude one of the two recordings"
+        warn(
+            Message(
+                "{n} of {windows} scored windows {what} (as {first} of {second}), so the scores are too high: "
+                "exclude one of the two recordings",
+                n=n,
+                windows=audit["windows"],
+                what=what,
+                first=first["scored"],
+                second=first["trained"],
+            )
         )
-        warn(Sentence(sentence, "near_copies", first=first["scored"], second=first["trained"]))
 
 
 def _ids(windows: WindowSet, index: Index) -> NDArray[np.str_]:

@@ -373,9 +373,11 @@ def _same_layout(bundle: Bundle, dataset: Dataset) -> None:
 
     if signature(one) != signature(other):
         raise DatasetError(
-            f"'{dataset.head.name}' has the layout '{other.name}', the bundle '{one.name}': a bundle can only be "
-            "adapted to recordings of the sensors that it reads.",
-            reason="other_sensors",
+            "'{dataset}' has the layout '{other}', the bundle '{one}': a bundle can only be adapted to recordings of "
+            "the sensors that it reads.",
+            dataset=dataset.head.name,
+            other=other.name,
+            one=one.name,
         )
 
 
@@ -397,10 +399,9 @@ def _recordings_of(dataset: Dataset, person: str, bundle: Bundle, warn: Warn) ->
         warn(f"left out: {label}: {why}")
     if not known:
         raise DatasetError(
-            f"{person} has no recording of a gesture that the bundle knows, which are: "
-            f"{', '.join(bundle.gestures.labels)}.",
-            reason="no_known_recording",
+            "{subject} has no recording of a gesture that the bundle knows, which are: {labels}.",
             subject=person,
+            labels=", ".join(bundle.gestures.labels),
         )
     return Dataset(dataset.path, dataset.head, known, dataset.streams), left_out
 

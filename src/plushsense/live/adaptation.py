@@ -150,15 +150,14 @@ def personalise(
     if len(used) < needed:
         missing = ", ".join(label for label in labels if label not in used)
         raise BadInput(
-            f"The recordings of {subject} are too few to adapt to: {needed} of the bundle's {len(labels)} gestures "
-            f"with {spec.least} recordings each are needed, better all; there are {len(used)}. Record more of: "
-            f"{missing}.",
-            reason="too_few_recordings",
+            "The recordings of {subject} are too few to adapt to: {needed} of the bundle's {gestures} gestures with "
+            "{least} recordings each are needed, better all; there are {used}. Record more of: {missing}.",
             subject=subject,
             needed=needed,
             gestures=len(labels),
             least=spec.least,
             used=len(used),
+            missing=missing,
         )
     own = judge(softmax(used_examples.features @ weight.T + bias), used_examples.y, used_examples.recording)
     tried = [(s, _cross_validate(weight, bias, used_examples, s)) for s in spec.strengths]

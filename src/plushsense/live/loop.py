@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from plushsense.core.errors import ConfigError, python_warning
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.devices.base import Device, Frame
 from plushsense.live.plausibility import PlausibilityMonitor
 from plushsense.runtime.classifier import Decision, StreamReader, check_layout
@@ -87,10 +87,10 @@ class LiveRun(Iterator[Decision]):
     ) -> None:
         self.device = device
         self.classifier = classifier
-        self.warnings: list[Sentence] = []
+        self.warnings: list[Message] = []
         self._warn = warn
         self._monitor = PlausibilityMonitor(classifier.layout, classifier.bundle)
-        self._mismatch = Sentence()
+        self._mismatch = Message()
         self._malformed = device.counters.malformed  # at the last frame
         self._seconds, self._silence_s = seconds, silence_s
         self._begun = self._last_frames_s = time.perf_counter()
@@ -125,7 +125,7 @@ class LiveRun(Iterator[Decision]):
             self._note(sentence)
         if self.device.counters.malformed > self._malformed:
             self._note_unread(self.device.mismatch)
-        self._malformed, self._mismatch = self.device.counters.malformed, Sentence()
+        self._malformed, self._mismatch = self.device.counters.malformed, Message()
         # Set after the computation, whose duration must not count as silence of the toy.
         self._last_frames_s, self._silent = time.perf_counter(), False
         return decided
@@ -139,9 +139,9 @@ class LiveRun(Iterator[Decision]):
             return []
         return [self._quiet()]
 
-    def _unread(self) -> Sentence:
+    def _unread(self) -> Message:
         """Return why the lines that came since the last frame cannot be read; "" if none came."""
-        return self.device.mismatch if self.device.counters.malformed > self._malformed else Sentence()
+        return self.device.mismatch if self.device.counters.malformed > self._malformed else Message()
 
     def _quiet(self) -> Decision:
         """Return the decision that ends an open event because no frame comes."""
@@ -153,13 +153,13 @@ class LiveRun(Iterator[Decision]):
         decision = replace(decision, state="unreadable")
         return decision if again else self._noted(decision)
 
-    def _note(self, sentence: Sentence) -> None:
+    def _note(self, sentence: Message) -> None:
         self.warnings.append(sentence)
         self._warn(sentence)
 
-    def _note_unread(self, mismatch: Sentence) -> None:
+    def _note_unread(self, mismatch: Message) -> None:
         # Once, although it may count the lines.
-        if mismatch and mismatch.reason not in {sentence.reason for sentence in self.warnings}:
+        if mismatch and mismatch.template not in {sentence.template for sentence in self.warnings}:
             self._note(mismatch)
 
     def _read(self, frames: list[Frame], arrived: float) -> list[Decision]:

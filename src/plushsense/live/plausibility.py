@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plushsense.core.layouts import ACCELERATION, GRAVITY_FRACTION_BITS, MAGNITUDE_FRACTION_BITS, Layout
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.devices.base import Frame
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.decisions import DecideSpec
@@ -119,17 +119,17 @@ class PlausibilityMonitor:
             self._low[free], self._high[free] = low[free] - 1.0, high[free] + 1.0
         self._outside = np.zeros(layout.n_channels, dtype=np.int64)
 
-    def push(self, frames: Iterable[Frame]) -> list[Sentence]:
+    def push(self, frames: Iterable[Frame]) -> list[Message]:
         """Add frames; return what differs from the training and was not reported before, usually nothing."""
         self._frames += frames
-        found: list[Sentence] = []
+        found: list[Message] = []
         while len(self._frames) >= self._size:
             block, self._frames = self._frames[: self._size], self._frames[self._size :]
             values = np.array([frame.values for frame in block], dtype=np.float64)
             found += [*self._check_rate(block), *self._check_rest(values), *self._check_range(values)]
         return found
 
-    def _check_rate(self, block: list[Frame]) -> Iterator[Sentence]:
+    def _check_rate(self, block: list[Frame]) -> Iterator[Message]:
         if self._clock is None:
             return
         steps = np.diff([frame.device_ms for frame in block])
@@ -141,22 +141,21 @@ class PlausibilityMonitor:
             return
         period_ms, nominal, self._clock = float(np.median(self._clock)), self._layout.rate_hz, None
         if period_ms <= 0.0:
-            message = "The toy's clock stands still, so nothing can be recognised: check device_ms."
-            yield Sentence(message, "live_clock_stands")
+            yield Message("The toy's clock stands still, so nothing can be recognised: check device_ms.")
             return
         rate = 1000.0 / period_ms
         # Whole milliseconds are not exact at high rates.
         slack = 0.5 / period_ms if period_ms < 10.0 else 0.0
         if not 1.0 / (_OTHER_RATE + slack) <= rate / nominal <= _OTHER_RATE + slack:
-            yield Sentence(
-                f"The toy sends {rate:.3g} frames a second by its clock, but the model reads {nominal:g}: it may not "
-                "recognise the gestures; check the rate, and that device_ms counts milliseconds.",
-                "live_rate",
-                rate=float(f"{rate:.3g}"),
+            yield Message(
+                "The toy sends {rate_2:.3g} frames a second by its clock, but the model reads {nominal:g}: it may "
+                "not recognise the gestures; check the rate, and that device_ms counts milliseconds.",
+                rate_2=rate,
                 nominal=nominal,
+                rate=float(f"{rate:.3g}"),
             )
 
-    def _check_rest(self, values: NDArray[np.float64]) -> Iterator[Sentence]:
+    def _check_rest(self, values: NDArray[np.float64]) -> Iterator[Message]:
         for one in list(self._rest):
             axes, expected, certain, lengths = one
             x = values[:, axes] - self._layout.zero_int[axes]
@@ -174,7 +173,7 @@ class PlausibilityMonitor:
             if certain or least < ratio < little or ratio > much:
                 yield self._other_gravity(axes, found, expected)
 
-    def _other_gravity(self, axes: list[int], found: float, expected: float) -> Sentence:
+    def _other_gravity(self, axes: list[int], found: float, expected: float) -> Message:
         channel = self._layout.channels[axes[0]]
         reads, read = (_value(channel.in_units(steps)) for steps in (found, expected))
         ratio = found / expected
@@ -183,16 +182,16 @@ class PlausibilityMonitor:
         if ratio < _GRAVITY_SUBTRACTED:
             why = "gravity seems to be subtracted, or the sensor is dead"
         names = [self._layout.names[axis] for axis in axes]
-        return Sentence(
-            f"At rest the accelerometer ({', '.join(names)}) reads {reads}, but in the training it read {read}: {why}. "
-            "The gestures will not be recognised: let the toy send what the toys of the training sent.",
-            "live_gravity",
+        return Message(
+            "At rest the accelerometer ({channels}) reads {reads}, but in the training it read {read}: {why}. The "
+            "gestures will not be recognised: let the toy send what the toys of the training sent.",
             channels=names,
             reads=reads,
             read=read,
+            why=why,
         )
 
-    def _check_range(self, values: NDArray[np.float64]) -> Iterator[Sentence]:
+    def _check_range(self, values: NDArray[np.float64]) -> Iterator[Message]:
         beyond = (values.max(axis=0) < self._low) | (values.min(axis=0) > self._high)
         self._outside = np.where(beyond, self._outside + 1, 0)
         at = np.flatnonzero(self._outside >= _BLOCKS).tolist()
@@ -201,13 +200,12 @@ class PlausibilityMonitor:
         parts = [self._range_of(channel, values[:, channel]) for channel in at]
         self._low[at], self._high[at] = -np.inf, np.inf
         self._outside[at] = 0
-        yield Sentence(
-            f"For {_BLOCKS * BLOCK_S:g} s {'; '.join(parts)}: is it the same sensor, in the same unit and with the "
-            "same settings? The gestures may not be recognised.",
-            "live_range",
+        yield Message(
+            "For {s:g} s {parts}: is it the same sensor, in the same unit and with the same settings? The gestures "
+            "may not be recognised.",
             s=_BLOCKS * BLOCK_S,
+            parts="; ".join(parts),
             channels=[self._layout.names[channel] for channel in at],
-            n=len(at),
         )
 
     def _range_of(self, at: int, values: NDArray[np.float64]) -> str:

@@ -237,10 +237,14 @@ def save_protocol(path: Path, name: str, gestures: Sequence[str], repetitions: i
         ConfigError: if no gesture is given, or a value is out of range.
     """
     if not gestures:
-        raise ConfigError("A protocol needs at least one gesture: choose one.", reason="no_gestures")
+        raise ConfigError("A protocol needs at least one gesture: choose one.")
     if not 1 <= repetitions <= _MOST_REPETITIONS:
-        message = f"repetitions is {repetitions}; accepted are 1 to {_MOST_REPETITIONS}."
-        raise ConfigError(message, reason="repetitions_bad", most=_MOST_REPETITIONS)
+        raise ConfigError(
+            "repetitions is {repetitions}; accepted are 1 to {most}.",
+            repetitions=repetitions,
+            most=_MOST_REPETITIONS,
+            field="repetitions",
+        )
     table: dict[str, Any] = {"name": name, "title": name, "gesture_set": "plush-18", "gestures": list(gestures)}
     table |= {"repetitions": repetitions, "order": order}
     protocol = Protocol.from_dict(table)
@@ -267,4 +271,6 @@ def _naming(name_or_path: str | Path) -> Iterator[None]:
     try:
         yield
     except BadInput as cause:
-        raise type(cause)(str(cause), reason="protocol_bad", name=Path(name_or_path).name) from None
+        raise type(cause)(
+            "Protocol '{path}': {problem}", path=Path(name_or_path), problem=str(cause), field="protocol"
+        ) from None

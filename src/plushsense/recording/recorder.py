@@ -22,7 +22,7 @@ from typing import Any, Self
 from plushsense.core.errors import ConfigError, DatasetError, PlushSenseError
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import STREAM_NAME
-from plushsense.core.sentences import Sentence, plural
+from plushsense.core.sentences import Message
 from plushsense.devices.base import Counters, Device, Frame, now_ms
 from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.stream import VirtualDevice
@@ -32,11 +32,11 @@ from plushsense.recording.status import PlanProgress, RecorderState, RecorderSta
 from plushsense.recording.takes import AWAY_S, Ended, FrameReceiver, RecordingTake, gap_entry, sidecar
 from plushsense.recording.writer import BackgroundWriter, StreamFile, lacks_descriptor, save_take, to_frames
 
-_NO_DESCRIPTOR = Sentence(
-    "Too many files are open on this computer: saving waits until some are closed. Nothing is lost.", "saving_waits"
+_NO_DESCRIPTOR = Message(
+    "Too many files are open on this computer: saving waits until some are closed. Nothing is lost."
 )
-_RECORDING = Sentence("Recording: space stops it, r discards it.", "recording_first")
-_CANCELLED = Sentence("The countdown was cancelled.", "cancelled")
+_RECORDING = Message("Recording: space stops it, r discards it.")
+_CANCELLED = Message("The countdown was cancelled.")
 
 Listener = Callable[[str, RecorderStatus], None]
 
@@ -89,9 +89,9 @@ class Recorder:
         self._since_s = time.monotonic()
         self._state: RecorderState = "idle"
         self._paused = False
-        self._message = self._mismatch = Sentence()
-        self.over = Sentence()
-        self._failed = Sentence()
+        self._message = self._mismatch = Message()
+        self.over = Message()
+        self._failed = Message()
         self._closing = False
         self._received: list[Frame] = []
         self._writer: BackgroundWriter | None = None
@@ -204,7 +204,7 @@ class Recorder:
                 row=self._receiver.rows,
             )
             repairs = self.session.progress.repairs
-            self._advance(Sentence("; ".join(repairs), "repaired", n=len(repairs)), from_start=True)
+            self._advance(Message("{repairs}", repairs="; ".join(repairs)) if repairs else Message(), from_start=True)
         self._reader.start()
 
     def space(self) -> None:
@@ -213,26 +213,26 @@ class Recorder:
             if self._state == "idle":
                 if self._receiver.quality().signal == "unreadable":
                     layout, fields = self.session.layout.name, len(self.session.layout.wire)
-                    sentence = (
-                        f"The toy sends lines, but none is a frame of {layout} ({fields} numbers): "
-                        "is the layout right, and the cable sound?"
+                    unread = self.device.mismatch or Message(
+                        "The toy sends lines, but none is a frame of {layout} ({n} numbers): is the layout right, "
+                        "and the cable sound?",
+                        layout=layout,
+                        n=fields,
                     )
-                    unread = self.device.mismatch or Sentence(sentence, "unreadable", layout=layout, n=fields)
                     self._show_message(unread)
                 elif self._receiver.silent:
-                    sentence = "Nothing comes from the toy: is it switched on and near?"
-                    self._show_message(Sentence(sentence, "silent"))
+                    self._show_message(Message("Nothing comes from the toy: is it switched on and near?"))
                 else:
                     self._begin()
             elif self._state == "countdown":
                 self._cancel(_CANCELLED)
             elif self._state == "recording" and self._take is not None:
                 if max(self._passed_s(), self._wall_s()) < self.protocol.shortest_s:
-                    self._show_message(Sentence("Too early to stop: still recording.", "too_early"))
+                    self._show_message(Message("Too early to stop: still recording."))
                 else:
                     self._stop("space")
             elif self._state == "paused":
-                self._show_message(Sentence("Paused: resume first (p).", "paused"))
+                self._show_message(Message("Paused: resume first (p)."))
 
     def redo(self, why: str = "") -> None:
         """Record again: stop the running recording, or else discard the last one, whose file is kept."""
@@ -240,18 +240,22 @@ class Recorder:
             if self._state == "countdown":
                 self._cancel(_CANCELLED)
             elif self._state == "recording":
-                self._abandon("redo", Sentence("Stopped: record it again.", "broken_off"))
+                self._abandon("redo", Message("Stopped: record it again."))
             elif self._state in ("idle", "paused", "finished"):
                 key = self._plan.last
                 if key is None:
-                    sentence = "There is no recording to repeat: go back to it (b)."
-                    self._show_message(Sentence(sentence, "nothing_to_repeat"))
+                    self._show_message(Message("There is no recording to repeat: go back to it (b)."))
                     return
                 file = self._plan.discard(key)
                 more = {"why": why} if why else {}
                 self._log("redo", file=file, gesture=key[0], repetition=key[1], **more)
-                sentence = f"'{key[0]}', {key[1]}, is to be recorded again; skip (s) keeps the earlier recording."
-                self._ready(Sentence(sentence, "again", gesture=key[0], n=key[1]))
+                self._ready(
+                    Message(
+                        "'{gesture}', {n}, is to be recorded again; skip (s) keeps the earlier recording.",
+                        gesture=key[0],
+                        n=key[1],
+                    )
+                )
 
     def skip(self) -> None:
         """Skip this step; if it was to be recorded again, use the earlier recording."""
@@ -262,15 +266,14 @@ class Recorder:
                 self._show_message(_RECORDING)
             elif self._state in ("idle", "paused"):
                 key = key_of(self._plan.step)
-                message = Sentence()
+                message = Message()
                 if file := self._plan.keep(key):
                     self._log("keep", file=file, gesture=key[0], repetition=key[1])
-                    message = Sentence("The earlier recording is kept.", "kept")
+                    message = Message("The earlier recording is kept.")
                 elif key not in self._plan.takes:
                     self._plan.skipped.add(key)
                     self._log_step("skip")
-                    sentence = f"Skipped '{key[0]}', {key[1]}; go back to it with b."
-                    message = Sentence(sentence, "skipped", gesture=key[0], n=key[1])
+                    message = Message("Skipped '{gesture}', {n}; go back to it with b.", gesture=key[0], n=key[1])
                 self._advance(message)
 
     def go(self, number: int) -> None:
@@ -284,8 +287,7 @@ class Recorder:
                 self._plan.at = min(max(0, number), len(self._plan.steps) - 1)
                 self._log_step("go")
                 there = key_of(self._plan.step) in self._plan.takes
-                sentence = "This step is recorded: space records it again, s goes on."
-                self._ready(Sentence(sentence, "recorded_already") if there else None)
+                self._ready(Message("This step is recorded: space records it again, s goes on.") if there else None)
 
     def back(self) -> None:
         """Go one step back."""
@@ -305,8 +307,7 @@ class Recorder:
                 return
             self._paused = True
             if self._state == "recording":
-                sentence = "The pause stopped this recording: record it again."
-                self._abandon("pause", Sentence(sentence, "broken_off_by_pause"))
+                self._abandon("pause", Message("The pause stopped this recording: record it again."))
             else:
                 self._enter("paused")
             self._log("pause")
@@ -330,13 +331,12 @@ class Recorder:
         with self._notifying():
             running = self._state in ("countdown", "saving") or (self._state == "recording" and not self._receiver.away)
             if running or self._closing or device.layout.wire != self.session.layout.wire:
-                message = "The toy can be exchanged only between two recordings, for one of the same layout."
-                raise ConfigError(message, reason="no_exchange")
+                raise ConfigError("The toy can be exchanged only between two recordings, for one of the same layout.")
             former, self.device = self.device, device
             self._receiver.exchange(device)
             self._log("exchange", device=device.url, former=former.url, row=self._receiver.rows)
-            message_to_all = Sentence("The session goes on with another toy.", "exchanged")
-            over, self.over = self.over, Sentence()
+            message_to_all = Message("The session goes on with another toy.")
+            over, self.over = self.over, Message()
             if self._state == "recording":
                 self._abandon("exchange", message_to_all)
             elif self._state == "stopped":
@@ -358,20 +358,19 @@ class Recorder:
                 # At real time, the toy's clock has gone on since its last frame.
                 device_ms = last.device_ms + (at_ms - last.host_ms if self._speed == 1.0 else 0)
             self._log_step("mark", host_ms=at_ms, device_ms=device_ms, row=self._receiver.rows)
-            self._show_message(Sentence("Marked for the video.", "marked"))
+            self._show_message(Message("Marked for the video."))
 
     def note(self, text: str) -> None:
         """Log a remark with the time, the current step and the last recording."""
         text = " ".join(text.split())
         with self._notifying():
             if text and (self._closing or self._state == "stopped"):
-                sentence = "The session has ended: this note is not saved."
-                self._show_message(Sentence(sentence, "note_too_late"))
+                self._show_message(Message("The session has ended: this note is not saved."))
             elif text:
                 self._log_step("note", text=text, file=self._plan.last_file)
-                self._show_message(Sentence("Note saved.", "note_saved"))
+                self._show_message(Message("Note saved."))
 
-    def show_message(self, message: Sentence) -> None:
+    def show_message(self, message: Message) -> None:
         """Show a message on every display."""
         with self._notifying():
             self._show_message(message)
@@ -430,18 +429,18 @@ class Recorder:
         step = self._plan.step
         self._log(kind, gesture=step.gesture, repetition=step.repetition, **more)
 
-    def _show_message(self, message: Sentence) -> None:
+    def _show_message(self, message: Message) -> None:
         self._message = message
         self._changes.append("message")
         self._changed.notify_all()
 
-    def _enter(self, state: RecorderState, message: Sentence | None = None) -> None:
+    def _enter(self, state: RecorderState, message: Message | None = None) -> None:
         if self._failed:
             # The stream may have failed while a recording was still being saved.
             state, message = "stopped", self._failed
         self._state = state
         self._since_ms, self._since_s = self._receiver.toy_ms, time.monotonic()
-        self._message = message or Sentence()
+        self._message = message or Message()
         self._changes.append(state)
         self._changed.notify_all()
 
@@ -452,7 +451,7 @@ class Recorder:
         """Return the seconds since the state was entered, by the toy's clock, see `FrameReceiver.passed_s`."""
         return self._receiver.passed_s(self._since_ms, self._since_s)
 
-    def _advance(self, message: Sentence | None = None, from_start: bool = False) -> None:
+    def _advance(self, message: Message | None = None, from_start: bool = False) -> None:
         """Go to the next step to record; finish the session if none is left."""
         if self._plan.advance(from_start):
             self._ready(message)
@@ -461,7 +460,7 @@ class Recorder:
             self._paused = False
             self._enter("stopped" if self.over else "finished", message)
 
-    def _ready(self, message: Sentence | None = None) -> None:
+    def _ready(self, message: Message | None = None) -> None:
         if self.over:
             self._enter("stopped", self.over)
         else:
@@ -472,11 +471,11 @@ class Recorder:
         self._log_step("countdown", countdown_s=self.protocol.countdown_s, device_ms=now)
         self._enter("countdown")
 
-    def _cancel(self, message: Sentence | None = None) -> None:
+    def _cancel(self, message: Message | None = None) -> None:
         self._log_step("cancel")
         self._enter("idle", message)
 
-    def _abandon(self, why: str, message: Sentence | None = None) -> None:
+    def _abandon(self, why: str, message: Message | None = None) -> None:
         take = self._take
         assert take is not None
         self._take = None
@@ -500,7 +499,7 @@ class Recorder:
 
     def _read(self) -> None:
         """Process frames as they arrive, in the reader's thread, independently of the display."""
-        over = Sentence("The toy's data have ended.", "data_ended")
+        over = Message("The toy's data have ended.")
         device = self.device
         try:
             while not self._closing:
@@ -524,10 +523,13 @@ class Recorder:
                 if self._writer is not None:
                     self._writer.wait_written()
         except PlushSenseError as cause:
-            over = Sentence.of(cause)
+            over = cause.message
         except Exception as cause:  # noqa: BLE001, RUF100
-            sentence = f"Reading the toy failed ({type(cause).__name__}: {cause}): all frames until then are kept."
-            over = Sentence(sentence, "reading_broke_off", why=cause)
+            over = Message(
+                "Reading the toy failed ({name}: {why}): all frames until then are kept.",
+                name=type(cause).__name__,
+                why=cause,
+            )
         with self._notifying():
             if self._closing:
                 return
@@ -570,7 +572,7 @@ class Recorder:
     def _show_unreadable(self) -> None:
         """Show why no line of the toy can be read, once for each reason."""
         unreadable = self._receiver.silent and self._receiver.quality().signal == "unreadable"
-        mismatch = self.device.mismatch if unreadable else Sentence()
+        mismatch = self.device.mismatch if unreadable else Message()
         if mismatch and mismatch != self._mismatch:
             self._show_message(mismatch)
         self._mismatch = mismatch
@@ -588,14 +590,13 @@ class Recorder:
             self._take.gaps.append(gap | {"after_row": len(self._take.frames)})
         if gap["missing_ms"] >= 1000.0 * AWAY_S:
             away_s = round(gap["missing_ms"] / 1000.0, 1)
-            sentence = f"The toy was disconnected for {away_s:.1f} s"
             if self._state == "countdown":
-                self._cancel(Sentence(f"{sentence}: press space again.", "away_in_countdown", s=away_s))
+                self._cancel(Message("The toy was disconnected for {s:.1f} s: press space again.", s=away_s))
             elif self._state == "recording":
-                sentence += ": this recording has a gap; r records it again."
-                self._show_message(Sentence(sentence, "away_in_recording", s=away_s))
+                template = "The toy was disconnected for {s:.1f} s: this recording has a gap; r records it again."
+                self._show_message(Message(template, s=away_s))
             else:
-                self._show_message(Sentence(f"{sentence}.", "away", s=away_s))
+                self._show_message(Message("The toy was disconnected for {s:.1f} s.", s=away_s))
 
     def _save(self, take: RecordingTake, ended: Ended, counters: Counters) -> None:
         """Save a recording and go to the next step; runs in a thread of the background writer."""
@@ -614,7 +615,7 @@ class Recorder:
         with contextlib.suppress(OSError):
             self.session.log.write([SessionEvent("failed", now_ms(), {"why": str(cause)})])
         with self._notifying():
-            self._failed = Sentence.of(write_error(self.session, len(self._plan.takes), cause))
+            self._failed = write_error(self.session, len(self._plan.takes), cause).message
             self._closing = True
             self._take = None
             self._enter("stopped", self._failed)
@@ -628,7 +629,7 @@ def store_take(
     saved_ms: int,
     earlier: str,
     **more: Any,
-) -> tuple[str, Sentence]:
+) -> tuple[str, Message]:
     """Write a recording, its sidecar and its log entry; ``earlier`` is the file that it replaces, or "".
 
     Returns:
@@ -647,31 +648,34 @@ def store_take(
     if earlier:
         events.append(SessionEvent("redo", saved_ms, {"file": earlier} | key))
     session.log.write(events)
-    message = Sentence()
+    message = Message()
     if ended == "longest":
         longest_s = session.protocol.longest_s
-        sentence = f"Nobody stopped the recording: it ended after {longest_s:g} s; r records it again."
-        message = Sentence(sentence, "ended_by_itself", s=longest_s)
+        message = Message("Nobody stopped the recording: it ended after {s:g} s; r records it again.", s=longest_s)
     elif take.gaps:
         longest = max(gap["missing_ms"] for gap in take.gaps) / 1000.0
-        fault = f"has a gap of {longest:.1f} s" if longest >= 0.05 else "has a jump in the toy's clock"
-        reason = "kept_with_gap" if longest >= 0.05 else "kept_with_jump"
-        message = Sentence(f"This recording {fault}; it is kept, r records it again.", reason, s=round(longest, 1))
+        if longest >= 0.05:
+            message = Message("This recording has a gap of {s:.1f} s; it is kept, r records it again.", s=longest)
+        else:
+            message = Message("This recording has a jump in the toy's clock; it is kept, r records it again.")
     return path.name, message
+
+
+_FILES_OPEN = (
+    "'{folder}' cannot be written any more ({why}): the session has stopped, with {n:recording} saved; close other "
+    "programs, and continue the same session."
+)
+_DISK_FULL = (
+    "'{folder}' cannot be written any more ({why}): the session has stopped, with {n:recording} saved; free disk "
+    "space, and continue the same session."
+)
 
 
 def write_error(session: OpenSession, recordings: int, cause: Exception) -> DatasetError:
     """Return the error for a session that stopped because its folder cannot be written any more."""
     why = getattr(cause, "strerror", None) or cause
-    remedy = "close other programs" if lacks_descriptor(cause) else "free disk space"
-    return DatasetError(
-        f"'{session.folder}' cannot be written any more ({why}): the session has stopped, with "
-        f"{plural(recordings, 'recording')} saved; {remedy}, and continue the same session.",
-        reason="files_open" if lacks_descriptor(cause) else "disk_full",
-        folder=session.folder,
-        why=why,
-        n=recordings,
-    )
+    template = _FILES_OPEN if lacks_descriptor(cause) else _DISK_FULL
+    return DatasetError(template, folder=str(session.folder), why=str(why), n=recordings)
 
 
 def open_toy(url: str, layout: Layout | str | None = None) -> Device:

@@ -45,8 +45,9 @@ class SessionRequest:
 def check_speed(speed: float) -> float:
     """Return ``speed`` if it is valid, else raise ConfigError."""
     if not 0.0 <= speed <= FASTEST:
-        message = f"--speed is {speed:g}; 0 (as fast as it can) to {FASTEST:g} is accepted."
-        raise ConfigError(message, reason="speed_bad", speed=speed, most=FASTEST)
+        raise ConfigError(
+            "--speed is {speed:g}; 0 (as fast as it can) to {most:g} is accepted.", speed=speed, most=FASTEST
+        )
     return speed
 
 
@@ -67,8 +68,9 @@ def session_folder(
     if not subject and request.protocol and load_protocol(request.protocol).needs_nobody:
         subject = NOBODY
     if not subject:
-        message = "The session has no person: give --subject with the person's code, such as S01."
-        raise ConfigError(message, reason="no_person")
+        raise ConfigError(
+            "The session has no person: give --subject with the person's code, such as S01.", field="person"
+        )
     person = out / check_subject(subject)
     if session is not None:
         name = check_session(session)
@@ -76,8 +78,11 @@ def session_folder(
         name = new_session(person) if new else next_session(person)
     known = SessionHead.read(person / name)
     if known is not None and new:
-        message = f"The session '{person / name}' exists: leave --new off, or give another --session."
-        raise ConfigError(message, reason="session_exists", name=f"{person.name}/{name}")
+        raise ConfigError(
+            "The session '{person}' exists: leave --new off, or give another --session.",
+            person=person / name,
+            name=f"{person.name}/{name}",
+        )
     return person / name, known
 
 

@@ -18,7 +18,7 @@ from plushsense.core.files import PART
 from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import HOST_MS, Layout
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.core.toml import loads_json
 from plushsense.devices.base import now_ms
 from plushsense.recording.plan import Protocol
@@ -40,6 +40,33 @@ _RESERVED = re.compile(r"(?i)con|prn|aux|nul|(com|lpt)\d")
 
 Key = tuple[str, int]
 """Key of a planned recording: its gesture and its repetition."""
+# Errors for an opened session of which a value of the head differs, by its key.
+_DIFFERS = {
+    "subject": (
+        "The session '{folder}' was begun with the subject {differs}: leave --subject as it was, or begin a new "
+        "session (--new)."
+    ),
+    "layout": (
+        "The session '{folder}' was begun with the layout {differs}: leave --layout as it was, or begin a new "
+        "session (--new)."
+    ),
+    "protocol": (
+        "The session '{folder}' was begun with the protocol {differs}: leave --protocol as it was, or begin a new "
+        "session (--new)."
+    ),
+    "age_group": (
+        "The session '{folder}' was begun with the age group {differs}: leave --age-group as it was, or begin a new "
+        "session (--new)."
+    ),
+    "gender": (
+        "The session '{folder}' was begun with the gender {differs}: leave --gender as it was, or begin a new "
+        "session (--new)."
+    ),
+    "consent": (
+        "The session '{folder}' was begun with the consent {differs}: leave --consent as it was, or begin a new "
+        "session (--new)."
+    ),
+}
 
 
 @dataclass
@@ -56,7 +83,7 @@ class SessionProgress:
     rows: int = 0
     host_ms: int = 0
     resumed: bool = False
-    repairs: list[Sentence] = field(default_factory=list)
+    repairs: list[Message] = field(default_factory=list)
 
 
 def check_subject(code: str) -> str:
@@ -69,10 +96,10 @@ def check_subject(code: str) -> str:
     is_word = len(code) > 2 and not re.search(r"\d", code) and code != NOBODY
     if valid is None or is_word or _RESERVED.fullmatch(code):
         raise DatasetError(
-            f"'{code}' is no code for a person: give a short one with a number in it, such as S01, never a name "
-            "(at most 16 letters and digits; keep the name that belongs to S01 on paper, away from the recordings).",
-            reason="code_bad",
+            "'{code}' is no code for a person: give a short one with a number in it, such as S01, never a name (at "
+            "most 16 letters and digits; keep the name that belongs to S01 on paper, away from the recordings).",
             code=code,
+            field="person",
         )
     return code
 
@@ -81,9 +108,7 @@ def check_session(name: str) -> str:
     """Return the name of a session if it is valid as a folder name, else raise DatasetError."""
     if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,31}", name, re.ASCII) is None or _RESERVED.fullmatch(name):
         raise DatasetError(
-            f"'{name}' is no name for a session: give at most 32 letters and digits, such as 1 or autumn.",
-            reason="session_name_bad",
-            name=name,
+            "'{name}' is no name for a session: give at most 32 letters and digits, such as 1 or autumn.", name=name
         )
     return name
 
@@ -155,8 +180,11 @@ class OpenSession:
                 if head is not None:
                     folder.mkdir(parents=True, exist_ok=True)
                 elif not (folder / SESSION_HEAD).is_file():
-                    message = f"'{folder}' holds no session: there is no {SESSION_HEAD} in it."
-                    raise DatasetError(message, reason="session_missing", name=folder.name)
+                    raise DatasetError(
+                        "'{path}' holds no session: there is no {session_head} in it.",
+                        path=folder,
+                        session_head=SESSION_HEAD,
+                    )
                 self._lock = FileLock(str(folder / LOCK), timeout=0, thread_local=False)
                 self._lock.acquire()
                 undo.callback(self._release)
@@ -170,14 +198,16 @@ class OpenSession:
                 undo.pop_all()
         except Timeout:
             raise DatasetError(
-                f"Another program is recording the session '{folder}': continue there, or close it first.",
-                reason="session_in_use",
+                "Another program is recording the session '{folder}': continue there, or close it first.",
+                folder=folder,
                 name=f"{folder.parent.name}/{folder.name}",
+                field="person",
             ) from None
         except (OSError, NotImplementedError) as cause:
             why = getattr(cause, "strerror", None) or cause
-            message = f"'{folder}' cannot be used ({why}): check the path and the disk."
-            raise DatasetError(message, reason="folder_unusable", folder=folder, why=why) from None
+            raise DatasetError(
+                "'{folder}' cannot be used ({why}): check the path and the disk.", folder=folder, why=why
+            ) from None
 
     def _head(self, given: SessionHead | None) -> SessionHead:
         known = SessionHead.read(self.folder)
@@ -186,8 +216,7 @@ class OpenSession:
             others = [p.name for p in self.folder.iterdir() if _is_content(p)]
             if others:
                 raise DatasetError(
-                    f"'{self.folder}' holds '{others[0]}' but no session: give another --session or an empty folder.",
-                    reason="folder_taken",
+                    "'{folder}' holds '{file}' but no session: give another --session or an empty folder.",
                     folder=self.folder,
                     file=others[0],
                 )
@@ -198,7 +227,7 @@ class OpenSession:
     def _joined(self, known: SessionHead, given: SessionHead) -> SessionHead:
         """Return the stored head with values that only ``given`` has; raise DatasetError if they contradict."""
         added: dict[str, Any] = {}
-        for key in ("subject", "layout", "protocol", "age_group", "gender", "consent"):
+        for key in _DIFFERS:
             old, new = getattr(known, key), getattr(given, key)
             old_json, new_json = json.loads(json.dumps([old, new]))
             if key == "protocol":
@@ -211,17 +240,18 @@ class OpenSession:
                 names = [v["name"] if isinstance(v, dict) and "name" in v else v for v in (old, new)]
                 differs = f"{names[0]!r}, not {names[1]!r}" if names[0] != names[1] else "another one of that name"
                 raise DatasetError(
-                    f"The session '{self.folder}' was begun with the {key.replace('_', ' ')} {differs}: "
-                    f"leave --{key.replace('_', '-')} as it was, or begin a new session (--new).",
-                    reason=f"session_{key}_differs",
+                    _DIFFERS[key],
+                    folder=self.folder,
+                    differs=differs,
                     name=f"{self.folder.parent.name}/{self.folder.name}",
                 )
             added[key] = new
         if given.simulated and not known.simulated:
             raise DatasetError(
-                f"The session '{self.folder}' was begun with a real toy: begin a new one (--new) for a virtual toy.",
-                reason="session_of_real_toy",
+                "The session '{folder}' was begun with a real toy: begin a new one (--new) for a virtual toy.",
+                folder=self.folder,
                 name=f"{self.folder.parent.name}/{self.folder.name}",
+                field="toy",
             )
         if added:
             known = replace(known, **added)
@@ -303,8 +333,9 @@ def _repair(folder: Path, layout: Layout, log: LogFile) -> SessionProgress:
             path.unlink()
     if started is not None and started not in progress.takes:
         log.write([new_event("unfinished", gesture=started[0], repetition=started[1])])
-        sentence = f"'{started[0]}', {started[1]}, was interrupted: record it again"
-        progress.repairs.append(Sentence(sentence, "interrupted", gesture=started[0], n=started[1]))
+        progress.repairs.append(
+            Message("'{gesture}', {n}, was interrupted: record it again", gesture=started[0], n=started[1])
+        )
     return progress
 
 
@@ -374,8 +405,11 @@ def _repair_stream(path: Path, layout: Layout, progress: SessionProgress, log: L
             )
             file.truncate(whole)
             os.fsync(file.fileno())
-            sentence = f"the incomplete last line of {path.name} was removed ({size - whole} bytes)"
-            progress.repairs.append(Sentence(sentence, "line_removed", file=path.name))
+            progress.repairs.append(
+                Message(
+                    "the incomplete last line of {file} was removed ({size} bytes)", file=path.name, size=size - whole
+                )
+            )
 
 
 def _host_ms(line: bytes, layout: Layout) -> int:
@@ -399,8 +433,7 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
         if not data.endswith(b"\n") or data.count(b"\n") != name.rows + 1:
             os.replace(path, path.with_name(path.name + TORN))
             log.write([new_event("mended", file=path.name, how=f"not whole: renamed to end in {TORN}")])
-            sentence = f"'{path.name}' is incomplete: record it again"
-            progress.repairs.append(Sentence(sentence, "recording_incomplete", file=path.name))
+            progress.repairs.append(Message("'{file}' is incomplete: record it again", file=path.name))
             if key is not None and progress.takes.get(key) == path.name:
                 del progress.takes[key]
             continue
@@ -429,7 +462,7 @@ def _repair_takes(folder: Path, progress: SessionProgress, log: LogFile, made: d
     for key, file in list(progress.takes.items()):
         if not (folder / file).exists():
             log.write([new_event("mended", file=file, how="the recording is gone", gesture=key[0], repetition=key[1])])
-            progress.repairs.append(Sentence(f"'{file}' is missing: record it again", "recording_missing", file=file))
+            progress.repairs.append(Message("'{file}' is missing: record it again", file=file))
             del progress.takes[key]
 
 

@@ -60,13 +60,15 @@ class SessionHead:
             return None
         except (OSError, ValueError, RecursionError) as cause:
             raise DatasetError(
-                f"'{path}' cannot be read ({cause}): restore it from a copy.",
-                reason="session_damaged",
-                name=folder.name,
+                "'{path}' cannot be read ({cause}): restore it from a copy.", path=path, cause=cause, name=folder.name
             ) from None
         if not isinstance(table, dict) or table.pop("format", None) != FORMAT_VERSION:
-            message = f"'{path}' is no session head of format {FORMAT_VERSION}: update PlushSense, or restore the file."
-            raise DatasetError(message, reason="session_damaged", name=folder.name)
+            raise DatasetError(
+                "'{path}' is no session head of format {format_version}: update PlushSense, or restore the file.",
+                path=path,
+                format_version=FORMAT_VERSION,
+                name=folder.name,
+            )
         return load_table(table, cls, f"'{path}'", DatasetError)
 
 
@@ -101,8 +103,9 @@ def read_events(folder: Path) -> Iterator[SessionEvent]:
     except FileNotFoundError:
         return
     except OSError as cause:
-        message = f"'{folder / SESSION_LOG}' cannot be read: {cause.strerror or cause}."
-        raise DatasetError(message, reason="session_damaged", name=folder.name) from None
+        raise DatasetError(
+            "'{path}' cannot be read: {why}.", path=folder / SESSION_LOG, why=cause.strerror or cause, name=folder.name
+        ) from None
     for line in filter(None, lines):
         try:
             table = loads_json(line.decode("utf-8"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.recording.plan import Step
 from plushsense.recording.session import Key, SessionProgress
 
@@ -61,7 +61,7 @@ class RecorderStatus:
     gaps: int
     rows: int
     file: str
-    message: Sentence
+    message: Message
     failed: str
     folder: str
     frames: int = 0

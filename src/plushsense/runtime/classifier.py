@@ -347,16 +347,20 @@ def check_layout(sent: Layout, read: Layout) -> None:
     ask = f"open the device with ?layout={read.name}, or take a model made for '{sent.name}'"
     if sent.names != read.names:
         raise ConfigError(
-            f"The device sends layout '{sent.name}' ({', '.join(sent.names)}), but the model reads "
-            f"'{read.name}' ({', '.join(read.names)}): {ask}.",
-            reason="toy_layout_differs",
+            "The device sends layout '{sent}' ({names}), but the model reads '{read}' ({model_names}): {ask}.",
             sent=sent.name,
+            names=", ".join(sent.names),
             read=read.name,
+            model_names=", ".join(read.names),
+            ask=ask,
+            field="network",
         )
     raise ConfigError(
-        f"The device sends layout '{sent.name}', in which channel '{sent.unlike(read)[0]}' has another unit, scale, "
-        f"step or kind than in the model's '{read.name}': {ask}.",
-        reason="toy_layout_differs",
+        "The device sends layout '{sent}', in which channel '{unlike}' has another unit, scale, step or kind than in "
+        "the model's '{read}': {ask}.",
         sent=sent.name,
+        unlike=sent.unlike(read)[0],
         read=read.name,
+        ask=ask,
+        field="network",
     )

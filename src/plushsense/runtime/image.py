@@ -285,11 +285,13 @@ def refuse_image(arch: Arch) -> None:
     """Raise ArchError for a network that has no image, and no C, with the option to train it with."""
     if arch.padding != "stream":
         raise ArchError(
-            f"{arch.title} has the padding '{arch.padding}', with which a toy would compute the whole window again at "
-            f"every step: train --arch {arch.symbol} --filters {','.join(map(str, arch.filters))} --padding stream"
-            f"{' --norm batch' * (arch.norm == 'layer')}, and export that.",
-            reason="arch_padding",
+            "{arch} has the padding '{padding}', with which a toy would compute the whole window again at every "
+            "step: train --arch {symbol} --filters {filters} --padding stream{value}, and export that.",
+            arch=arch.title,
             padding=arch.padding,
+            symbol=arch.symbol,
+            filters=",".join(map(str, arch.filters)),
+            value=" --norm batch" * (arch.norm == "layer"),
         )
 
 

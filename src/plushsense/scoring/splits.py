@@ -231,10 +231,7 @@ def by_subject(subject: NDArray[np.str_], k: int, seed: int = 0) -> list[Fold]:
     dealt = np.random.default_rng([seed, 1]).permutation(people).tolist()
     groups = [tuple(sorted(dealt[i::k])) for i in range(k)]
     if min(len(people) - len(group) for group in groups) < 2:
-        raise BadInput(
-            f"by-subject:{k} leaves one person to train and validate: use leave-one-subject-out.",
-            reason="one_person_left",
-        )
+        raise BadInput("by-subject:{k} leaves one person to train and validate: use leave-one-subject-out.", k=k)
     return _by_people(subject, groups, people, seed)
 
 
@@ -268,16 +265,16 @@ def _saved(subject: NDArray[np.str_], names: NDArray[Any]) -> Fold:
         sets = sets_of_session(str(name).split("/")[-2:][0], len(mine))
         if not sets:
             raise BadInput(
-                f"The split {SAVED} takes the sets of a file of windows, and '{name}' is in none: import a .mat file "
-                f"with traindata, valdata and testdata, or use {', '.join(_HOLDOUTS)}.",
-                reason="no_saved_sets",
+                "The split {saved} takes the sets of a file of windows, and '{recording}' is in none: import a .mat "
+                "file with traindata, valdata and testdata, or use {holdouts}.",
+                saved=SAVED,
                 recording=str(name),
+                holdouts=", ".join(_HOLDOUTS),
             )
         if len(sets) != len(mine):
             raise BadInput(
-                f"'{name}' has {len(mine)} windows, but {len(sets)} in the file that was imported: cut windows of the "
-                "same length and step (2.5 s, 0.5 s) in the context rows, without trims.",
-                reason="saved_sets_differ",
+                "'{recording}' has {n} windows, but {of} in the file that was imported: cut windows of the same "
+                "length and step (2.5 s, 0.5 s) in the context rows, without trims.",
                 recording=str(name),
                 n=len(mine),
                 of=len(sets),
@@ -350,19 +347,19 @@ def _people(subject: NDArray[np.str_], split: str, needed: int) -> list[str]:
     people = list(_named(subject))
     if UNKNOWN in people:
         raise BadInput(
-            f"{split} needs to know who made each recording, but {int((subject == UNKNOWN).sum())} lack it: "
-            "import them again with a mapping file (--subjects map.csv), or use by-recording:5.",
-            reason="split_needs_people",
+            "{split} needs to know who made each recording, but {n} lack it: import them again with a mapping file "
+            "(--subjects map.csv), or use by-recording:5.",
+            split=split,
             n=int((subject == UNKNOWN).sum()),
         )
     if len(people) < needed:
         raise BadInput(
-            f"{split} needs at least {needed} people (test, validation, training); there are {len(people)} "
-            f"({', '.join(people) or 'nobody'}): record more people, or use by-recording:5, which says nothing about "
-            "new people.",
-            reason="few_people",
-            n=len(people),
+            "{split} needs at least {needed} people (test, validation, training); there are {n} ({people}): record "
+            "more people, or use by-recording:5, which says nothing about new people.",
+            split=split,
             needed=needed,
+            n=len(people),
+            people=", ".join(people) or "nobody",
         )
     return people
 
@@ -370,7 +367,7 @@ def _people(subject: NDArray[np.str_], split: str, needed: int) -> list[str]:
 def _enough(n: int, needed: int, split: str, units: str) -> None:
     if n < needed:
         raise BadInput(
-            f"{split} needs at least {needed} {units}; there are {n}.", reason="few_units", n=n, needed=needed
+            "{split} needs at least {needed} {units}; there are {n}.", split=split, needed=needed, units=units, n=n
         )
 
 

@@ -26,7 +26,7 @@ from typing import Any
 
 from plushsense.core.errors import ConfigError, DatasetError, PlushSenseError, ToolError
 from plushsense.core.files import free_path, write_file
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message, plain
 from plushsense.dataset.backup import backup, is_backup, restore
 from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.importers import import_recordings, propose
@@ -60,7 +60,7 @@ class TaskReporter:
     def write(self, **message: Any) -> None:
         """Write one line of JSON."""
         with self._lock:
-            self._out.write(json.dumps(_plain(message), ensure_ascii=True, default=str) + "\n")
+            self._out.write(json.dumps(plain(message), ensure_ascii=True, default=str) + "\n")
             self._out.flush()
 
     def progress(self, **values: Any) -> None:
@@ -75,18 +75,13 @@ class TaskReporter:
         """Report that ``done`` of ``total`` items of a stage are done."""
         self.progress(stage=stage, done=done, total=total)
 
+    def refuse(self, message: Message) -> None:
+        """Report why the task has failed."""
+        self.write(refused=message.to_json())
+
     def warn(self, sentence: str) -> None:
         """Report a warning to the user."""
-        self.write(warning=_plain(sentence))
-
-
-def _plain(value: Any) -> Any:
-    """Replace every `Sentence` in a value by a table of its message, reason and values, see `Words.sentence`."""
-    if isinstance(value, Sentence):
-        return {"message": str(value), "reason": value.reason, "values": _plain(value.values)}
-    if isinstance(value, dict):
-        return {key: _plain(each) for key, each in value.items()}
-    return [_plain(each) for each in value] if isinstance(value, list | tuple) else value
+        self.write(warning=plain(sentence))
 
 
 class Clock:
@@ -208,7 +203,7 @@ def run_inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
             )
         except PlushSenseError as refusal:
             refusals.append(refusal)
-            rejected.append({"file": source.name, "reason": Sentence.of(refusal)})
+            rejected.append({"file": source.name, "reason": refusal.message})
             continue
         notes += done.notes
         rejected += done.rejected
@@ -258,8 +253,7 @@ def run_pseudonymise(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, 
         ConfigError: if ``words`` is missing, as in a job resumed after a restart, because words are never stored.
     """
     if "words" not in spec:
-        message = "The words to remove are not stored: enter them again on the publish page."
-        raise ConfigError(message, reason="words_not_stored")
+        raise ConfigError("The words to remove are not stored. Enter them again on the page Publish.")
     done = pseudonymise(
         spec["dataset"],
         spec["place"],
@@ -296,8 +290,7 @@ def run_forget(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         ConfigError: if ``person`` is missing, as in a job resumed after a restart, because it is never stored.
     """
     if "person" not in spec:
-        message = "The person's code is not stored: choose the person in the menu of the data set again."
-        raise ConfigError(message, reason="person_not_stored")
+        raise ConfigError("The person's code is not stored. Choose the person again in the menu of the data set.")
     return {"dataset": spec["dataset"], "files": len(forget(spec["dataset"], spec["person"]).files)}
 
 
@@ -309,8 +302,7 @@ def run_publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
             Path(key).parent.mkdir(parents=True, exist_ok=True)
         except OSError as cause:
             file, why = Path(key).name, cause.strerror or str(cause)
-            message = f"The key file '{key}' cannot be written: {why}."
-            raise DatasetError(message, reason="key_not_written", file=file, why=why) from None
+            raise DatasetError("The key file “{file}” cannot be written: {why}.", file=file, why=why) from None
     options = {name: value for name, value in spec.items() if name not in ("dataset", "place")}
     options |= {"columns": tuple(spec.get("columns", ())), "key": key}
     return publish_dataset(spec["dataset"], spec["place"], **options, progress=reporter.stage).to_dict()
@@ -457,7 +449,7 @@ def run_sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     s = done.summary
     for lost in s["failed"]:
         network = f"{lost['arch']} {lost['filters']}"
-        reporter.warn(Sentence(f"{network} was given up: {lost['why']}", "network_lost", network=network))
+        reporter.warn(Message("The network {network} was given up, because its training failed.", network=network))
     keys = ("name", "split", "leaky", "context", "simulated", "trials", "done", "trainings_lost", "best", "seconds")
     return {"out": str(done.out), **{key: s[key] for key in keys}}
 
@@ -498,7 +490,7 @@ def _profile(folder: Path, reporter: TaskReporter) -> dict[str, Any]:
         return {"digest": digest, **profile(folder, progress=partial(reporter.stage, "profile")).to_dict()}
     except ToolError as refusal:
         # Not an error: an export without a profile is valid.
-        return {"digest": digest, "refused": Sentence.of(refusal)}
+        return {"digest": digest, "refused": refusal.message}
 
 
 def run_export(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -576,17 +568,15 @@ def main() -> int:
     except KeyboardInterrupt:
         return 1
     except PlushSenseError as refusal:
-        reporter.write(refused=str(refusal), reason=refusal.reason, values=refusal.values)
+        reporter.refuse(refusal.message)
         return 2
     except OSError as cause:
         where = f" ({cause.filename})" if cause.filename else ""
-        values = {"where": where, "why": cause.strerror or str(cause)}
-        reporter.write(refused="The computer refused: {why}{where}.".format(**values), reason="system", values=values)
+        reporter.refuse(Message("The computer refused: {why}{where}.", why=cause.strerror or str(cause), where=where))
         return 2
     except Exception as cause:  # noqa: BLE001, RUF100
         what = f"{type(cause).__name__}: {cause}"
-        message = f"The work broke off ({what}): what was finished is kept."
-        reporter.write(refused=message, reason="broke_off", values={"what": what})
+        reporter.refuse(Message("The work broke off: {what}. What was finished is kept.", what=what))
         return 2
     return 0
 

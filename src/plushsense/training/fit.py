@@ -311,7 +311,7 @@ def _tensors(windows: WindowSet, scaler: Scaler, arch: Arch, device: torch.devic
 def _check(windows: WindowSet, arch: Arch, purpose: str, some: bool = True) -> None:
     if some and not len(windows):
         raise TrainingError(
-            f"There are no windows to {purpose}: check the data set, the gestures and the split.", reason="no_windows"
+            "There are no windows to {purpose}: check the data set, the gestures and the split.", purpose=purpose
         )
     _, channels, samples = windows.integers.shape
     if channels != arch.channels or len(windows.labels) != arch.classes:
@@ -330,10 +330,12 @@ def _refuse_not_finite(row: dict[str, Any], spec: TrainSpec) -> None:
     for name in ("train_loss", "validation_loss"):
         if row[name] is not None and not np.isfinite(row[name]):
             raise DivergedError(
-                f"The {name.replace('_', ' ')} is no longer a number in epoch {row['epoch']} at the learning rate "
-                f"{row['learning_rate']:g}: try a lower one, such as {spec.learning_rate / 10:g}.",
-                reason="diverged",
+                "The {name} is no longer a number in epoch {epoch} at the learning rate {learning_rate:g}: try a "
+                "lower one, such as {learning_rate_2:g}.",
+                name=name.replace("_", " "),
                 epoch=row["epoch"],
+                learning_rate=row["learning_rate"],
+                learning_rate_2=spec.learning_rate / 10,
             )
 
 
@@ -350,5 +352,5 @@ def _device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if name == "cuda" and not torch.cuda.is_available():
-        raise TrainingError("There is no CUDA device to train on: use the device 'auto' or 'cpu'.", reason="no_cuda")
+        raise TrainingError("There is no CUDA device to train on: use the device 'auto' or 'cpu'.")
     return torch.device(name)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ConfigError, DivergedError
 from plushsense.core.gestures import NOBODY, GestureSet
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.crossval import fold_fingerprint, fold_windows, windows_fingerprint
 from plushsense.jobs.journal import JOURNAL, UNFINISHED, Journal, Result, job_id, keep_if_possible
@@ -174,12 +174,15 @@ def _warn_of_rare(dataset: Dataset, cut: _Cut, warn: Warn) -> None:
     if cut.split.separates_people and cut.grid.classes == ALL:
         rare = set(cut.gestures.labels) - set(shared_gestures(dataset)[0].labels)
         if rare:
-            sentence = (
-                f"{len(rare)} of the {len(cut.gestures)} classes are gestures that fewer than 90 % of the people made "
-                f"({', '.join(sorted(rare))}): the tested person may be the only one with a class; leave these classes "
-                "out with --classes shared"
+            warn(
+                Message(
+                    "{n} of the {of} classes are gestures that fewer than 90 % of the people made ({gestures}): the "
+                    "tested person may be the only one with a class; leave these classes out with --classes shared",
+                    n=len(rare),
+                    of=len(cut.gestures),
+                    gestures=sorted(rare),
+                )
             )
-            warn(Sentence(sentence, "rare_gestures", gestures=sorted(rare)))
 
 
 @dataclass

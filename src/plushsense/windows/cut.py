@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
 from plushsense.core.gestures import NOBODY, GestureSet
-from plushsense.core.sentences import Sentence, plural
+from plushsense.core.sentences import Message, plural
 from plushsense.dataset.quality.measurements import NEVER_STOPPED_FACTOR, usual_rows
 from plushsense.dataset.store import RECORDINGS, UNKNOWN_SUBJECT, Dataset, Progress, RecordingInfo
 from plushsense.windows.clock import Segment, whole_recording
@@ -113,7 +113,7 @@ class WindowSet:
     rate_hz: float
     inputs: tuple[str, ...]
     vectors: tuple[tuple[int, ...], ...] = ()
-    left_out: tuple[Sentence, ...] = ()
+    left_out: tuple[Message, ...] = ()
     self_calibration: str = ""
 
     def __len__(self) -> int:
@@ -226,12 +226,12 @@ def cut_windows(
         DatasetError: if there is no window.
     """
     spec = spec or WindowSpec()
-    left_out = list[Sentence]()
+    left_out = list[Message]()
     if gestures is None:
         free = [g.label for g in dataset.gestures.gestures if g.free_choice]
         gestures = dataset.gestures.subset([label for label in dataset.gestures.labels if label not in free])
         left_out = [
-            Sentence(f"{label}: free choice, everybody did something else", "gestures_left_out", gestures=[label])
+            Message("{label}: free choice, everybody did something else", label=label, gestures=[label])
             for label in free
         ]
     if spec.context == ANYWHERE:
@@ -273,54 +273,55 @@ def cut_windows(
     if not cuts:
         refuse_still_clocks(dataset, sessions)
         raise DatasetError(
-            f"Data set '{dataset.head.name}' gives no window: {plural(len(recordings), 'recording')} of "
-            f"{plural(len(gestures), 'gesture')} ({', '.join(gestures.labels[:6])}…).",
-            reason="no_windows",
+            "Data set '{dataset}' gives no window: {n:recording} of {of:gesture} ({labels}…).",
+            dataset=dataset.head.name,
+            n=len(recordings),
+            of=len(gestures),
+            labels=", ".join(gestures.labels[:6]),
         )
     return replace(assemble(cuts, gestures, dataset), left_out=tuple(left_out))
 
 
-def constant_windows(windows: WindowSet) -> Sentence | None:
+def constant_windows(windows: WindowSet) -> Message | None:
     """Return a warning if windows are constant in time, None if none is."""
     constant = np.flatnonzero((windows.integers == windows.integers[:, :, :1]).all(axis=(1, 2)))
     if not len(constant):
         return None
     first = windows.recording_ids[windows.recording[constant[0]]]
-    return Sentence(
-        f"{len(constant)} of {len(windows)} windows are constant in time, for instance of {first}: look at the sensors "
-        "and the clock with  plushsense check",
-        "windows_constant",
+    return Message(
+        "{n} of {of} windows are constant in time, for instance of {recording}: look at the sensors and the clock "
+        "with  plushsense check",
         n=len(constant),
         of=len(windows),
         recording=first,
     )
 
 
-def without_window(recording: RecordingInfo, sessions: SessionReader) -> Sentence:
+def without_window(recording: RecordingInfo, sessions: SessionReader) -> Message:
     """Return the reason why a recording gives no window."""
     if recording.id in sessions.standing:
-        return Sentence(f"{recording.id}: its clock stands still", "clock_of_recording_still", recording=recording.id)
-    return Sentence(f"{recording.id}: no valid sample", "no_valid_sample", recording=recording.id)
+        return Message("{recording}: its clock stands still", recording=recording.id)
+    return Message("{recording}: no valid sample", recording=recording.id)
 
 
 def refuse_still_clocks(dataset: Dataset, sessions: SessionReader) -> None:
     """Raise DatasetError if clocks that stand still are why a data set gives no window."""
     if sessions.standing:
         raise DatasetError(
-            f"Data set '{dataset.head.name}' gives no window: the clock stands still in {len(sessions.standing)} "
-            f"recordings, for instance in {min(sessions.standing)}: import the files again with all digits of their "
-            "times, or with row_rate_hz in a pattern.",
-            reason="no_windows_clocks_still",
+            "Data set '{dataset}' gives no window: the clock stands still in {n} recordings, for instance in "
+            "{standing}: import the files again with all digits of their times, or with row_rate_hz in a pattern.",
+            dataset=dataset.head.name,
             n=len(sessions.standing),
+            standing=min(sessions.standing),
         )
 
 
 def drop_long_recordings(
     recordings: list[RecordingInfo], spec: WindowSpec
-) -> tuple[list[RecordingInfo], list[Sentence]]:
+) -> tuple[list[RecordingInfo], list[Message]]:
     """Return the recordings to cut, and a description of each recording that was not stopped in time."""
     usual = usual_rows((r.gesture, r.stop - r.start) for r in recordings)
-    in_time, left_out = list[RecordingInfo](), list[Sentence]()
+    in_time, left_out = list[RecordingInfo](), list[Message]()
     for r in recordings:
         own_file = r.file.startswith(f"{RECORDINGS}/")
         if (
@@ -329,8 +330,16 @@ def drop_long_recordings(
             and own_file
             and r.stop - r.start > spec.longest_factor * usual[r.gesture]
         ):
-            sentence = f"{r.id}: {r.stop - r.start} rows where {r.gesture} usually has {usual[r.gesture]:.0f}"
-            left_out.append(Sentence(sentence, "not_stopped", recording=r.id, gesture=[r.gesture]))
+            left_out.append(
+                Message(
+                    "{recording}: {stop} rows where {label} usually has {usual:.0f}",
+                    recording=r.id,
+                    stop=r.stop - r.start,
+                    label=r.gesture,
+                    usual=usual[r.gesture],
+                    gesture=[r.gesture],
+                )
+            )
         else:
             in_time.append(r)
     return in_time, left_out

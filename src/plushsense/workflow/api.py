@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError, python_warning
 from plushsense.core.gestures import NOBODY
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.core.version import __version__
 from plushsense.dataset.files import CACHE
 from plushsense.dataset.importing.importers import import_recordings
@@ -274,8 +274,13 @@ def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> t
         if agreement < _AGREEMENT:
             advice = "more epochs of --quantize-aware" if trained.tuned else "--quantize-aware 10"
             changed = 100 * (1 - agreement)
-            sentence = f"8 bits change {changed:.1f} % of the answers on the validation windows: try {advice}"
-            warn(Sentence(sentence, "bits_change", percent=changed))
+            warn(
+                Message(
+                    "8 bits change {percent:.1f} % of the answers on the validation windows: try {advice}",
+                    percent=changed,
+                    advice=advice,
+                )
+            )
     return predictions, scores
 
 
@@ -295,8 +300,7 @@ def _decisions(bundle: Bundle, dataset: Dataset, given: DecideSpec, warn: Warn) 
     The weights of ``bundle`` must not have been fitted to these people.
     """
     if bundle.provenance["split"] != WHOLE_PEOPLE:
-        sentence = "decision settings are the defaults: fitting them needs whole people held out for validation"
-        warn(Sentence(sentence, "no_decisions"))
+        warn(Message("decision settings are the defaults: fitting them needs whole people held out for validation"))
         return bundle.decision
     validated, trained = (
         set(bundle.provenance[key]) - {NOBODY, UNKNOWN_SUBJECT} for key in ("validation_subjects", "subjects")
@@ -417,11 +421,10 @@ def validation_predictions(bundle: Bundle, dataset: Dataset | str | os.PathLike[
     stored = journal_of(dataset, _PREDICTIONS).find(_predictions_id(bundle)) if bundle.provenance.get("refit") else None
     lost = bundle.provenance.get("refit") and stored is None
     if bundle.provenance.get("split") != WHOLE_PEOPLE or not people or lost:
-        raise DatasetError("This network has no validation people: evaluate it instead.", reason="no_validation_people")
+        raise DatasetError("This network has no validation people: evaluate it instead.")
     if not is_training_content(bundle, dataset):
         raise DatasetError(
-            f"The data set '{dataset.head.name}' was changed since this network was trained: evaluate it instead.",
-            reason="data_changed",
+            "The data set '{name}' was changed since this network was trained: evaluate it instead.",
             name=dataset.head.name,
         )
     if stored is not None:

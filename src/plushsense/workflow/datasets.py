@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from plushsense.core.errors import BundleError, ConfigError, DatasetError
 from plushsense.core.files import write_file
-from plushsense.core.sentences import Sentence, plural
+from plushsense.core.sentences import Message, plural
 from plushsense.dataset.index import as_dataset, change_head, open_dataset
 from plushsense.dataset.privacy.forget import RemovalPlan, find_mentions, plan_removal
 from plushsense.dataset.privacy.forget import forget as remove_person
@@ -212,9 +212,12 @@ def publish_dataset(
             )
         except DatasetError as cause:
             # The package is complete: this is only a warning.
-            why = cause.values.get("why", str(cause))
-            message = f"licence, contact and consent could not be written into '{dataset.path}': {why}"
-            done.warnings.append(Sentence(message, "statements_not_kept", why=why))
+            why = cause.message.values.get("why", str(cause))
+            done.warnings.append(
+                Message(
+                    "licence, contact and consent could not be written into '{path}': {why}", path=dataset.path, why=why
+                )
+            )
     return done
 
 
@@ -234,17 +237,10 @@ def _read_key(path: Path, *beside: Path) -> bytes:
         return key
     except ValueError:
         raise DatasetError(
-            f"'{path}' is not a key of plushsense publish: give a file that does not exist yet.",
-            reason="no_key_file",
-            file=path.name,
+            "'{file}' is not a key of plushsense publish: give a file that does not exist yet.", file=path
         ) from None
     except OSError as cause:
-        raise DatasetError(
-            f"The key '{path}' cannot be used: {cause.strerror or cause}.",
-            reason="key_not_written",
-            file=path.name,
-            why=cause.strerror or str(cause),
-        ) from None
+        raise DatasetError("The key '{file}' cannot be used: {why}.", file=path, why=cause.strerror or cause) from None
 
 
 @dataclass(frozen=True)

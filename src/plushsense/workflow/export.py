@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BadInput, BundleError, ConfigError, python_warning
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
-from plushsense.core.sentences import Sentence, plural
+from plushsense.core.sentences import Message
 from plushsense.dataset.importing.saved_windows import SETS, SIMULATED
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
@@ -50,7 +50,7 @@ def calibrated_on(bundle: Bundle, dataset: Dataset | str | os.PathLike[str], war
     """
     refuse_undeployable(bundle.arch)
     if bundle.calibration and bundle.provenance.get("quantize_aware"):
-        warn(Sentence("the bundle was fine-tuned for its own calibration, which is kept", reason="calibration_kept"))
+        warn(Message("the bundle was fine-tuned for its own calibration, which is kept"))
         return bundle
     return calibrated(bundle, training_windows(bundle, dataset, warn))
 
@@ -72,28 +72,33 @@ def training_windows(
     origin = bundle.provenance
     if isinstance(origin.get("subjects"), int):
         raise BundleError(
-            "The bundle belongs to an export and does not name its training people, which calibration needs: give the "
-            "bundle that plushsense train wrote.",
-            reason="calibration_people",
+            "The bundle belongs to an export and does not name its training people, which calibration needs: give "
+            "the bundle that plushsense train wrote."
         )
     # Windows of `NOBODY` are used both for training and for validation.
     people = {str(s) for s in origin.get("subjects", ())} - {NOBODY}
     if origin.get("split") != WHOLE_PEOPLE or not people:
         raise BundleError(
-            "The bundle does not name the people of its training windows "
-            f"(split '{origin.get('split', 'unknown')}'), which calibration needs: train it again.",
-            reason="calibration_people",
+            "The bundle does not name the people of its training windows (split '{split}'), which calibration needs: "
+            "train it again.",
+            split=origin.get("split", "unknown"),
         )
     if dataset.layout.inputs != bundle.layout.inputs or dataset.layout.period_us != bundle.layout.period_us:
         raise BundleError(
-            f"The data set '{dataset.head.name}' has the layout '{dataset.layout.name}', the bundle "
-            f"'{bundle.layout.name}': give the data set that it was trained on.",
-            reason="calibration_layout",
+            "The data set '{name}' has the layout '{layout}', the bundle '{bundle_layout}': give the data set that "
+            "it was "
+            "trained on.",
             name=dataset.head.name,
+            layout=dataset.layout.name,
+            bundle_layout=bundle.layout.name,
         )
     if not is_training_content(bundle, dataset):
-        message = f"'{dataset.head.name}' has changed since the training of the bundle: its present content is used"
-        warn(Sentence(message, reason="dataset_changed", name=dataset.head.name))
+        warn(
+            Message(
+                "'{name}' has changed since the training of the bundle: its present content is used",
+                name=dataset.head.name,
+            )
+        )
     known = {field.name for field in fields(WindowSpec)}
     spec = WindowSpec(**{k: v for k, v in bundle.windowing.items() if k in known})
     anywhere = AnywhereSpec(**bundle.windowing.get("anywhere", {}))
@@ -101,15 +106,14 @@ def training_windows(
     at = np.flatnonzero(np.isin(windows.subject, sorted(people)))
     if not len(at):
         raise BundleError(
-            f"The data set '{dataset.head.name}' has no window of the {plural(len(people), 'person')} the bundle was "
-            "trained on: give the data set that it was trained on.",
-            reason="calibration_other",
+            "The data set '{name}' has no window of the {n:person} the bundle was trained on: give the data set that "
+            "it was trained on.",
             name=dataset.head.name,
+            n=len(people),
         )
     missing = sorted(people - set(windows.subject[at].tolist()))
     if missing:
-        message = f"no longer in '{dataset.head.name}': {', '.join(missing)}"
-        warn(Sentence(message, reason="people_gone", name=dataset.head.name, people=", ".join(missing)))
+        warn(Message("no longer in '{name}': {people}", name=dataset.head.name, people=", ".join(missing)))
     return windows.integers[at]
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet, merge_names
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.importing.proposals import median_gesture_s
 from plushsense.dataset.quality.outliers import far_inputs
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
@@ -73,7 +73,7 @@ def choose_classes(dataset: Dataset, choice: str | Sequence[str], warn: Warn = s
         gestures, left_out = shared_gestures(dataset)
         if left_out:
             reasons = "; ".join(f"{label} ({why})" for label, why in left_out.items())
-            warn(Sentence(f"left out of the shared gestures: {reasons}", "gestures_left_out", gestures=list(left_out)))
+            warn(Message("left out of the shared gestures: {reasons}", reasons=reasons, gestures=list(left_out)))
     elif choice == ALL:
         recorded = {r.gesture for r in dataset.used}
         gestures = dataset.gestures.subset([g for g in dataset.gestures.labels if g in recorded])
@@ -82,10 +82,10 @@ def choose_classes(dataset: Dataset, choice: str | Sequence[str], warn: Warn = s
         gestures = dataset.gestures.subset([label.strip() for label in labels])
     if len(gestures) < 2:
         raise DatasetError(
-            f"At least 2 gestures are needed, not {len(gestures)} ({', '.join(gestures.labels) or 'none'}): "
-            "choose others with --classes all or --classes LABEL,LABEL.",
-            reason="few_gestures",
+            "At least 2 gestures are needed, not {n} ({labels}): choose others with --classes all or --classes "
+            "LABEL,LABEL.",
             n=len(gestures),
+            labels=", ".join(gestures.labels) or "none",
         )
     return gestures
 
@@ -97,7 +97,7 @@ def classes_for(dataset: Dataset, choice: str | Sequence[str], context: str, war
         return gestures
     with_idle = add_idle_gesture(gestures, dataset)
     if added := [g.label for g in with_idle.gestures if g not in gestures.gestures]:
-        warn(Sentence(f"added a class for what happens between gestures: {added[0]}", "idle_added", gesture=added[:1]))
+        warn(Message("added a class for what happens between gestures: {added}", added=added[0], gesture=added[:1]))
     return with_idle
 
 
@@ -122,7 +122,7 @@ def windows_for(
     else:
         cut = cut_windows(dataset, spec, gestures)
     for line in cut.left_out:
-        warn(Sentence(f"left out: {line}", line.reason, **line.values))
+        warn(Message("left out: {line}", line=line))
     warn_of_far_readings(cut, warn)
     # Cells that nothing touches are constant without a fault.
     if not any(c.is_discrete for c in dataset.layout.channels) and (note := constant_windows(cut)) is not None:
@@ -135,12 +135,17 @@ def warn_of_far_readings(windows: WindowSet, warn: Warn) -> None:
     for at, far in far_inputs(windows.integers).items() if warn is not silent else ():
         name, n, percent = windows.inputs[at], int(far.sum()), 100 * float(far.mean())
         people = ", ".join(sorted(set(windows.subject[far.any(axis=1)].tolist())))
-        sentence = (
-            f"the scale of {name} is set by {n} samples ({percent:.2g} %, of {people}) far from all others, so that "
-            "everything else looks alike in it: if these readings failed, exclude their recordings, or give the "
-            "layout a valid_min and valid_max without them"
+        warn(
+            Message(
+                "the scale of {channel} is set by {n} samples ({percent:.2g} %, of {people}) far from all others, so "
+                "that everything else looks alike in it: if these readings failed, exclude their recordings, or give "
+                "the layout a valid_min and valid_max without them",
+                channel=name,
+                n=n,
+                percent=percent,
+                people=people,
+            )
         )
-        warn(Sentence(sentence, "far_readings", channel=name, n=n, people=people))
 
 
 def add_hard_negatives(
@@ -193,12 +198,16 @@ def warn_of_untrimmed(dataset: Dataset, gestures: GestureSet, warn: Warn) -> Non
     located = [r for r in dataset.used if r.gesture in active and r.stream_row >= 0]
     untrimmed = [r for r in located if not r.start]
     if not dataset.layout.is_labelled and 2 * len(untrimmed) > len(located):
-        sentence = (
-            f"{len(untrimmed)} of {len(located)} recordings are not trimmed, so the network learns the time before a "
-            "gesture as the gesture and reports it too early and too often: run "
-            f"'plushsense trim {dataset.path.name} --accept-above 0.5' first"
+        warn(
+            Message(
+                "{n} of {of} recordings are not trimmed, so the network learns the time before a gesture as the "
+                "gesture and reports it too early and too often: run 'plushsense trim {path} --accept-above 0.5' "
+                "first",
+                n=len(untrimmed),
+                of=len(located),
+                path=dataset.path.name,
+            )
         )
-        warn(Sentence(sentence, "untrimmed", n=len(untrimmed), of=len(located)))
 
 
 def warn_of_single_people(windows: WindowSet, warn: Warn) -> None:
@@ -207,11 +216,15 @@ def warn_of_single_people(windows: WindowSet, warn: Warn) -> None:
         people = set(windows.subject[windows.y == index].tolist())
         if len(people) == 1 and not people & {NOBODY, UNKNOWN_SUBJECT}:
             person = people.pop()
-            sentence = (
-                f"only {person} made '{label}', so it cannot be learnt when that person is left out: leave it "
-                "out with --classes, or record it with more people"
+            warn(
+                Message(
+                    "only {person} made '{label}', so it cannot be learnt when that person is left out: leave it out "
+                    "with --classes, or record it with more people",
+                    person=person,
+                    label=label,
+                    gesture=[label],
+                )
             )
-            warn(Sentence(sentence, "single_person", person=person, gesture=[label]))
 
 
 def warn_of_files_twice(dataset: Dataset, gestures: GestureSet, warn: Warn) -> None:
@@ -224,8 +237,24 @@ def warn_of_files_twice(dataset: Dataset, gestures: GestureSet, warn: Warn) -> N
         for other in others:
             labels = {first.gesture, other.gesture}
             known = "as two gestures" if len(labels) == 2 else f"twice as '{first.gesture}'"
-            sentence = f"the same file is in the data set {known}: {first.id} and {other.id}; exclude one of them"
-            warn(Sentence(sentence, "same_file", first=first.id, second=other.id))
+            warn(
+                Message(
+                    "the same file is in the data set {known}: {first} and {second}; exclude one of them",
+                    known=known,
+                    first=first.id,
+                    second=other.id,
+                )
+            )
+
+
+_LOOPED_WINDOWS = (
+    "a decision reads {reads:.1f} s (kernels {kernels:.1f} s, window {window:g} s), but half of the recordings last "
+    "less than {usual:.1f} s, so most windows repeat their gesture: try {advice}"
+)
+_LONG_WINDOWS = (
+    "a decision reads {reads:.1f} s (kernels {kernels:.1f} s, window {window:g} s), but half of the recordings last "
+    "less than {usual:.1f} s, so most windows begin before their gesture: try {advice}"
+)
 
 
 def warn_of_long_windows(
@@ -248,13 +277,9 @@ def warn_of_long_windows(
     if window_s > usual_s:
         advice.append(f"window_s = {max(0.5, round(usual_s, 1)):g} in [windows] of a --config file, or in a grid")
     looped = spec.context in ("loop", ROWS)
-    effect = "repeat their gesture" if looped else "begin before their gesture"
-    sentence = (
-        f"a decision reads {reads_s:.1f} s (kernels {field_s:.1f} s, window {window_s:g} s), but half of the "
-        f"recordings last less than {usual_s:.1f} s, so most windows {effect}: try {' and '.join(advice)}"
-    )
-    reason = "looped_windows" if looped else "long_windows"
-    warn(Sentence(sentence, reason, reads=float(reads_s), usual=float(usual_s)))
+    template = _LOOPED_WINDOWS if looped else _LONG_WINDOWS
+    values = {"reads": float(reads_s), "kernels": field_s, "window": window_s, "usual": float(usual_s)}
+    warn(Message(template, **values, advice=" and ".join(advice)))
 
 
 def outside_streams(windows: WindowSet, dataset: Dataset, people: Collection[str]) -> NDArray[np.bool_]:

@@ -29,11 +29,13 @@ def check_folder(out: Path, name: str) -> None:
     """Raise ConfigError if results cannot be written to the folder ``out``; ``what`` names them, as in "A sweep"."""
     there = next(p for p in (out.absolute(), *out.absolute().parents) if p.exists())
     if not there.is_dir():
-        message = f"{name} cannot be written to '{out}': '{there}' is a file; give a folder."
-        raise ConfigError(message, reason="folder_is_file", path=there)
+        raise ConfigError(
+            "{name} cannot be written to '{out}': '{path}' is a file; give a folder.", name=name, out=out, path=there
+        )
     if not os.access(there, os.W_OK | os.X_OK):
-        message = f"{name} cannot be written to '{out}': you may not write in '{there}'."
-        raise ConfigError(message, reason="folder_read_only", path=there)
+        raise ConfigError(
+            "{name} cannot be written to '{out}': you may not write in '{path}'.", name=name, out=out, path=there
+        )
 
 
 def check_results(out: Path, name: str, summary: str, identity: str | None = None, *, replace: bool = False) -> None:
@@ -123,10 +125,11 @@ def check_place(out: Path, config: RunConfig, dataset: Dataset, *, replace: bool
     data = earlier.get("dataset")
     other = isinstance(data, Mapping) and data.get("hash") != dataset.hash
     raise ConfigError(
-        f"'{out}' contains an evaluation of {'other data' if other else 'other settings'} "
-        f"({earlier.get('split', 'no split')}, {earlier.get('title', 'no title')}): choose another --out, or --force "
-        "to replace it.",
-        reason="other_results",
+        "'{out}' contains an evaluation of {more} ({split}, {title}): choose another --out, or --force to replace it.",
+        out=out,
+        more="other data" if other else "other settings",
+        split=earlier.get("split", "no split"),
+        title=earlier.get("title", "no title"),
     )
 
 

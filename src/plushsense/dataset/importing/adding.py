@@ -16,7 +16,7 @@ from filelock import Timeout
 from plushsense.core.errors import DatasetError
 from plushsense.core.files import write_file
 from plushsense.core.gestures import GestureSet
-from plushsense.core.sentences import Sentence, join_names
+from plushsense.core.sentences import Message, join_names
 from plushsense.dataset.files import CACHE, sha256_of, walk_files
 from plushsense.dataset.importing.build import (
     RECORDER,
@@ -62,8 +62,7 @@ def _locked_work_folder(dest: Path) -> Iterator[Path]:
             finally:
                 shutil.rmtree(work, ignore_errors=True)
     except Timeout:
-        message = f"Another import is adding to '{dest}' now: wait until it ends."
-        raise DatasetError(message, reason="import_runs") from None
+        raise DatasetError("Another import is adding to '{dest}' now: wait until it ends.", dest=dest) from None
 
 
 def _copier(dataset: Dataset, work: Path) -> Copier:
@@ -134,17 +133,21 @@ def add_to_dataset(
         if dataset.head.simulated != simulated and (simulated or account.kept):
             kinds = ("real", "virtual") if simulated else ("virtual", "real")
             raise DatasetError(
-                f"'{dest}' holds recordings of a {kinds[0]} toy, the source those of a {kinds[1]} one: keep them "
-                "apart.",
-                reason="real_and_virtual",
+                "'{dest}' holds recordings of a {kind} toy, the source those of a {other} one: keep them apart.",
+                dest=dest,
+                kind=kinds[0],
+                other=kinds[1],
             )
         if account.rejected and not account.kept and not copier.already:
             file, reason = account.rejected[0].values()
             raise DatasetError(
-                f"Nothing of the source fits '{dest}', whose layout is '{head.layout.name}': "
-                f"rejected are all files ({len(account.rejected)}). The first: '{file}': {reason.rstrip('.')}.",
-                reason="import_unreadable",
+                "Nothing of the source fits '{dest}', whose layout is '{layout}': rejected are all files ({n}). The "
+                "first: '{file}': {reason}.",
+                dest=dest,
                 layout=head.layout.name,
+                n=len(account.rejected),
+                file=file,
+                reason=reason.rstrip("."),
                 first=reason,
             )
         head = replace(head, gestures=extend_gestures(head.gestures, built.dataset))
@@ -186,10 +189,13 @@ def _returning_people_warning(dest: Path, come: list[str]) -> list[str]:
     days = ", ".join(dict.fromkeys(g.day for g in gone))
     listed = join_names(come, most=5)
     return [
-        Sentence(
-            f"people were removed from this data set ({len(gone)}; {days}), and {listed} were added now: remove a "
-            f"person again with  plushsense forget {dest} CODE",
-            reason="removed_return",
+        Message(
+            "people were removed from this data set ({n}; {days}), and {listed} were added now: remove a person "
+            "again with  plushsense forget {dest} CODE",
+            n=len(gone),
+            days=days,
+            listed=listed,
+            dest=dest,
             people=", ".join(come),
         )
     ]

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from plushsense.core.errors import ConfigError, DatasetError
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.importing.build import DEVICE_NAME
 
 _CHUNK = 1 << 20
@@ -75,21 +75,23 @@ class UnpackLimits:
         """Raise DatasetError if unpacking the archive ``path`` into ``place`` needs more than is allowed or free."""
         if files > self.files or total_bytes > self.total_bytes:
             raise DatasetError(
-                f"'{path}' would unpack to {files} files and {total_bytes / 1e9:.1f} GB; {self.files} files and "
-                f"{self.total_bytes / 1e9:g} GB are allowed: if you trust it, allow more (--max-gb) or unpack it "
-                "yourself.",
-                reason="zip_too_large",
-                name=path.name,
+                "'{path}' would unpack to {there} files and {total_bytes:.1f} GB; {files} files and {gb:g} GB are "
+                "allowed: if you trust it, allow more (--max-gb) or unpack it yourself.",
+                path=path,
+                there=files,
+                total_bytes=total_bytes / 1e9,
                 files=self.files,
-                gb=f"{self.total_bytes / 1e9:g}",
+                gb=self.total_bytes / 1e9,
             )
         there = next(folder for folder in (place.resolve(), *place.resolve().parents) if folder.is_dir())
         if total_bytes > (free := shutil.disk_usage(there).free):
             raise DatasetError(
-                f"'{path}' would unpack to {total_bytes / 1e9:.1f} GB, but the disk of '{place}' has only "
-                f"{free / 1e9:.1f} GB: make room, or give another place.",
-                reason="zip_no_room",
-                name=path.name,
+                "'{path}' would unpack to {total_bytes:.1f} GB, but the disk of '{place}' has only {free:.1f} GB: "
+                "make room, or give another place.",
+                path=path,
+                total_bytes=total_bytes / 1e9,
+                place=place,
+                free=free / 1e9,
             )
 
 
@@ -102,25 +104,25 @@ def zip_entry(name: str) -> zipfile.ZipInfo:
     return entry
 
 
-def member_target(name: str) -> PurePosixPath | Sentence:
+def member_target(name: str) -> PurePosixPath | Message:
     """Return the path of a member below the target folder, or the reason why it is refused."""
     plain = name.replace("\\", "/")
     if plain.startswith("/") or re.match(r"^[A-Za-z]:", plain):
-        return Sentence("its path is absolute: it would be written outside the target", reason="file_outside")
+        return Message("its path is absolute: it would be written outside the target")
     parts = [p for p in plain.split("/") if p not in ("", ".")]
     if ".." in parts:
-        return Sentence("its path holds '..': it would be written outside the target", reason="file_outside")
+        return Message("its path holds '..': it would be written outside the target")
     if not parts or len(parts) > _DEEPEST or len(plain) > _LONGEST_PATH:
-        return Sentence("its path is empty, too deep or too long", reason="file_name")
+        return Message("its path is empty, too deep or too long")
     for part in parts:
         if _FORBIDDEN.search(part) or part != part.rstrip(" .") or len(part.encode("utf-8", "replace")) > _LONGEST_NAME:
-            return Sentence("its name is not one that every file system can hold", reason="file_name")
+            return Message("its name is not one that every file system can hold")
         if DEVICE_NAME.match(part):
-            return Sentence(f"'{part[:20]}' is the name of a device on Windows", reason="file_name")
+            return Message("'{part}' is the name of a device on Windows", part=part[:20])
     try:
         plain.encode("utf-8")
     except UnicodeEncodeError:
-        return Sentence("its name is not UTF-8", reason="file_name")
+        return Message("its name is not UTF-8")
     return PurePosixPath(*parts)
 
 
@@ -128,17 +130,16 @@ def refusal(info: zipfile.ZipInfo, limits: UnpackLimits) -> str:
     """Return the reason to refuse a member by its directory entry; "" if it may be unpacked."""
     kind = stat.S_IFMT(info.external_attr >> 16)
     if kind == stat.S_IFLNK:
-        return Sentence("a symbolic link is not followed", reason="file_link")
+        return Message("a symbolic link is not followed")
     if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
-        return Sentence("not a regular file", reason="file_link")
+        return Message("not a regular file")
     if info.flag_bits & 0x41:
-        message = "it is encrypted: unpack the archive with its password and import the folder"
-        return Sentence(message, reason="file_encrypted")
+        return Message("it is encrypted: unpack the archive with its password and import the folder")
     if info.file_size > _SMALL_BYTES and info.file_size > limits.ratio * max(1, info.compress_size):
-        return Sentence(
-            f"it would swell {info.file_size / max(1, info.compress_size):.0f} times, more than the {limits.ratio:g} "
-            "that are allowed",
-            reason="file_swells",
+        return Message(
+            "it would swell {file_size:.0f} times, more than the {ratio:g} that are allowed",
+            file_size=info.file_size / max(1, info.compress_size),
+            ratio=limits.ratio,
         )
     return ""
 
@@ -179,9 +180,7 @@ def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list
         archive = zipfile.ZipFile(path)
     except DAMAGED as cause:
         raise DatasetError(
-            f"'{path}' is no zip, or a damaged one ({_message(cause)}): get another copy.",
-            reason="zip_damaged",
-            name=path.name,
+            "'{path}' is no zip, or a damaged one ({message}): get another copy.", path=path, message=_message(cause)
         ) from None
     with archive:
         members = [m for m in archive.infolist() if not m.filename.endswith("/")]
@@ -197,17 +196,15 @@ def unpack(path: Path, folder: Path, limits: UnpackLimits | None = None) -> list
                 continue
             key = unicodedata.normalize("NFC", str(target)).casefold()
             if key in seen:
-                refused.append(
-                    (name, Sentence("another member has the same name, but for case or accents", reason="file_twice"))
-                )
+                refused.append((name, Message("another member has the same name, but for case or accents")))
                 continue
             seen.add(key)
             try:
                 room -= unpack_member(archive, info, folder / target, room)
             except (FileExistsError, NotADirectoryError, IsADirectoryError):
-                refused.append((name, Sentence("another member stands where its folder would be", reason="file_twice")))
+                refused.append((name, Message("another member stands where its folder would be")))
             except DAMAGED as cause:
-                refused.append((name, Sentence(f"it is damaged: {_message(cause)}", reason="file_damaged")))
+                refused.append((name, Message("it is damaged: {message}", message=_message(cause))))
     return refused
 
 

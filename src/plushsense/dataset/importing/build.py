@@ -14,7 +14,7 @@ from plushsense.core.errors import DatasetError
 from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
-from plushsense.core.sentences import Sentence, plural
+from plushsense.core.sentences import Message
 from plushsense.dataset.files import sha256_of
 from plushsense.dataset.importing.sources import COMPANIONS, LEFT_OUT, SourceFile, SourceScan
 from plushsense.dataset.importing.truncation import IMPORTER, truncation_marks
@@ -34,7 +34,7 @@ from plushsense.dataset.store import (
 )
 from plushsense.recording.session_files import SESSION_LOG
 
-TWICE = Sentence("the same file was already imported", reason="file_twice")
+TWICE = Message("the same file was already imported")
 # Files to which the recorder only appends.
 APPENDED = (STREAM_NAME, SESSION_LOG)
 _LONGEST = 120
@@ -66,8 +66,9 @@ def refuse_merged(files: Sequence[SourceFile], there: Iterable[str] = ()) -> Non
     for kind, code, folder, within in folders:
         if len(folder.encode("utf-8")) > _LONGEST:
             raise DatasetError(
-                f"The code '{code[:40]}…' is too long: codes of {kind} have {_LONGEST} bytes at most.",
-                reason="code_too_long",
+                "The code '{code}' is too long: codes of {kind} have {longest} bytes at most.",
+                kind=kind,
+                longest=_LONGEST,
                 code=f"{code[:40]}…",
             )
         key = (folder.casefold(), within)
@@ -78,16 +79,17 @@ def refuse_merged(files: Sequence[SourceFile], there: Iterable[str] = ()) -> Non
             codes[key] = code
         elif first != code:
             raise DatasetError(
-                f"The {kind} '{first}' and '{code}' would share the folder '{folder}': rename one of them.",
-                reason="codes_alike",
+                "The {kind} '{a}' and '{b}' would share the folder '{folder}': rename one of them.",
+                kind=kind,
                 a=first,
                 b=code,
+                folder=folder,
             )
 
 
-def _orphan(name: str) -> Sentence:
+def _orphan(name: str) -> Message:
     """Return the reason to refuse a companion of the file ``name``, which was not imported."""
-    return Sentence(f"belongs to '{name}', which was not imported", reason="file_orphan")
+    return Message("belongs to '{name}', which was not imported", name=name)
 
 
 @dataclass
@@ -117,7 +119,7 @@ class Copier:
         try:
             raw = file.source.read_bytes()
         except OSError as cause:
-            return Sentence(f"cannot be read: {cause.strerror or cause}", reason="file_unreadable")
+            return Message("cannot be read: {why}", why=cause.strerror or cause)
         content = hashlib.sha256(raw).hexdigest()
         existing = self.contents.get((file.kind, content))
         if existing is None and self.contents and file.cut is not None:
@@ -185,14 +187,11 @@ def key_of(path: str, *, companion: bool) -> str:
 
 
 RECORDER = "recorder"
-SIMULATED = Sentence(
-    "these recordings are a simulation: scores on them say nothing about a real toy", reason="simulated"
-)
-NO_PEOPLE = Sentence(
-    "the folders are gestures, so the people are not known: splits by subject are not possible; "
-    "import again with --streams DIR if the fulldatastream.csv of each person is there, or with --subjects map.csv "
-    "(columns file,subject) if a mapping is",
-    reason="people_unknown",
+SIMULATED = Message("these recordings are a simulation: scores on them say nothing about a real toy")
+NO_PEOPLE = Message(
+    "the folders are gestures, so the people are not known: splits by subject are not possible; import again with "
+    "--streams DIR if the fulldatastream.csv of each person is there, or with --subjects map.csv (columns "
+    "file,subject) if a mapping is"
 )
 
 
@@ -347,10 +346,9 @@ def unknown_labels(given: GestureSet, labels: Iterable[str]) -> str:
     if given.inferred or not counts:
         return ""
     listed = ", ".join(f"'{label}' ({n})" for label, n in counts.most_common(8)) + (", …" if len(counts) > 8 else "")
-    return Sentence(
-        f"the gesture set '{given.name}' has no gesture {listed}: such recordings become gestures without affect; give "
-        "other spellings as aliases of a pattern, or a gesture set that has them",
-        reason="labels_unknown",
+    return Message(
+        "the gesture set '{set}' has no gesture {labels}: such recordings become gestures without affect; give other "
+        "spellings as aliases of a pattern, or a gesture set that has them",
         set=given.name,
         labels=listed,
     )
@@ -381,8 +379,15 @@ def merge_people(
         for key in keys:
             new, old = getattr(info, key), getattr(known, key)
             if new and old and new != old:
-                message = f"the {key.replace('_', ' ')} of '{code}' is kept as '{old}'; a session states '{new}'"
-                notes.append(Sentence(message, reason="person_kept", person=code, old=old, new=new))
+                notes.append(
+                    Message(
+                        "the {key} of '{person}' is kept as '{old}'; a session states '{new}'",
+                        key=key.replace("_", " "),
+                        person=code,
+                        old=old,
+                        new=new,
+                    )
+                )
         values = {key: getattr(known, key) or getattr(info, key) for key in keys}
         people[code] = replace(known, **values, more=info.more | known.more)
     strangers = [code for code in file if folder_name(code) not in subjects]
@@ -429,11 +434,12 @@ def create_dataset(
                 *search.notes[-1:],
             ]
             if not reasons:
-                message = f"'{source}' holds no finished recording yet, only a stream: record some first."
-                raise DatasetError(message, reason="import_only_stream")
+                raise DatasetError(
+                    "'{source}' holds no finished recording yet, only a stream: record some first.", source=source
+                )
             raise DatasetError(
-                f"'{source}' holds no recording that layout '{head.layout.name}' can read. The first: {reasons[0]}",
-                reason="import_unreadable",
+                "'{source}' holds no recording that layout '{layout}' can read. The first: {first}",
+                source=source,
                 layout=head.layout.name,
                 first=reasons[0],
             )
@@ -462,11 +468,12 @@ def create_dataset(
     return summarize_import(dataset, account, virtual + search.notes + notes + remarks, set(account.kept), len(trims))
 
 
-def virtual_note(built: IndexBuild) -> Sentence:
+def virtual_note(built: IndexBuild) -> Message:
     """Return the note that the times of recordings tell that they are simulated."""
     of = len(built.dataset.recordings)
-    message = f"{built.virtual} of {plural(of, 'recording')} are of a virtual toy, as the times of their rows tell"
-    return Sentence(message, reason="virtual_recordings", n=built.virtual, of=of)
+    return Message(
+        "{n} of {of:recording} are of a virtual toy, as the times of their rows tell", n=built.virtual, of=of
+    )
 
 
 def read_copied(account: ImportedFiles, head: DatasetHead, progress: Progress | None) -> IndexBuild:
@@ -483,11 +490,10 @@ def _no_people(dataset: Dataset, shape: str) -> str:
     if not dataset.subjects:
         return NO_PEOPLE
     n, of = sum(r.subject == UNKNOWN_SUBJECT for r in dataset.recordings), len(dataset.recordings)
-    return Sentence(
-        f"the people of {n} of {plural(of, 'recording')} are not known, because their folders are gestures: splits by "
-        "subject are not possible; move them to the folders of their people, or import again with --subjects map.csv "
+    return Message(
+        "the people of {n} of {of:recording} are not known, because their folders are gestures: splits by subject "
+        "are not possible; move them to the folders of their people, or import again with --subjects map.csv "
         "(columns file,subject)",
-        reason="people_of_some_unknown",
         n=n,
         of=of,
     )

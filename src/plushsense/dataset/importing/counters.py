@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import Frames
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 
 CLOCK, COUNTER = "a second clock", "a number of the row"
 # Shorter recordings prove nothing.
@@ -70,7 +70,7 @@ def _rates(values: Floats, times: Floats) -> list[float]:
     return rates
 
 
-def counters_note(layout: Layout, recordings: Sequence[Frames]) -> list[Sentence]:
+def counters_note(layout: Layout, recordings: Sequence[Frames]) -> list[Message]:
     """Return a warning about the channels that are clocks or numbers of rows in every recording, if there are any."""
     kinds = {
         c.name: no_reading(
@@ -83,8 +83,11 @@ def counters_note(layout: Layout, recordings: Sequence[Frames]) -> list[Sentence
         return []
     listed = ", ".join(f"'{name}' is {kind}" for name, kind in found.items())
     channels = ", ".join(f"'{name}'" for name in found)
-    message = (
-        f"{listed}: a network would read from it when a recording was made, which says nothing live; take "
-        f"{channels} out of the channels and import again"
-    )
-    return [Sentence(message, reason="channel_counts", channels=channels)]
+    return [
+        Message(
+            "{listed}: a network would read from it when a recording was made, which says nothing live; take "
+            "{channels} out of the channels and import again",
+            listed=listed,
+            channels=channels,
+        )
+    ]

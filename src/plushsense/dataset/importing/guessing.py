@@ -90,8 +90,7 @@ class GuessedPattern:
     def write(self, path: str | Path) -> None:
         """Write the TOML file; raise ConfigError if the file exists."""
         if Path(path).exists():
-            message = f"'{path}' exists already: give the name of a new file."
-            raise ConfigError(message, reason="name_exists", name=Path(path).name)
+            raise ConfigError("'{path}' exists already: give the name of a new file.", path=Path(path))
         write_file(Path(path), self.toml)
 
 

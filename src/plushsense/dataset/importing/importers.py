@@ -18,7 +18,7 @@ from plushsense.core.files import temporary_folder, work_folder, write_file
 from plushsense.core.gestures import GestureSet, load_gestures
 from plushsense.core.layouts import DEVICE_MS, Layout, layout_names, load_layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, parse_name
-from plushsense.core.sentences import Sentence, plural
+from plushsense.core.sentences import Message
 from plushsense.dataset.importing.adding import add_to_dataset
 from plushsense.dataset.importing.archives import UnpackLimits, unpack
 from plushsense.dataset.importing.build import (
@@ -52,6 +52,7 @@ from plushsense.dataset.importing.sources import (
     common_layout,
     is_simulation,
     moved_note,
+    needs_person,
     people_of,
     printable_path,
     read_mapping,
@@ -79,10 +80,11 @@ FOLDER = "folder"
 SHOWN = 5
 # Recordings in which channels that are no readings are looked for.
 _SAMPLED = 40
-NO_PEOPLE_OF_PATTERN = Sentence(
+LAYOUT_GUESSED = "the layout is '{layout}', as {why}"
+ADOPTED = "adopted in the layout (--no-adopt keeps it as given): {listed}"
+NO_PEOPLE_OF_PATTERN = Message(
     "the pattern finds no person, so the people are not known, and splits by subject are not possible: put {subject} "
-    "into paths, give its column, or import again with --subjects map.csv (columns file,subject)",
-    reason="people_unknown",
+    "into paths, give its column, or import again with --subjects map.csv (columns file,subject)"
 )
 
 
@@ -127,14 +129,14 @@ class ImportOptions:
             found = readable_layouts(files, [layout.name for layout in found])[:1]
         if len(found) == 1:
             name = found[0].name
-            message = f"the layout is '{name}', as {why}"
-            return found[0], [Sentence(message, reason="layout_guessed", layout=name)]
+            return found[0], [Message(LAYOUT_GUESSED, layout=name, why=why)]
         fit = f"The header of the files fits {' and '.join(layout.name for layout in found)}. " if found else ""
         raise ConfigError(
-            f"--layout is needed: accepted are {', '.join(layout_names())}, or a TOML file of your own, which "
-            f"names the channels (see docs/importing.md). {fit}For files of another form, let --guess FILE.toml write "
-            "a pattern.",
-            reason="layout_unknown",
+            "--layout is needed: accepted are {layout_names}, or a TOML file of your own, which names the channels "
+            "(see docs/importing.md). {fit}For files of another form, let --guess FILE.toml write a pattern.",
+            layout_names=", ".join(layout_names()),
+            fit=fit,
+            needs="layout",
         )
 
     def known_gestures(self, layout: Layout) -> GestureSet | None:
@@ -203,12 +205,18 @@ def scan_folder(source: Path, options: ImportOptions, *, around: Path | None = N
         try:
             files_of.setdefault(_add_xdf(file, name, person, options, search), []).append(name)
         except FileFormatError as cause:
-            search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
+            search.found.append(SourceFile(file, "", origin=name, reason=cause.message))
     for (subject, session), names in files_of.items():
         if len(names) > 1:
-            message = f"{len(names)} files are the session '{session}' of '{subject}': {', '.join(names[:SHOWN])}"
-            values = {"n": len(names), "session": session, "person": subject, "files": ", ".join(names[:SHOWN])}
-            search.notes.append(Sentence(message, reason="session_shared", **values))
+            search.notes.append(
+                Message(
+                    "{n} files are the session '{session}' of '{person}': {files}",
+                    n=len(names),
+                    session=session,
+                    person=subject,
+                    files=names[:SHOWN],
+                )
+            )
     if mapping is not None:
         present = {name for f in rest for name in (f.name, f.relative_to(source).as_posix())}
         if missing := [name for name in mapping if name not in present]:
@@ -252,12 +260,12 @@ def scan_pattern(source: Path, options: ImportOptions, *, around: Path | None = 
             person = options.mapping.get(relative, options.mapping.get(file.name))
         try:
             for entry in tables.convert(file, name, person, place):
-                if isinstance(entry, Sentence):
+                if isinstance(entry, Message):
                     remarks.append((entry.values["file"], entry.values["note"]))
                 else:
                     search.found.append(entry)
         except FileFormatError as cause:
-            search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
+            search.found.append(SourceFile(file, "", origin=name, reason=cause.message))
     search.found += tables.origins()
     search.notes += group_flags(remarks, "files")
     if any(f.subject == UNKNOWN_SUBJECT for f in search.found):
@@ -279,7 +287,7 @@ def _add_intervals(
         try:
             tables.intervals.append(read_intervals(file, name, pattern, place))
         except FileFormatError as cause:
-            search.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
+            search.found.append(SourceFile(file, "", origin=name, reason=cause.message))
         else:
             search.found.append(SourceFile(file, LEFT_OUT, origin=name, reason="its intervals label other files"))
     return found
@@ -292,8 +300,7 @@ def scan_zip(path: Path, options: ImportOptions) -> SourceScan:
     folder.mkdir()
     refused = unpack(path, folder, options.limits)
     if any(folder.rglob(HEAD)):
-        message = f"'{path}' holds a data set: unpack it and open the folder, it needs no import."
-        raise DatasetError(message, reason="import_of_dataset", name=path.name)
+        raise DatasetError("'{path}' holds a data set: unpack it and open the folder, it needs no import.", path=path)
     options = replace(options, person=options.person or None)
     scan = scan_folder if options.pattern is None else scan_pattern
     search = scan(folder, options, around=path.resolve().parent)
@@ -322,9 +329,10 @@ def _add_xdf(path: Path, name: str, person: str | None, options: ImportOptions, 
         subject = person
     if subject is None:
         raise FileFormatError(
-            f"the person of '{name}' is not known: name the person with --subjects map.csv (file,subject), or call the "
-            "file sub-<code>_ses-<session>.xdf as LabRecorder does",
-            reason="person_unknown",
+            "the person of '{name}' is not known: name the person with --subjects map.csv (file,subject), or call "
+            "the file sub-<code>_ses-<session>.xdf as LabRecorder does",
+            name=name,
+            needs="person",
         )
     folder = options.new_folder("converted")
     choices, limits = options.columns, options.limits
@@ -404,8 +412,9 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
             scan = next((scan for ending, scan in FORMATS.items() if source.name.lower().endswith(ending)), None)
             if scan is None:
                 raise DatasetError(
-                    f"'{source}' cannot be imported: give a folder, or a file that ends in {', '.join(FORMATS)}.",
-                    reason="file_no_recording",
+                    "'{source}' cannot be imported: give a folder, or a file that ends in {formats}.",
+                    source=source,
+                    formats=", ".join(FORMATS),
                 )
             search = scan(source, options)
         else:
@@ -415,23 +424,26 @@ def scan_source(source: Path, options: ImportOptions) -> SourceScan:
     except OSError as cause:
         raise DatasetError(f"'{source}' cannot be read: {cause.strerror or cause} ({cause.filename}).") from None
     except FileFormatError as cause:
-        raise FileFormatError(f"'{source}': {cause}.", reason=cause.reason, **cause.values) from None
+        raise FileFormatError("'{source}': {cause}.", source=source, cause=cause.message) from None
     if options.streams is not None:
         find_people(search, options.streams)
     if not any(f.kind in ("recordings", "streams") for f in search.found):
         first = next((f" The first: '{f.origin}': {f.reason.rstrip('.')}." for f in search.found if f.reason), "")
-        unknown = any(getattr(f.reason, "reason", "") == "person_unknown" for f in search.found)
+        unknown = any(needs_person(f.reason) for f in search.found)
         expected = "<label>_<epoch ms>_<rows>.csv in a folder per person"
         if options.pattern is not None:
             expected = f"files that fit {', '.join(options.pattern.paths)}"
         elif search.shape == "labelled-rows":
             expected += " (or CSVs with a label column)"
+        if options.pattern is None:
+            first += " Other files can be described with --pattern FILE.toml."
         raise DatasetError(
-            f"'{source}' holds no recording: expected {expected}; found "
-            f"{plural(len(search.found), 'other file')}.{first}"
-            + ("" if options.pattern is not None else " Other files can be described with --pattern FILE.toml."),
-            reason="person_unknown" if unknown else "import_nothing",
+            "'{source}' holds no recording: expected {expected}; found {n:other file}.{first}",
+            source=source,
+            expected=expected,
             n=len(search.found),
+            first=first,
+            **({"needs": "person"} if unknown else {}),
         )
     return search
 
@@ -464,8 +476,13 @@ def propose(done: ImportSummary, adopting: bool = False, added: bool = False) ->
     if reasons:
         settings = [f"{', '.join(texts)} ({reason})" for reason, texts in reasons.items()]
         what = [text for texts in reasons.values() for text in texts]
-        message = f"adopted in the layout (--no-adopt keeps it as given): {'; '.join(settings)}"
-        done.notes.append(Sentence(message, reason="adopted", settings=what))
+        done.notes.append(
+            Message(
+                ADOPTED,
+                listed="; ".join(settings),
+                settings=what,
+            )
+        )
     if layout != head.layout:
         head = replace(head, layout=layout)
         write_file(done.dataset.path / HEAD, head.to_toml())
@@ -604,10 +621,9 @@ def import_recordings(
         raise ConfigError(f"'{dest}' lies in '{source}', which is only read: give a folder outside of it.")
     if not add_to and (dest / HEAD).is_file():
         raise DatasetError(
-            f"'{dest}' is a data set already: add to it with --add (Python: add_to=True), or give another folder; "
+            "'{path}' is a data set already: add to it with --add (Python: add_to=True), or give another folder; "
             "nothing is overwritten.",
-            reason="name_exists",
-            name=dest.name,
+            path=dest,
         )
     with _temporary_folders(dest) as new_folder:
         options = _options(

@@ -17,7 +17,7 @@ from plushsense.core.errors import BadInput, DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet, plain_label
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, STREAM_NAME, parse_name
-from plushsense.core.sentences import Sentence, plural
+from plushsense.core.sentences import Message
 from plushsense.core.toml import read_toml
 from plushsense.dataset.importing.truncation import Choice
 from plushsense.dataset.store import HEAD, RECORDINGS, STREAMS, UNKNOWN_SUBJECT, PersonInfo, read_csv_rows
@@ -101,8 +101,8 @@ def source_files(source: Path) -> list[Path]:
                 else f"'{here}' in '{source}' is a data set already: give the recorder's folder, or move it away first"
             )
             raise DatasetError(
-                f"{problem}; importing it again would mix its copies of files with its people.",
-                reason="import_of_dataset",
+                "{problem}; importing it again would mix its copies of files with its people.",
+                problem=problem,
                 name=here.name,
             )
         files += [here / name for name in sorted(names + [f for f in folders if (here / f).is_symlink()])]
@@ -138,17 +138,17 @@ def split_regular_files(files: Iterable[Path]) -> tuple[list[Path], list[SourceF
 def _refusal(path: Path) -> str:
     """Return the reason to refuse a file by its kind or name; "" if there is none."""
     if path.is_symlink():
-        return Sentence("a symbolic link is not followed", reason="file_link")
+        return Message("a symbolic link is not followed")
     if not path.is_file():
-        return Sentence("not a regular file", reason="file_link")
+        return Message("not a regular file")
     if path.name.startswith("._"):
-        return Sentence("metadata of macOS, no recording", reason="file_of_system")
+        return Message("metadata of macOS, no recording")
     try:
         path.name.encode("utf-8")
     except UnicodeEncodeError:
-        return Sentence("its name is not UTF-8: rename it", reason="file_name")
+        return Message("its name is not UTF-8: rename it")
     if any(c < " " or c == "\x7f" for c in path.name):
-        return Sentence("its name holds a control character: rename it", reason="file_name")
+        return Message("its name holds a control character: rename it")
     return ""
 
 
@@ -199,20 +199,21 @@ def _refuse_unclear_people(source: Path, files: Iterable[SourceFile], *, nested:
         if other != f.source.parent:
             a, b = (p.relative_to(source).as_posix() for p in (other, f.source.parent))
             raise DatasetError(
-                f"The person is not clear: '{a}' and '{b}' in '{source}' have the same name: {_ASK}.",
-                reason="person_twice",
+                "The person is not clear: '{a}' and '{b}' in '{source}' have the same name: {ask}.",
                 a=a,
                 b=b,
+                source=source,
+                ask=_ASK,
             )
     places = set(folders.values())
     for place in sorted(places) if nested else ():
         above = next((p for p in place.parents if p in places), None)
         if above is not None:
             raise DatasetError(
-                f"The person is not clear: '{place}' lies in '{above}', and both hold recordings: {_ASK}.",
-                reason="person_nested",
-                a=place.name,
-                b=above.name,
+                "The person is not clear: '{a}' lies in '{b}', and both hold recordings: {ask}.",
+                a=place,
+                b=above,
+                ask=_ASK,
             )
 
 
@@ -267,15 +268,15 @@ def classify_gesture_recorder(
             subject = _folder_person(path, source, person)
         if path.name.casefold() == STREAM_NAME.casefold():
             if (by_label and not person) or subject is None:
-                note = Sentence("a session stream whose person is not known", reason="person_unknown")
+                note = Message("a session stream whose person is not known", needs="person")
                 yield SourceFile(path, "", reason=note)
             else:
                 yield SourceFile(path, STREAMS, subject)
         elif parse_name(path.name) is None:
-            note = Sentence("not a recording: its name is not <label>_<epoch ms>_<rows>.csv", "file_no_recording")
+            note = Message("not a recording: its name is not <label>_<epoch ms>_<rows>.csv")
             yield SourceFile(path, "", reason=note)
         elif subject is None:
-            yield SourceFile(path, "", reason=Sentence(f"not {_where(subjects)}", reason="person_unknown"))
+            yield SourceFile(path, "", reason=Message("not {where}", where=_where(subjects), needs="person"))
         else:
             moved = not _same_gesture(named[path], labels[path], gestures)
             yield SourceFile(path, RECORDINGS, subject, gesture=labels[path] if moved else "")
@@ -296,9 +297,9 @@ def classify_labelled_rows(
         else:
             subject = _folder_person(path, source, person) if one_person or path.parent != source else person or None
         if path.suffix.lower() != ".csv":
-            yield SourceFile(path, "", reason=Sentence("not a CSV file", reason="file_no_recording"))
+            yield SourceFile(path, "", reason=Message("not a CSV file"))
         elif subject is None:
-            yield SourceFile(path, "", reason=Sentence(f"not {_where(subjects)}", reason="person_unknown"))
+            yield SourceFile(path, "", reason=Message("not {where}", where=_where(subjects), needs="person"))
         else:
             yield SourceFile(path, STREAMS, subject)
 
@@ -360,16 +361,12 @@ def read_mapping(path: Path) -> dict[str, str]:
 
 
 # Suffixes of files that the recorder leaves behind if it is killed, or is still running.
-_UNFINISHED = Sentence(
-    "not finished when the recorder stopped; its rows are in the session's stream", reason="file_unfinished"
-)
+_UNFINISHED = Message("not finished when the recorder stopped; its rows are in the session's stream")
 LEFT_OVER = {
     ".part": _UNFINISHED,
     ".new": _UNFINISHED,
-    ".torn": Sentence(
-        "damaged by a crash and renamed by the recorder; its rows are in the session's stream", reason="file_unfinished"
-    ),
-    ".lock": Sentence("a lock of the recorder", reason="file_lock"),
+    ".torn": Message("damaged by a crash and renamed by the recorder; its rows are in the session's stream"),
+    ".lock": Message("a lock of the recorder"),
 }
 
 Sessions = dict[Path, SessionHead | str]
@@ -386,13 +383,17 @@ def read_sessions(files: Iterable[Path]) -> Sessions:
             if head is not None and head.subject.strip():
                 Layout.from_dict(head.layout, "layout")
         except (BadInput, RecursionError) as cause:
-            message = f"its {SESSION_HEAD} cannot be used: {cause}"
-            sessions[path.parent] = Sentence(message, reason="session_unusable", file=SESSION_HEAD)
+            sessions[path.parent] = Message("its {file} cannot be used: {cause}", file=SESSION_HEAD, cause=cause)
             continue
         if head is not None:
-            nobody = Sentence(f"its {SESSION_HEAD} names no subject", reason="person_unknown")
+            nobody = Message("its {session_head} names no subject", session_head=SESSION_HEAD, needs="person")
             sessions[path.parent] = head if head.subject.strip() else nobody
     return sessions
+
+
+def needs_person(reason: str) -> bool:
+    """Return whether a file was refused because it is not known whose recording it is."""
+    return isinstance(reason, Message) and reason.values.get("needs") == "person"
 
 
 def session_of(path: Path, sessions: Mapping[Path, object]) -> Path | None:
@@ -416,12 +417,13 @@ def common_layout(sessions: Sessions, given: Layout | None, of: str) -> Layout |
         elif own.to_dict() != agreed.to_dict():
             other = f"'{own.name}'" if own.name != agreed.name else f"another '{own.name}'"
             raise DatasetError(
-                f"Session '{place.name}' was recorded with the layout {other}, but {of} is '{agreed.name}': "
-                "a data set has one layout, so import them apart.",
-                reason="sessions_differ",
+                "Session '{session}' was recorded with the layout {differing}, but {of} is '{other}': a data set has "
+                "one layout, so import them apart.",
                 session=place.name,
-                layout=own.name,
+                differing=other,
+                of=of,
                 other=agreed.name,
+                layout=own.name,
             )
     if agreed is not None and agreed.is_labelled and any(isinstance(h, SessionHead) for h in sessions.values()):
         raise DatasetError(
@@ -450,7 +452,7 @@ def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceF
         discarded = discarded_recordings(place)
     except (BadInput, OverflowError, RecursionError) as cause:
         # Without the log it is unknown which recordings were discarded.
-        note = Sentence(f"its {SESSION_LOG} cannot be used: {cause}", reason="session_unusable", file=SESSION_LOG)
+        note = Message("its {file} cannot be used: {cause}", file=SESSION_LOG, cause=cause)
         yield from (SourceFile(path, "", reason=note) for path in files)
         return
     stream = place / STREAM_NAME
@@ -469,28 +471,29 @@ def _find(place: Path, head: SessionHead, files: list[Path]) -> Iterator[SourceF
         elif name.endswith(SIDECAR):
             main = mains.get(path.with_suffix("").as_posix())
             if main is None:
-                note = Sentence("the sidecar of a recording that is missing", reason="file_orphan")
+                note = Message("the sidecar of a recording that is missing")
                 yield of_session(LEFT_OUT, reason=note)
             else:
                 yield of_session(COMPANIONS, beside=main)
         else:
-            note = Sentence(
-                "no file of a session: expected are recordings, sidecars, stream and log", reason="file_no_recording"
-            )
+            note = Message("no file of a session: expected are recordings, sidecars, stream and log")
             yield of_session("", reason=note)
 
 
-def moved_note(files: Iterable[SourceFile]) -> list[Sentence]:
+def moved_note(files: Iterable[SourceFile]) -> list[Message]:
     """Return a note on recordings that get the label of their folder, and not that of their name."""
     moved = [f for f in files if f.gesture]
     if not moved:
         return []
     first = f"'{(moved[0].cut or moved[0].source).name}' in '{moved[0].gesture}'"
-    message = (
-        f"{plural(len(moved), 'recording')} in the folder of another gesture than the name says (the first: {first}): "
-        "the folder's label is taken by a mark, as the authors' scripts read the label from the folder"
-    )
-    return [Sentence(message, "moved_by_label", n=len(moved), file=first)]
+    return [
+        Message(
+            "{n:recording} in the folder of another gesture than the name says (the first: {file}): the folder's "
+            "label is taken by a mark, as the authors' scripts read the label from the folder",
+            n=len(moved),
+            file=first,
+        )
+    ]
 
 
 def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:
@@ -504,12 +507,15 @@ def people_of(sessions: Sessions) -> tuple[list[PersonInfo], list[str]]:
         for key, value in values.items() if before is not None else ():
             earlier = getattr(before, key)
             if earlier and value and earlier != value:
-                message = (
-                    f"the sessions of '{head.subject}' differ in {key.replace('_', ' ')} ('{earlier}', '{value}'): "
-                    "the latest is kept"
+                notes.append(
+                    Message(
+                        "the sessions of '{person}' differ in {key} ('{old}', '{new}'): the latest is kept",
+                        person=head.subject,
+                        key=key.replace("_", " "),
+                        old=earlier,
+                        new=value,
+                    )
                 )
-                values_of = {"person": head.subject, "old": earlier, "new": value}
-                notes.append(Sentence(message, reason="person_changed", **values_of))
             values[key] = value or earlier
         people[head.subject] = PersonInfo(head.subject, values["age_group"], values["gender"], values["consent"])
     return list(people.values()), notes

@@ -105,9 +105,9 @@ class TableFile:
     pattern: ImportPattern
     place: Mapping[str, str] | None = None
 
-    def error(self, message: str, reason: str = "", **values: object) -> FileFormatError:
-        """Return the error that this file cannot be used."""
-        return FileFormatError(f"'{self.display_name}' {message}", reason=reason, **values)
+    def error(self, template: str, /, **values: object) -> FileFormatError:
+        """Return the error that this file, ``{file}`` in the template, cannot be used."""
+        return FileFormatError(template, file=self.display_name, **values)
 
     def hint(self, role: str) -> str:
         """Return how to say in which column a role stands."""
@@ -148,19 +148,16 @@ class TableFile:
             elif role in given or (role in needed and not (self.pattern.bits and role in layout.names)):
                 if not any(plain):
                     raise self.error(
-                        "begins with no line of column names: a table needs a header"
-                        + (", or names in the pattern" if self.place is not None else ""),
-                        reason="table_no_header",
-                        file=self.display_name,
+                        "'{file}' begins with no line of column names: a table needs a header{names}",
+                        names=", or names in the pattern" if self.place is not None else "",
                     )
                 listed = ", ".join(t.strip()[:30] for t in there[:20]) + (", …" if len(there) > 20 else "")
                 missing = given.get(role, role)
                 raise self.error(
-                    f"has no column '{missing}'; it has {listed}: {self.hint(role)}",
-                    reason="table_column_missing",
-                    file=self.display_name,
+                    "'{file}' has no column '{column}'; it has {there}: {hint}",
                     column=missing,
                     there=listed,
+                    hint=self.hint(role),
                 )
         return chosen
 
@@ -169,12 +166,11 @@ class TableFile:
         for name in (n.strip().casefold() for n in names):
             if name in plain:
                 if plain.count(name) > 1:
+                    or_number = f", or name them {name}#1 and {name}#2 under [columns]"
                     raise self.error(
-                        f"has two columns '{name}': rename one of them"
-                        + (f", or name them {name}#1 and {name}#2 under [columns]" if self.place is not None else ""),
-                        reason="column_twice",
-                        file=self.display_name,
+                        "'{file}' has two columns '{column}': rename one of them{or_number}",
                         column=name,
+                        or_number=or_number if self.place is not None else "",
                     )
                 return plain.index(name)
             base, sign, number = name.rpartition("#")
@@ -337,11 +333,12 @@ def read_csv(file: TableFile) -> ImportedColumns:
                 # Rows that are left out have taken their time too.
                 row_number += 1
     except UnicodeError:
-        message = f"is not {pattern.encoding.upper()}: save it as UTF-8"
         hint = ", or name its encoding in the pattern" if file.place is not None else ""
-        raise file.error(message + hint, reason="table_not_utf8", file=file.display_name) from None
+        raise file.error(
+            "'{file}' is not {encoding}: save it as UTF-8{hint}", encoding=pattern.encoding.upper(), hint=hint
+        ) from None
     except csv.Error as cause:
-        raise file.error(f"is no CSV table: {cause}", reason="table_damaged", file=file.display_name) from None
+        raise file.error("'{file}' is no CSV table: {cause}", cause=cause) from None
     return rows.columns(numbers)
 
 
@@ -400,7 +397,9 @@ def _bit_column(file: TableFile, name: str, there: Sequence[str]) -> int:
     at = file.column_index((name,), [t.strip().casefold() for t in there])
     if at is None:
         listed = ", ".join(filter(None, (t.strip()[:30] for t in there[:20]))) or "no names"
-        raise file.error(f"has no column '{name}', which bits names; it has {listed}", reason="")
+        raise file.error(
+            "'{file}' has no column '{column}', which bits names; it has {there}", column=name, there=listed
+        )
     return at
 
 
@@ -410,7 +409,7 @@ def read_json(file: TableFile) -> ImportedColumns:
     try:
         text = path.read_text(encoding=file.pattern.text_encoding)
     except UnicodeError:
-        raise file.error("is not UTF-8: save it as UTF-8", reason="table_not_utf8", file=file.display_name) from None
+        raise file.error("'{file}' is not {encoding}: save it as UTF-8{hint}", encoding="UTF-8", hint="") from None
     try:
         objects = one_recording_each(json_objects(text))
         first = next((item for _, item in objects if isinstance(item, dict)), None)
@@ -620,10 +619,9 @@ def _cell(value: Any, at: int) -> str:
 
 def read_parquet(file: TableFile) -> ImportedColumns:
     """Read a Parquet table with polars; each value of a list becomes a row, and a row of lists a recording."""
-    name = file.display_name
     with file.path.open("rb") as opened:
         if opened.read(4) != b"PAR1":
-            raise file.error("is no Parquet file: it does not begin with PAR1", reason="table_damaged", file=name)
+            raise file.error("'{file}' is no Parquet file: it does not begin with PAR1")
     pattern = file.pattern
     if pattern.bits or pattern.missing:
         key = "bits" if pattern.bits else "missing"
@@ -642,8 +640,7 @@ def read_parquet(file: TableFile) -> ImportedColumns:
             names.setdefault("recording", row)
         nested = next((n for n in table.columns if table[n].dtype.is_nested()), None)
         if nested is not None:
-            message = f"has more than one value in a cell of column '{nested}'"
-            raise file.error(message, reason="table_damaged", file=name)
+            raise file.error("'{file}' has more than one value in a cell of column '{column}'", column=nested)
         texts = {
             r: [text.strip() for text in table[n].cast(pl.String).fill_null("").to_list()]
             for r, n in names.items()
@@ -660,7 +657,7 @@ def read_parquet(file: TableFile) -> ImportedColumns:
         if not isinstance(cause, Exception) and type(cause).__name__ != "PanicException":
             raise
         message = " ".join(str(cause).split())[:120] or type(cause).__name__
-        raise file.error(f"cannot be read as Parquet: {message}", reason="table_damaged", file=name) from None
+        raise file.error("'{file}' cannot be read as Parquet: {why}", why=message) from None
     if pattern.row_rate_hz:
         numbers["time"] = np.arange(len(table), dtype=np.float64) * (1000.0 / pattern.row_rate_hz)
         names["time"], in_ms = "row number", True

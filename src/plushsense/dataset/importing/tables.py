@@ -36,7 +36,7 @@ from plushsense.core.recorder_csv import (
     parse_name,
     recording_filename,
 )
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.files import sha256_of
 from plushsense.dataset.importing.intervals import IntervalFile, label_rows
 from plushsense.dataset.importing.pattern import UNITS, ImportPattern
@@ -94,10 +94,9 @@ def whole_steps(values: NDArray[np.float64], layout: Layout) -> tuple[NDArray[np
         between = np.mean(np.abs(scaled - rounded) > _BETWEEN, axis=0) > 0.1
         coarse = between & (np.std(scaled, axis=0) < _FEW_STEPS)
         if names := ", ".join(f"'{n}'" for n, is_coarse in zip(layout.names, coarse, strict=True) if is_coarse):
-            warning = Sentence(
-                f"{names}: the values are small fractions of the step of layout '{layout.name}' and were rounded to "
-                "it: give a layout with a smaller step",
-                reason="values_rounded",
+            warning = Message(
+                "{columns}: the values are small fractions of the step of layout '{layout}' and were rounded to it: "
+                "give a layout with a smaller step",
                 columns=names,
                 layout=layout.name,
             )
@@ -157,7 +156,7 @@ def write_session(
             at_ms += 1
         names.add(path.name)
         if len(path.name.encode("utf-8")) > LONGEST_LABEL:
-            note = Sentence("its label is too long for a file name", reason="label_too_long")
+            note = Message("its label is too long for a file name")
             yield SourceFile(path, "", origin=name, reason=note)
             continue
         # Nothing is lost if these temporary files are: they need not be on the disk before the import copies them.
@@ -171,9 +170,9 @@ def write_session(
     yield SourceFile(about, COMPANIONS, subject, session=session, origin=f"{where}, {ORIGIN}", beside=main)
 
 
-def about_file(name: str, note: str) -> Sentence:
+def about_file(name: str, note: str) -> Message:
     """Return a note about the file ``name``."""
-    return Sentence(f"{name}: {note}", reason="about_file", file=name, note=note)
+    return Message("{file}: {note}", file=name, note=note)
 
 
 def _codes(texts: Iterable[str]) -> tuple[NDArray[np.int64], list[str]]:
@@ -225,7 +224,7 @@ class TableImport:
 
     def convert(
         self, path: Path, display_name: str, person: str | None, place: Mapping[str, str] | None = None
-    ) -> Iterator[SourceFile | Sentence]:
+    ) -> Iterator[SourceFile | Message]:
         """Write the recordings of a table; yield the files, and warnings as `about_file` makes them.
 
         ``place`` are the parts of the path, None without a pattern, when each session gets its ``origin.json`` at once.
@@ -237,23 +236,21 @@ class TableImport:
         table = TableFile(path, display_name, self.layout, self.pattern, place)
         columns = read_rows(table)
         place = place or {}
-        notes: list[Sentence] = []
+        notes: list[Message] = []
         if self.pattern.intervals:
             columns = self._labelled(table, columns, notes)
         subject = place.get("subject", person)
         if "subject" not in columns.names and subject is None:
             raise table.error(
-                f"has no column 'subject': {table.hint('subject')}, or the person with --subjects map.csv "
-                "(file,subject)",
-                reason="person_unknown",
+                "'{file}' has no column 'subject': {hint}, or the person with --subjects map.csv (file,subject)",
+                hint=table.hint("subject"),
+                needs="person",
             )
         samples = self._samples(table, columns, subject or "", notes)
         yield from notes
         if not len(samples.frames):
             raise table.error(
-                f"has no usable row: each needs a subject, a time and {self.layout.n_channels} numbers",
-                reason="rows_unusable",
-                n=self.layout.n_channels,
+                "'{file}' has no usable row: each needs a subject, a time and {n} numbers", n=self.layout.n_channels
             )
         group = samples.person * len(samples.sessions) + samples.session
         order = np.argsort(group, kind="stable")
@@ -269,7 +266,7 @@ class TableImport:
                 mine = mine[moved]
             yield from self._write(table, original, samples, mine, apart)
 
-    def _labelled(self, table: TableFile, columns: ImportedColumns, notes: list[Sentence]) -> ImportedColumns:
+    def _labelled(self, table: TableFile, columns: ImportedColumns, notes: list[Message]) -> ImportedColumns:
         """Label the rows of a table by the file of intervals that belongs to it."""
         mine = [intervals for intervals in self.intervals if intervals.fits(table.place or {})]
         if len(mine) != 1:
@@ -284,9 +281,7 @@ class TableImport:
         notes += [about_file(table.display_name, note) for note in found]
         return labelled
 
-    def _samples(
-        self, table: TableFile, columns: ImportedColumns, subject: str, notes: list[Sentence]
-    ) -> _TableSamples:
+    def _samples(self, table: TableFile, columns: ImportedColumns, subject: str, notes: list[Message]) -> _TableSamples:
         """Return the usable rows of a table as samples; add what is to be said about the file to ``notes``."""
         name, place = table.display_name, table.place or {}
         times = columns.numbers["time"]
@@ -338,7 +333,7 @@ class TableImport:
 
     def _write(
         self, table: TableFile, original: ConvertedSource, samples: _TableSamples, mine: NDArray[np.int64], apart: bool
-    ) -> Iterator[SourceFile | Sentence]:
+    ) -> Iterator[SourceFile | Message]:
         """Write the session whose rows are ``mine``; ``apart``: the file itself tells its recordings apart."""
         every = samples.frames
         assert every.host_ms is not None
@@ -400,16 +395,22 @@ class TableImport:
         gap_ms = max(self.layout.gap_ms, SLOW_FACTOR * float(np.median(forward)))
         return float(np.mean((steps[new] > 0) & (steps[new] <= gap_ms))) > 0.5
 
-    def _short(self, source: str, recordings: Sequence[NDArray[np.int64]]) -> Iterator[Sentence]:
+    def _short(self, source: str, recordings: Sequence[NDArray[np.int64]]) -> Iterator[Message]:
         """Yield a note about recordings, given as the numbers of their rows, with fewer than ``recording_rows``."""
         count = sum(int(np.ptp(rows)) + 1 < self.pattern.recording_rows for rows in recordings)
         if count:
             n = self.pattern.recording_rows
-            message = f"{count} of {len(recordings)} recordings have fewer than {n} rows: is recording_rows right?"
-            values = {"n": count, "of": len(recordings), "rows": n}
-            yield about_file(source, Sentence(message, reason="recordings_cut_short", **values))
+            yield about_file(
+                source,
+                Message(
+                    "{n} of {of} recordings have fewer than {rows} rows: is recording_rows right?",
+                    n=count,
+                    of=len(recordings),
+                    rows=n,
+                ),
+            )
 
-    def _merged(self, source: str, labels: Sequence[str]) -> Iterator[Sentence]:
+    def _merged(self, source: str, labels: Sequence[str]) -> Iterator[Message]:
         """Yield a note for each label that becomes the same as another one, for want of characters in file names."""
         for label in labels:
             name = parse_name(recording_filename(label, 0, 0))
@@ -438,8 +439,13 @@ class TableImport:
         suggests = len(forward_steps(times)) > 0 and not rows_at_one_time(times[np.isfinite(times)])
         why = f", as the rate of {self.layout.rate_hz:g} Hz suggests" if suggests else ""
         unit = unit if suggests else "ms"
-        message = f"column '{name}' is read as {unit if suggests else 'milliseconds'}{why}"
-        return UNITS[unit], Sentence(message, reason="time_unit", column=name, unit=unit)
+        return UNITS[unit], Message(
+            "column '{column}' is read as {read_as}{why}",
+            column=name,
+            read_as=unit if suggests else "milliseconds",
+            why=why,
+            unit=unit,
+        )
 
     def origins(self) -> Iterator[SourceFile]:
         """Write ``origin.json`` of each session that was converted with a pattern, with the original names."""
@@ -453,7 +459,7 @@ class TableImport:
 
 def _left_out(
     table: TableFile, columns: ImportedColumns, good: NDArray[np.bool_], known: NDArray[np.bool_]
-) -> Iterator[Sentence]:
+) -> Iterator[Message]:
     """Yield notes about the rows that are not used, with the line of the first of each kind."""
 
     def first(bad: NDArray[np.bool_]) -> str:
@@ -467,26 +473,40 @@ def _left_out(
     ):
         if count:
             at = f" (the first: {where})" if where else ""
-            message = f"{count} row{'s' if count > 1 else ''} {reason} left out{at}"
-            yield about_file(table.display_name, Sentence(message, reason="rows_left_out", n=count))
+            yield about_file(
+                table.display_name,
+                Message(
+                    "{n} row{more} {reason} left out{at}", n=count, more="s" if count > 1 else "", reason=reason, at=at
+                ),
+            )
 
 
-def _too_fine(table: TableFile, columns: ImportedColumns, device: NDArray[np.float64]) -> Iterator[Sentence]:
+def _too_fine(table: TableFile, columns: ImportedColumns, device: NDArray[np.float64]) -> Iterator[Message]:
     """Yield a note if the times in ``device`` (T,), in ms, would stand still since they are kept in whole ms."""
     steps = forward_steps(device)
     if len(steps) and float(np.median(steps)) < _FINEST_MS:
         name, step = columns.names["time"], float(np.median(steps))
-        message = f"by column '{name}', rows are {step:g} ms apart, but times are kept in whole ms: is its unit right?"
-        yield about_file(table.display_name, Sentence(message, reason="time_too_fine", column=name))
+        yield about_file(
+            table.display_name,
+            Message(
+                "by column '{column}', rows are {step:g} ms apart, but times are kept in whole ms: is its unit right?",
+                column=name,
+                step=step,
+            ),
+        )
 
 
-def _blocks(table: TableFile, columns: ImportedColumns) -> Iterator[Sentence]:
+def _blocks(table: TableFile, columns: ImportedColumns) -> Iterator[Message]:
     """Yield a note about the blocks of rows, if a table has several."""
     count = int(columns.block_of_row.max(initial=0)) + 1
     if count > 1:
         join = ': between = "none" in the pattern joins them' if table.place is not None else ""
-        message = (
-            f"{count} blocks of rows, separated by empty lines, comments or repeated column names, are recordings of "
-            f"their own{join}"
+        yield about_file(
+            table.display_name,
+            Message(
+                "{n} blocks of rows, separated by empty lines, comments or repeated column names, are recordings of "
+                "their own{join}",
+                n=count,
+                join=join,
+            ),
         )
-        yield about_file(table.display_name, Sentence(message, reason="blocks_of_rows", n=count))

@@ -15,7 +15,7 @@ from pathlib import Path, PureWindowsPath
 
 from plushsense.core.errors import DatasetError
 from plushsense.core.recorder_csv import parse_name
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.marks import BY_HAND, Mark, MarkState
 from plushsense.dataset.store import RecordingInfo, read_csv_rows
 
@@ -23,7 +23,7 @@ CHOICES = "truncate_choices.csv"
 _BACKUP = re.compile(r"training data - backup \d{4}-\d\d-\d\d_\d{6}", re.IGNORECASE)
 # The person who chose is not in the files.
 IMPORTER = "plushsense import"
-CHOSEN = Sentence("no recording: its choices become marks of the recordings", "choices_read")
+CHOSEN = Message("no recording: its choices become marks of the recordings")
 _COLUMNS = ("filename", "fullpath", "length", "truncaten")
 
 
@@ -54,7 +54,7 @@ class Backups:
 
     kept: list[Path]
     originals: dict[Path, Path] = field(default_factory=dict)
-    left_out: dict[Path, Sentence] = field(default_factory=dict)
+    left_out: dict[Path, Message] = field(default_factory=dict)
     choices: list[Choice] = field(default_factory=list)
 
     @classmethod
@@ -198,15 +198,15 @@ def _notes(results: Mapping[str, int]) -> Iterator[str]:
         yield f"cuts of the truncation script, how many rows to cut off at the beginning: {parts}"
 
 
-def _copy_of(backup: str) -> Sentence:
+def _copy_of(backup: str) -> Message:
     """Return why a recording in the folder ``backup`` is left out."""
-    return Sentence(f"a copy, in '{backup}', of a recording that is imported", "backup_copy", folder=backup)
+    return Message("a copy, in '{folder}', of a recording that is imported", folder=backup)
 
 
-REPLACED = Sentence("cut by the truncation script: its uncut original is imported, and the cut is a mark", "cut_copy")
+REPLACED = Message("cut by the truncation script: its uncut original is imported, and the cut is a mark")
 
 
-def choices_of(source: Path, files: Iterable[Path]) -> tuple[list[Choice], dict[Path, Sentence | None], list[Sentence]]:
+def choices_of(source: Path, files: Iterable[Path]) -> tuple[list[Choice], dict[Path, Message | None], list[Message]]:
     """Read the choices of the truncation script in ``source``, or beside it, where the script writes them.
 
     Returns:
@@ -216,15 +216,16 @@ def choices_of(source: Path, files: Iterable[Path]) -> tuple[list[Choice], dict[
     inside = [f for f in files if f.name.casefold() == CHOICES]
     beside = source.resolve().parent / CHOICES
     choices: list[Choice] = []
-    read: dict[Path, Sentence | None] = dict.fromkeys(inside)
-    notes: list[Sentence] = []
+    read: dict[Path, Message | None] = dict.fromkeys(inside)
+    notes: list[Message] = []
     for path in inside or ([beside] if beside.is_file() else []):
         try:
             choices += read_choices(path)
         except DatasetError as cause:
             if path in read:
-                read[path] = Sentence.of(cause)
+                read[path] = cause.message
             else:
-                message = f"no trims are taken from the file beside the folder: {cause}"
-                notes.append(Sentence(message, "choices_unread", file=path.name))
+                notes.append(
+                    Message("no trims are taken from the file beside the folder: {cause}", cause=cause, file=path.name)
+                )
     return choices, read, notes

@@ -27,7 +27,7 @@ from plushsense.core.errors import ConfigError, FileFormatError, need
 from plushsense.core.gestures import GestureSet
 from plushsense.core.layouts import DEVICE_MS, Layout, StreamColumns
 from plushsense.core.recorder_csv import Frames
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.markers import Marker, MarkerCuts, cut_by_markers, read_marker
 from plushsense.dataset.importing.pattern import MARKERS_ROLE, STREAM_ROLE
@@ -162,8 +162,9 @@ def complete_chunks(path: Path, name: str) -> tuple[int, int]:
     widths: dict[int, int] = {}
     with path.open("rb") as file:
         if file.read(4) != _MAGIC:
-            message = f"'{name}' is no XDF file: it does not begin with {_MAGIC.decode()}"
-            raise FileFormatError(message, reason="xdf_damaged", file=name)
+            raise FileFormatError(
+                "'{file}' is no XDF file: it does not begin with {decode}", file=name, decode=_MAGIC.decode()
+            )
         good = 4
         while good < size:
             try:
@@ -225,8 +226,7 @@ def _load(path: Path, length: int, name: str) -> list[XdfStream]:
             streams, _ = pyxdf.load_xdf(file, dejitter_timestamps=False)
         except Exception as cause:  # noqa: BLE001, RUF100
             message = " ".join(str(cause).split())[:120] or type(cause).__name__
-            message = f"'{name}' cannot be read as XDF: {message}"
-            raise FileFormatError(message, reason="xdf_damaged", file=name) from None
+            raise FileFormatError("'{file}' cannot be read as XDF: {message}", file=name, message=message) from None
     return [XdfStream.of(stream) for stream in streams]
 
 
@@ -265,12 +265,11 @@ def _joined(streams: Sequence[XdfStream]) -> tuple[XdfStream, str] | None:
         clock = np.concatenate([whole.clock, whole.clock[-1] + stream.clock[n:]])
         samples = np.concatenate([whole.samples, stream.samples[n:]])
         whole = replace(whole, times_s=times, clock=clock, samples=samples)
-    note = f"the stream '{whole.name}' is in the file {len(streams)} times"
-    if again:
-        note += ", with equal rows: they are used once"
+    how = ", with equal rows: they are used once" if again else ""
     if gaps:
-        note += f", one after another: joined, with gaps of {', '.join(f'{gap:.3g} s' for gap in gaps[:5])}"
-    return whole, Sentence(note, reason="xdf_joined", stream=whole.name, n=len(streams))
+        how += f", one after another: joined, with gaps of {', '.join(f'{gap:.3g} s' for gap in gaps[:5])}"
+    template = "the stream '{stream}' is in the file {n} times{how}"
+    return whole, Message(template, stream=whole.name, n=len(streams), how=how)
 
 
 def _renamed(labels: Sequence[str], channels: Mapping[str, str]) -> list[str]:
@@ -321,18 +320,25 @@ def _find_toy(streams: Sequence[XdfStream], layout: Layout, choices: Mapping[str
         remedy = (
             f"; --column {layout.names[0]}=LABEL names the label of a channel" if any(s.labels for s in streams) else ""
         )
-        message = f"no stream fits layout '{layout.name}': {reasons}{remedy}"
-        raise FileFormatError(message, reason="xdf_streams", n=0, layout=layout.name)
+        raise FileFormatError(
+            "no stream fits layout '{layout}': {reasons}{remedy}",
+            layout=layout.name,
+            reasons=reasons,
+            remedy=remedy,
+            n=0,
+        )
     found = [stream for stream, _ in fitting]
     one_source = len({(s.name, s.source, s.format, tuple(s.labels)) for s in found}) == 1
     joined = _joined(found) if len(found) > 1 and one_source else None
     if len(found) > 1 and joined is None:
         listed = ", ".join(f"{s}{f', source {s.source!r}' if s.source else ''}" for s in found[:6])
-        message = (
-            f"{len(found)} streams fit layout '{layout.name}': {listed}; choose one with --column stream=NAME or "
-            f"stream=#{found[0].number}"
+        raise FileFormatError(
+            "{n} streams fit layout '{layout}': {listed}; choose one with --column stream=NAME or stream=#{number}",
+            n=len(found),
+            layout=layout.name,
+            listed=listed,
+            number=found[0].number,
         )
-        raise FileFormatError(message, reason="xdf_streams", n=len(found), layout=layout.name)
     stream, notes = (joined[0], [joined[1]]) if joined else (found[0], [])
     notes += [about_file(f"stream {stream}", note) for note in fitting[0][1].notes]
     return _Toy(stream, fitting[0][1], notes, others)
@@ -372,8 +378,12 @@ def _find_markers(
         why = (
             f"no stream '{choice}' has markers" if choice else f"{len(chosen)} streams have texts that may be gestures"
         )
-        message = f"{why} (there are {listed or 'none'}): choose one with --column markers=NAME or markers=#NUMBER"
-        raise FileFormatError(message, reason="xdf_marker_streams", streams=listed)
+        raise FileFormatError(
+            "{why} (there are {listed}): choose one with --column markers=NAME or markers=#NUMBER",
+            why=why,
+            listed=listed or "none",
+            streams=listed,
+        )
     others = {s.number: "it is not the stream of markers" for s in events if s.is_text and chosen}
     others |= {s.number: "" for s in chosen}
     markers: list[Marker] = []
@@ -402,8 +412,7 @@ def _frames(toy: _Toy, layout: Layout) -> tuple[Frames, NDArray[np.float64], lis
     device = times * 1000.0 if columns.clock is None else series[:, columns.clock]
     good = usable_rows(series[:, columns.channels], times * 1000.0, device)
     if lost := int(np.sum(~good)):
-        message = f"{lost} samples without a number in every channel left out"
-        toy.notes.append(Sentence(message, reason="rows_left_out", n=lost))
+        toy.notes.append(Message("{n} samples without a number in every channel left out", n=lost))
     values, warning = whole_steps(series[good][:, columns.channels], layout)
     toy.notes += [warning] if warning else []
     host_ms = np.round(times[good] * 1000.0).astype(np.int64)
@@ -417,20 +426,21 @@ def _quoted(texts: Iterable[str]) -> str:
     return ", ".join(f"'{text[:40]}'" for text in few[:8]) + (", …" if len(few) > 8 else "")
 
 
-def _about_cuts(cuts: MarkerCuts, hint: str) -> Iterator[Sentence]:
+_CUTS = (
+    "{n} markers name no gesture and begin no recording: {markers}",
+    "{n} markers end a recording; a gesture set can make them a gesture (--gestures FILE): {markers}",
+    "{n} markers name a gesture where the stream has no samples, and give no recording: {markers}",
+    "{n} recordings are cut short by the stream or a marker that names no gesture: {markers}",
+)
+
+
+def _about_cuts(cuts: MarkerCuts, hint: str) -> Iterator[Message]:
     """Yield what is to be said about markers that give no recording, or not quite."""
-    for texts, reason, message in (
-        (cuts.unknown, "xdf_markers", "markers name no gesture and begin no recording"),
-        (cuts.zeros, "xdf_zeros", "markers end a recording; a gesture set can make them a gesture (--gestures FILE)"),
-        (cuts.empty, "xdf_empty", "markers name a gesture where the stream has no samples, and give no recording"),
-        (cuts.shortened, "xdf_shortened", "recordings are cut short by the stream or a marker that names no gesture"),
-    ):
+    for texts, template in zip((cuts.unknown, cuts.zeros, cuts.empty, cuts.shortened), _CUTS, strict=True):
         if texts:
-            listed = _quoted(texts)
-            yield Sentence(f"{len(texts)} {message}: {listed}", reason=reason, n=len(texts), markers=listed)
+            yield Message(template, n=len(texts), markers=_quoted(texts))
     if not cuts.segments:
-        message = f"no marker gives a recording{hint}"
-        yield Sentence(message, reason="xdf_no_gesture")
+        yield Message("no marker gives a recording{hint}", hint=hint)
 
 
 def read_xdf(
@@ -462,8 +472,12 @@ def read_xdf(
     good, size = complete_chunks(plain, display_name)
     streams = _load(plain, good, display_name)
     if good < size:
-        message = f"{display_name}: cut off or damaged from byte {good} of {size} on; the bytes before are used"
-        yield Sentence(message, reason="xdf_cut", file=display_name)
+        yield Message(
+            "{file}: cut off or damaged from byte {good} of {size} on; the bytes before are used",
+            file=display_name,
+            good=good,
+            size=size,
+        )
     toy = _find_toy([s for s in streams if not s.is_text], layout, choices)
     events = [s for s in streams if s.is_text or s.name != toy.stream.name]
     markers, others, hint = _find_markers(events, gestures, choices.get(MARKERS_ROLE, ""))
@@ -472,8 +486,11 @@ def read_xdf(
     cuts = cut_by_markers(markers, times, resets, tolerance_s) if len(times) else MarkerCuts()
     yield from (about_file(display_name, note) for note in [*toy.notes, *_about_cuts(cuts, hint)])
     if not len(frames):
-        message = f"the stream '{toy.stream.name}' has no sample with a number in every channel"
-        raise FileFormatError(message, reason="rows_unusable", n=layout.n_channels)
+        raise FileFormatError(
+            "the stream '{stream}' has no sample with a number in every channel",
+            stream=toy.stream.name,
+            n=layout.n_channels,
+        )
     about = {"stream": toy.stream.name, "type": toy.stream.type, "nominal_rate_hz": toy.stream.rate}
     original = ConvertedSource(path, display_name, about)
     yield from write_session(

@@ -144,13 +144,12 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
     folder = Path(dataset)
     DatasetHead.read(folder)
     if not subject.strip():
-        message = "No person was named: give the code of one, as  plushsense info  shows it."
-        raise DatasetError(message, reason="forget_nobody")
+        raise DatasetError("No person was named: give the code of one, as  plushsense info  shows it.")
     table = read_people(folder)
     if subject in (NOBODY, UNKNOWN_SUBJECT):
         raise DatasetError(
-            f"'{subject}' is no person, but the folder of recordings without one: exclude such recordings by a mark.",
-            reason="forget_nobody",
+            "'{subject}' is no person, but the folder of recordings without one: exclude such recordings by a mark.",
+            subject=subject,
         )
     files = list_files(folder)
     own = [f for f in files if f.person == subject]
@@ -158,9 +157,9 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
     intent = _read_intent(folder)
     if intent is not None and intent.subject != subject:
         raise DatasetError(
-            f"The removal of another person from '{folder}' was interrupted: finish it first, with  "
-            f"plushsense forget {folder} {intent.subject} --yes",
-            reason="forget_interrupted",
+            "The removal of another person from '{folder}' was interrupted: finish it first, with  plushsense forget "
+            "{folder} {person} --yes",
+            folder=folder,
             person=intent.subject,
         )
     # An incomplete line or another spelling is not enough: the code must be exact, since the removal is permanent.
@@ -173,17 +172,20 @@ def plan_removal(dataset: str | Path, subject: str) -> RemovalPlan:
         # Codes of removed people are not stored, so an unknown code may be one of them, but not another spelling.
         if not _record_lines(folder) or match_code(subject, known):
             raise DatasetError(
-                f"'{folder}' knows no person '{subject}': it knows {', '.join(known) or 'nobody'}."
-                f"{nearest(subject, known)}",
-                reason="forget_unknown",
+                "'{folder}' knows no person '{subject}': it knows {known}.{hint}",
+                folder=folder,
+                subject=subject,
+                known=", ".join(known) or "nobody",
+                hint=nearest(subject, known),
             )
     lost = [f for f in missing_files(folder) if PurePosixPath(f).parts[1] != subject]
     if intent is None and lost and not absent:
         raise DatasetError(
-            f"'{folder}' lacks {len(lost)} raw file{'s' if len(lost) > 1 else ''} of other people ('{lost[0]}'): "
-            "restore them first, since the removal deletes the list that they are missing from.",
-            reason="forget_missing",
+            "'{folder}' lacks {n} raw file{more} of other people ('{file}'): restore them first, since the removal "
+            "deletes the list that they are missing from.",
+            folder=folder,
             n=len(lost),
+            more="s" if len(lost) > 1 else "",
             file=lost[0],
         )
     leftovers, running = _leftovers(folder, files)
@@ -303,15 +305,16 @@ def forget(dataset: str | Path, subject: str) -> RemovalPlan:
                 _finish(folder, intent)
     except Timeout:
         raise DatasetError(
-            f"An import is adding to '{folder}' now, and nothing was removed: wait until it ends, or end it, then give "
-            "the command again.",
-            reason="import_runs",
+            "An import is adding to '{folder}' now, and nothing was removed: wait until it ends, or end it, then "
+            "give the command again.",
+            folder=folder,
         ) from None
     except OSError as cause:
         raise DatasetError(
-            f"'{cause.filename or folder}' cannot be changed ({cause.strerror or cause}): close the programs that use "
-            "it, check that you may write there, then give the same command again to finish.",
-            reason="forget_locked",
+            "'{why}' cannot be changed ({cause}): close the programs that use it, check that you may write there, "
+            "then give the same command again to finish.",
+            why=cause.filename or folder,
+            cause=cause.strerror or cause,
             file=cause.filename or folder.name,
         ) from None
     # The removal is complete even if the data set has other problems; opening it later reports them.

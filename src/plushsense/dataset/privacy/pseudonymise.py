@@ -22,7 +22,7 @@ from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, Layout
 from plushsense.core.recorder_csv import ReadResult, parse_name, read_recording, read_stream
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.files import STAMP, DatasetFile, list_files, match_code, person_folders
 from plushsense.dataset.index import DUPLICATE_FOLDER, build_index, open_dataset, write_index_files
 from plushsense.dataset.marks import MARKS
@@ -124,10 +124,10 @@ def pseudonymise(
             return _Pseudonymisation(source, key, words, drop_notes, progress).run(dest)
     except OSError as cause:
         raise DatasetError(
-            f"'{cause.filename or folder}' cannot be used ({cause.strerror or cause}): check the path and the disk.",
-            reason="not_readable",
+            "'{file}' cannot be used ({why}): check the path and the disk.",
+            file=cause.filename or folder,
+            why=cause.strerror or cause,
             name=folder.name,
-            why=cause.strerror or str(cause),
         ) from None
 
 
@@ -185,8 +185,7 @@ class _Pseudonymisation:
         self.files = sorted(files, key=lambda c: (self._pseudonym(c.person).code if c.person else "", c.path))
         if self.names.too_short:
             listed = _listed(self.names.too_short)
-            message = f"too short to be searched in texts: {listed}; read the notes"
-            self.notes.add("", Sentence(message, "names_too_short", listed=listed))
+            self.notes.add("", Message("too short to be searched in texts: {listed}; read the notes", listed=listed))
 
     def _pseudonym(self, person: str) -> Pseudonym:
         return self.codes.get(person) or self.codes[match_code(person, self.people) or NOBODY]
@@ -206,24 +205,28 @@ class _Pseudonymisation:
             old = [p for p in self.people if p not in KEPT]
             for file, name in find_traces(work, old, self.names, times):
                 raise DatasetError(
-                    f"'{file}' would still hold '{name}': nothing was written. If that is a gesture or another word of "
-                    "the data, rename the person or the gesture first; if the file does not belong there, remove it.",
-                    reason="name_remains",
+                    "'{file}' would still hold '{name}': nothing was written. If that is a gesture or another word "
+                    "of the data, rename the person or the gesture first; if the file does not belong there, remove "
+                    "it.",
                     file=file,
                     name=name,
                 )
             files = len(list_files(work))
         if self.notes.prose:
-            message = f"{self.notes.prose} notes in free text were kept: names are replaced, but read them"
-            self.notes.add("", Sentence(message, "free_text_kept", n=self.notes.prose))
+            self.notes.add(
+                "", Message("{n} notes in free text were kept: names are replaced, but read them", n=self.notes.prose)
+            )
         words = sorted({s for new in self.moved.values() for s in PurePosixPath(new).parts[2:-1] if _in_words(s)})
         if words:
             listed = _listed(words)
-            message = (
-                f"names of sessions that are words stay as they are: {listed}; if one identifies a person, add it to "
-                "--words"
+            self.notes.add(
+                "",
+                Message(
+                    "names of sessions that are words stay as they are: {listed}; if one identifies a person, add it "
+                    "to --words",
+                    listed=listed,
+                ),
             )
-            self.notes.add("", Sentence(message, "session_names_kept", listed=listed))
         result = Dataset(dest, made.head, made.recordings, made.streams)
         return PseudonymisationResult(result, files, self.notes.merged(), self.key)
 
@@ -251,8 +254,7 @@ class _Pseudonymisation:
             times += clocks.values()
             if not _same(before, reader(target, self.source.layout), clocks, shift_ms):
                 raise DatasetError(
-                    f"The times in '{content.path}' cannot be shifted alone, so nothing was written: exclude it.",
-                    reason="times_not_shifted",
+                    "The times in '{file}' cannot be shifted alone, so nothing was written: exclude it.",
                     file=content.path,
                 )
             if self.progress is not None:
@@ -273,8 +275,12 @@ class _Pseudonymisation:
         for content in self.files:
             path = self.folder / content.path
             if content.path.name == ORIGIN:
-                message = f"'{ORIGIN}' of a converted file was left out: it names the file that it came from"
-                self.notes.add("", Sentence(message, "origin_left_out", file=ORIGIN))
+                self.notes.add(
+                    "",
+                    Message(
+                        "'{file}' of a converted file was left out: it names the file that it came from", file=ORIGIN
+                    ),
+                )
             elif content.kind == "words" and content.person:
                 new = self._place(content)
                 text = redact_json(path, new.as_posix(), self._words(content.person))
@@ -291,8 +297,9 @@ class _Pseudonymisation:
             elif content.kind in ("other", "link", "words"):
                 left.append(content.path.as_posix())
         if left:
-            message = f"not copied, since their contents are not known: {_listed(left)}"
-            self.notes.add("", Sentence(message, "files_not_copied", listed=_listed(left)))
+            self.notes.add(
+                "", Message("not copied, since their contents are not known: {listed}", listed=_listed(left))
+            )
 
     def _words_of_id(self, identity: str) -> Redactor | None:
         if not identity:
@@ -320,16 +327,19 @@ class _Pseudonymisation:
         wrong = sorted(old.keys() ^ new.keys()) or [i for i in old if not self._agrees(old[i], new[i])]
         if wrong or len(made.streams) != len(self.source.streams):
             raise DatasetError(
-                f"The new data set would differ from the old one ({_listed(wrong)}): report it.", reason="copy_differs"
+                "The new data set would differ from the old one ({listed}): report it.", listed=_listed(wrong)
             )
         across = [r for r in self.source.recordings for f in r.flags if f.startswith(_SAME)]
         lost = [r for r in across if not any(f.startswith(_SAME) for f in new[self._renamed(r.id)].flags)]
         if lost:
-            message = (
-                f"{len(lost)} recordings have the same content as one of another person, which their different shifts "
-                "of time now hide: check them in the original"
+            self.notes.add(
+                "",
+                Message(
+                    "{n} recordings have the same content as one of another person, which their different shifts of "
+                    "time now hide: check them in the original",
+                    n=len(lost),
+                ),
             )
-            self.notes.add("", Sentence(message, "same_content_hidden", n=len(lost)))
 
     def _agrees(self, old: RecordingInfo, new: RecordingInfo) -> bool:
         def facts(r: RecordingInfo) -> tuple[Any, ...]:

@@ -246,31 +246,31 @@ def read_key(path: Path) -> dict[str, Pseudonym]:
         return {}
     except (OSError, UnicodeDecodeError, csv.Error) as cause:
         raise DatasetError(
-            f"The key file '{path}' cannot be read ({cause}): restore it from a copy.",
-            reason="key_damaged",
-            file=path.name,
+            "The key file '{file}' cannot be read ({cause}): restore it from a copy.", file=path, cause=cause
         ) from None
     if not rows or rows[0] != COLUMNS:
         raise DatasetError(
-            f"'{path}' is no key file (it does not begin with {','.join(COLUMNS)}): name a new file, or the key of an "
-            "earlier run; nothing is overwritten.",
-            reason="no_key_file",
-            file=path.name,
+            "'{file}' is no key file (it does not begin with {columns}): name a new file, or the key of an earlier "
+            "run; nothing is overwritten.",
+            file=path,
+            columns=",".join(COLUMNS),
         )
     key: dict[str, Pseudonym] = {}
     codes: set[str] = set()
     for number, row in enumerate(rows[1:], 2):
         if len(row) != 3 or not row[0] or not row[1] or not row[2].lstrip("-").isdigit():
             raise DatasetError(
-                f"The key file '{path}' line {number} is no  {','.join(COLUMNS)}: restore it from a copy.",
-                reason="key_damaged",
-                file=path.name,
+                "The key file '{file}' line {number} is no  {columns}: restore it from a copy.",
+                file=path,
+                number=number,
+                columns=",".join(COLUMNS),
             )
         if row[0] in key or (row[1].casefold() in codes):
             raise DatasetError(
-                f"The key file '{path}' line {number} names '{row[0]}' or its code twice.",
-                reason="key_damaged",
-                file=path.name,
+                "The key file '{file}' line {number} names '{row}' or its code twice.",
+                file=path,
+                number=number,
+                row=row[0],
             )
         codes.add(row[1].casefold())
         key[row[0]] = Pseudonym(row[0], row[1], int(row[2]))
@@ -311,8 +311,7 @@ def write_key(path: Path, key: dict[str, Pseudonym]) -> None:
         write_file(path, out.getvalue(), private=True)
     except OSError as cause:
         raise DatasetError(
-            f"The key file '{path}' cannot be written ({cause.strerror or cause}): choose another place for it.",
-            reason="key_not_written",
-            file=path.name,
-            why=cause.strerror or str(cause),
+            "The key file '{file}' cannot be written ({why}): choose another place for it.",
+            file=path,
+            why=cause.strerror or cause,
         ) from None

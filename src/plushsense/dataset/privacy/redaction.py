@@ -26,7 +26,7 @@ import numpy as np
 import tomli_w
 
 from plushsense.core.errors import DatasetError, MissingExtraError, need
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.core.toml import loads_json, read_toml
 from plushsense.dataset.files import normalize_code
 from plushsense.dataset.privacy.pseudonyms import FIRST_MS, shifted_number, shifted_text
@@ -123,12 +123,12 @@ class ReviewNotes:
     found: list[dict[str, Any]] = field(default_factory=list)
     prose: int = 0
 
-    def add(self, file: str, message: Sentence, line: int = 0) -> None:
+    def add(self, file: str, message: Message, line: int = 0) -> None:
         """Add a note."""
         self.found.append({"file": file, "line": line, "message": message})
 
     def merged(self) -> list[dict[str, Any]]:
-        """Return all notes, equal ones merged; ``sentence`` is `Sentence.to_dict` of the message of one of them."""
+        """Return all notes, equal ones merged; ``sentence`` is `Message.to_json` of the message of one of them."""
         times = Counter((f["file"], f["line"], f["message"]) for f in self.found)
         return [
             {
@@ -136,7 +136,7 @@ class ReviewNotes:
                 "line": line,
                 "message": message if n == 1 else f"{n} times: {message}",
                 "times": n,
-                "sentence": message.to_dict(),
+                "sentence": message.to_json(),
             }
             for (file, line, message), n in times.items()
         ]
@@ -158,8 +158,11 @@ class Redactor:
         new, replacements = self.names.replace(shifted_text(without_addresses(text), self.shift_ms))
         if replacements and where is not None:
             for word, times in Counter(replacements).items():
-                message = f"a name or code in the text was replaced by '{word}' ({times}×): read it"
-                self.findings.add(where[0], Sentence(message, "name_replaced", word=word, n=times), where[1])
+                self.findings.add(
+                    where[0],
+                    Message("a name or code in the text was replaced by '{word}' ({n}×): read it", word=word, n=times),
+                    where[1],
+                )
         return new
 
     def name(self, name: str) -> str:
@@ -374,7 +377,7 @@ def redact_json(path: Path, new: str, words: Redactor) -> str | None:
     out = []
     for number, value in read_lines(path):
         if value is None:
-            message = Sentence("left out: this is no JSON (torn by a crash?)", "no_json")
+            message = Message("left out: this is no JSON (torn by a crash?)")
             words.findings.add(new, message, number if lines else 0)
             continue
         changed = words.value(value, where=(new, number if lines else 0))
@@ -394,8 +397,9 @@ def redact_marks(
         identity = table.get("recording") if isinstance(table, dict) else None
         words = words_of(identity) if isinstance(identity, str) else None
         if words is None or not isinstance(identity, str):
-            message = "a mark was left out: it is torn, or nobody is known by its recording"
-            findings.add(path.name, Sentence(message, "mark_left_out"), number)
+            findings.add(
+                path.name, Message("a mark was left out: it is torn, or nobody is known by its recording"), number
+            )
             continue
         new = renamed(identity)
         # A label is or names a gesture, which is no personal data.

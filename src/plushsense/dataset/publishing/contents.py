@@ -30,7 +30,7 @@ from plushsense.core.recorder_csv import (
     read_stream,
     recording_filename,
 )
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.index import DUPLICATE_FOLDER, build_index
 from plushsense.dataset.marks import MARKS, PRACTICE, Mark, MarkState, mark_line, read_marks
 from plushsense.dataset.publishing.texts import is_misread, label_prefix, public_label
@@ -126,7 +126,7 @@ class PackageContents:
     dataset: Dataset
     people: dict[str, PersonInfo]
     origin: dict[str, RecordingInfo]
-    notes: tuple[Sentence, ...]
+    notes: tuple[Message, ...]
 
 
 class ContentsWriter:
@@ -144,18 +144,15 @@ class ContentsWriter:
         self.options = options
         self.progress = progress
         self.labelled = dataset.layout.is_labelled
-        self.notes: list[Sentence] = []
+        self.notes: list[Message] = []
         if self.labelled and not options.streams:
             raise DatasetError(
-                f"'{dataset.path}' holds its recordings as parts of streams: it cannot be published without streams.",
-                reason="streams_needed",
+                "'{path}' holds its recordings as parts of streams: it cannot be published without streams.",
+                path=dataset.path,
             )
         self.kept = [r for r in dataset.recordings if options.excluded or self.labelled or not r.excluded]
         if not self.kept:
-            raise DatasetError(
-                f"'{dataset.path}' has no recording left to publish: every one is excluded.",
-                reason="nothing_to_publish",
-            )
+            raise DatasetError("'{path}' has no recording left to publish: every one is excluded.", path=dataset.path)
         self.streams = dataset.streams if options.streams else []
         clocks = (HOST_MS, DEVICE_MS) if self._all_have_host() else (DEVICE_MS,)
         columns = (*clocks, *dataset.layout.names, *(("label",) if self.labelled else ()))
@@ -187,20 +184,18 @@ class ContentsWriter:
         origin = {ids[r.id]: replace(r, gesture=self.label(r.gesture)) for r in self.kept}
         if built.unreadable or published.keys() != origin.keys():
             odd = next(iter([*built.unreadable, *(published.keys() ^ origin.keys())]))
-            raise DatasetError(
-                f"The package would differ from the data set in '{odd}'. Please report it.",
-                reason="package_differs",
-                name=odd,
-            )
+            raise DatasetError("The package would differ from the data set in '{name}'. Please report it.", name=odd)
         for identity, before in origin.items():
             after = published[identity]
             for key in ("gesture", "rows", "first_row", "start", "stop", "excluded"):
                 if getattr(before, key) != getattr(after, key):
                     raise DatasetError(
-                        f"'{identity}' would be published with another {key}: {getattr(after, key)!r} instead of "
-                        f"{getattr(before, key)!r}. Please report it.",
-                        reason="package_differs",
+                        "'{name}' would be published with another {key}: {later!r} instead of {earlier!r}. "
+                        "Please report it.",
                         name=identity,
+                        key=key,
+                        later=getattr(after, key),
+                        earlier=getattr(before, key),
                     )
         self._note_changes(built.dataset, origin)
         return PackageContents(built.dataset, people, origin, tuple(self.notes))
@@ -223,11 +218,7 @@ class ContentsWriter:
         code = _folder_of(recording.file)
         name = parse_name(Path(recording.file).name)
         if name is None:
-            raise DatasetError(
-                f"'{recording.file}' is not named <label>_<epoch ms>_<rows>.csv.",
-                reason="raw_file_name",
-                file=recording.file,
-            )
+            raise DatasetError("'{file}' is not named <label>_<epoch ms>_<rows>.csv.", file=recording.file)
         raw = read_recording(self.source.path / recording.file, self.source.layout)
         frames = raw.frames
         if raw.integrated and recording.stream_row >= 0 and self.streams:
@@ -258,9 +249,7 @@ class ContentsWriter:
         )
         if not same:
             raise DatasetError(
-                f"'{target}' would differ from the recording when it is read. Please report it.",
-                reason="package_differs",
-                name=target,
+                "'{name}' would differ from the recording when it is read. Please report it.", name=target
             )
 
     def _free(self, path: str) -> str:
@@ -304,10 +293,9 @@ class ContentsWriter:
         if not self.labelled:
             lacking += sum(read_recording(folder / r.file, layout).frames.host_ms is None for r in self.kept)
         if lacking:
-            message = (
-                f"Left out: the computer's clock, since {_count(lacking, 'file')} lacked it; the toy's clock is kept."
+            self.notes.append(
+                Message("Left out: the computer's clock, since {n:file} lacked it; the toy's clock is kept.", n=lacking)
             )
-            self.notes.append(Sentence(message, "no_host_clock", n=lacking))
         return lacking == 0
 
     def _shifts(self) -> dict[str, Shift]:
@@ -342,10 +330,11 @@ class ContentsWriter:
         for column in self.options.columns:
             if column not in columns:
                 raise DatasetError(
-                    f"{PEOPLE} has no column '{column}' to publish; besides {', '.join(PUBLIC_COLUMNS)} it has "
-                    f"{', '.join(sorted(columns)) or 'none'}.",
-                    reason="no_column",
+                    "{people} has no column '{column}' to publish; besides {public_columns} it has {columns}.",
+                    people=PEOPLE,
                     column=column,
+                    public_columns=", ".join(PUBLIC_COLUMNS),
+                    columns=", ".join(sorted(columns)) or "none",
                 )
         people = {
             public: PersonInfo(public, p.age_group, p.gender, "", {c: p.more.get(c, "") for c in self.options.columns})
@@ -357,8 +346,7 @@ class ContentsWriter:
         left_out = len(columns - set(self.options.columns)) + any(p.consent for p in known.values())
         if left_out:
             # Give only the number, since even the name of a column may be private.
-            message = f"Left out: {_count(left_out, 'column')} of the people's table."
-            self.notes.append(Sentence(message, "columns_left_out", n=left_out))
+            self.notes.append(Message("Left out: {n:column} of the people's table.", n=left_out))
         return people
 
     def _write_marks(self, ids: dict[str, str], files: dict[str, str]) -> None:
@@ -387,47 +375,51 @@ class ContentsWriter:
     def _note_changes(self, published: Dataset, origin: dict[str, RecordingInfo]) -> None:
         out = [r for r in self.source.recordings if r.excluded]
         if out and not self.options.excluded and not self.labelled:
-            message = f"Left out: {_count(len(out), 'excluded recording')}."
-            message += " Their rows are still in the session's stream." if self.streams else ""
-            self.notes.append(
-                Sentence(message, "excluded_in_stream" if self.streams else "excluded_left_out", n=len(out))
-            )
+            template = "Left out: {n:excluded recording}."
+            if self.streams:
+                template = "Left out: {n:excluded recording}. Their rows are still in the session's stream."
+            self.notes.append(Message(template, n=len(out)))
         elif out:
-            message = f"In the package, but marked as excluded: {_count(len(out), 'recording')}."
-            self.notes.append(Sentence(message, "excluded_included", n=len(out)))
+            self.notes.append(Message("In the package, but marked as excluded: {n:recording}.", n=len(out)))
         if self.source.streams and not self.streams:
             n = len(self.source.streams)
-            self.notes.append(Sentence(f"Left out: {_count(n, 'session stream')}.", "streams_left_out", n=n))
+            self.notes.append(Message("Left out: {n:session stream}.", n=n))
         trimmed = sum((r.start, r.stop) != (0, r.rows) for r in published.recordings)
         if trimmed:
-            message = (
-                f"Trimmed: {_count(trimmed, 'recording')}; the files hold all rows, start and stop say which remain."
+            self.notes.append(
+                Message("Trimmed: {n:recording}; the files hold all rows, start and stop say which remain.", n=trimmed)
             )
-            self.notes.append(Sentence(message, "trimmed", n=trimmed))
         relabelled = sum(r.gesture != r.recorded for r in published.recordings)
         if relabelled:
-            message = (
-                f"Relabelled: {_count(relabelled, 'recording')}; the files are named after the gesture that was asked "
-                "for, the tables state the one that was made."
+            self.notes.append(
+                Message(
+                    "Relabelled: {n:recording}; the files are named after the gesture that was asked for, the tables "
+                    "state the one that was made.",
+                    n=relabelled,
+                )
             )
-            self.notes.append(Sentence(message, "relabelled", n=relabelled))
         renamed = [code for code, public in self.codes.items() if code != public]
         if renamed:
-            message = (
-                f"Renamed: {_count(len(renamed), 'subject code')} that looked like a number or nothing, now with "
-                "a P in front."
+            self.notes.append(
+                Message(
+                    "Renamed: {n:subject code} that looked like a number or nothing, now with a P in front.",
+                    n=len(renamed),
+                )
             )
-            self.notes.append(Sentence(message, "codes_renamed", n=len(renamed)))
         odd = sorted(r for r in {r.gesture for r in self.kept} if self.label(r) != r)
         if odd:
             listed = ", ".join(f"'{label}' is now '{self.label(label)}'" for label in odd)
-            message = f"Renamed: gestures that other programs read as a number, a date or no value; {listed}."
-            self.notes.append(Sentence(message, "gestures_renamed", n=len(odd), listed=listed))
+            self.notes.append(
+                Message(
+                    "Renamed: gestures that other programs read as a number, a date or no value; {listed}.",
+                    listed=listed,
+                    n=len(odd),
+                )
+            )
         if self.streams and published.recordings and not self.labelled:
             lost = sum(origin[r.id].stream_row >= 0 and r.stream_row < 0 for r in published.recordings)
             if lost:
-                message = f"No longer found in their stream: {_count(lost, 'recording')}."
-                self.notes.append(Sentence(message, "lost_in_stream", n=lost))
+                self.notes.append(Message("No longer found in their stream: {n:recording}.", n=lost))
 
 
 def _count(n: int, noun: str) -> str:

@@ -14,7 +14,7 @@ from typing import Any
 
 from plushsense.core.errors import DatasetError, nearest
 from plushsense.core.layouts import DEVICE_MS, HOST_MS, Channel, Layout
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.core.templates import fill_text
 from plushsense.dataset.about import About, Creator
 from plushsense.dataset.files import sha256_of
@@ -50,10 +50,10 @@ def find_licence(spdx: str) -> Licence:
         if name.casefold() == spdx.strip().casefold():
             return licence
     raise DatasetError(
-        f"'{spdx}' is no licence that can be published under: accepted are the SPDX names {', '.join(LICENCES)}."
-        f"{nearest(spdx.replace(' ', '-'), LICENCES)}",
-        reason="no_licence",
+        "'{licence}' is no licence that can be published under: accepted are the SPDX names {licences}.{hint}",
         licence=spdx,
+        licences=", ".join(LICENCES),
+        hint=nearest(spdx.replace(" ", "-"), LICENCES),
     )
 
 
@@ -113,7 +113,7 @@ class Description:
     consent: str
     published: str
     tables: tuple[PackageTable, ...]
-    notes: tuple[Sentence, ...] = ()
+    notes: tuple[Message, ...] = ()
     """Notes on what was left out or changed, one sentence each."""
     files: Mapping[str, FileEntry] = field(default_factory=dict)
     """The files of the tables by path."""

@@ -15,7 +15,7 @@ from plushsense.core.errors import DatasetError, need
 from plushsense.core.files import new_folder
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import SIMULATION_MARK
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.about import Contact
 from plushsense.dataset.publishing.checking import EXTRA, StageProgress, ValidationResult, check_folder
 from plushsense.dataset.publishing.contents import ContentsWriter, PublishOptions
@@ -71,7 +71,7 @@ class PublishResult:
     description: Description
     checked: ValidationResult
     seconds: float
-    warnings: list[Sentence] = field(default_factory=list)
+    warnings: list[Message] = field(default_factory=list)
 
     @property
     def valid(self) -> bool:
@@ -93,7 +93,7 @@ class PublishResult:
             "simulated": d.simulated,
             "notes": list(d.notes),
             "warnings": self.warnings,
-            "sentences": [sentence.to_dict() for sentence in (*self.warnings, *d.notes)],
+            "sentences": [sentence.to_json() for sentence in (*self.warnings, *d.notes)],
             "seconds": round(self.seconds, 1),
             **self.checked.to_dict(),
         }
@@ -118,14 +118,17 @@ def complete_head(
     if missing := [(line, flag) for value, line, flag in hints if not value]:
         lines, flags = zip(*missing, strict=True)
         raise DatasetError(
-            f"'{where}' cannot be published without licence, contact and consent statement: set in '{where / HEAD}'  "
-            f"{'  and  '.join(lines)}  or give  {' '.join(flags)}",
-            reason="statements_missing",
+            "'{where}' cannot be published without licence, contact and consent statement: set in '{path}'  {lines}  "
+            "or give  {flags}",
+            where=where,
+            path=where / HEAD,
+            lines="  and  ".join(lines),
+            flags=" ".join(flags),
         )
     if not _VERSION.fullmatch(head.version):
         raise DatasetError(
-            f"'{where / HEAD}' has the version '{head.version}': three numbers are accepted, like 1.0.0.",
-            reason="version_bad",
+            "'{path}' has the version '{version}': three numbers are accepted, like 1.0.0.",
+            path=where / HEAD,
             version=head.version,
         )
     return replace(head, licence=find_licence(head.licence).spdx)
@@ -167,18 +170,15 @@ def check_output_folder(dataset: Dataset, out: Path, repeatable: bool = True) ->
     target = real.with_name(real.name + ".zip")
     if real.exists() and (not real.is_dir() or any(real.iterdir())):
         raise DatasetError(
-            f"'{out}' already holds something: give a new or empty folder, nothing is overwritten.",
-            reason="name_exists",
-            name=out.name,
+            "'{path}' already holds something: give a new or empty folder, nothing is overwritten.", path=out
         )
     if dataset.path.resolve() in (real, *real.parents):
         raise DatasetError(f"'{out}' lies in the data set itself: give a folder elsewhere.")
     if target.exists() and not repeatable:
         raise DatasetError(
-            f"'{target}' exists without its folder: give another OUT, or delete this zip if an interrupted publication "
+            "'{path}' exists without its folder: give another OUT, or delete this zip if an interrupted publication "
             "has left it; nothing is overwritten.",
-            reason="name_exists",
-            name=target.name,
+            path=target,
         )
     return target
 
@@ -278,40 +278,51 @@ def _write_metadata(work: Path, d: Description) -> None:
     write_checksums(work)
 
 
-def _warnings(source: Dataset, d: Description, people: dict[str, PersonInfo]) -> list[Sentence]:
+def _warnings(source: Dataset, d: Description, people: dict[str, PersonInfo]) -> list[Message]:
     warnings = []
     groups = Counter((p.age_group, p.gender, *p.more.values()) for p in people.values() if p.age_group or p.gender)
     rare = sum(n for n in groups.values() if n < FEWEST_ALIKE)
     if rare:
-        message = (
-            f"{rare} people have an age group and gender that fewer than {FEWEST_ALIKE} people share, which alone may "
-            "identify them: use coarser groups in subjects.csv"
+        warnings.append(
+            Message(
+                "{n} people have an age group and gender that fewer than {least} people share, which alone may "
+                "identify them: use coarser groups in subjects.csv",
+                n=rare,
+                least=FEWEST_ALIKE,
+            )
         )
-        warnings.append(Sentence(message, "rare_groups", n=rare, least=FEWEST_ALIKE))
     without_digit = [s for s in d.dataset.subjects if not any(c.isdigit() for c in s)]
     if without_digit:
         n, code = len(without_digit), without_digit[0]
-        message = (
-            f"subject codes are published as they are, and {n} hold no digit ('{code}'): if they are names, "
-            "pseudonymise the data set first"
+        warnings.append(
+            Message(
+                "subject codes are published as they are, and {n} hold no digit ('{code}'): if they are names, "
+                "pseudonymise the data set first",
+                n=n,
+                code=code,
+            )
         )
-        warnings.append(Sentence(message, "codes_like_names", n=n, code=code))
     if d.licence.travels and not any((source.path / name).is_file() for name in _LICENCE_FILES):
         licence = d.licence.spdx
-        message = f"{licence} requires its text in every copy: put it into the data set as LICENSE.txt"
-        warnings.append(Sentence(message, "licence_text", licence=licence))
-    if not d.about.title:
-        message = (
-            f"the published title is the data set's name, '{source.head.name}', often that of the imported folder: "
-            "check it, or set title in [about] in dataset.toml"
+        warnings.append(
+            Message(
+                "{licence} requires its text in every copy: put it into the data set as LICENSE.txt", licence=licence
+            )
         )
-        warnings.append(Sentence(message, "title_is_name", name=source.head.name))
+    if not d.about.title:
+        warnings.append(
+            Message(
+                "the published title is the data set's name, '{name}', often that of the imported folder: check it, "
+                "or set title in [about] in dataset.toml",
+                name=source.head.name,
+            )
+        )
     if not d.about.creators:
-        message = "nobody is named as creator, so the contact is: add creators to [about] in dataset.toml"
-        warnings.append(Sentence(message, "contact_is_creator"))
+        warnings.append(
+            Message("nobody is named as creator, so the contact is: add creators to [about] in dataset.toml")
+        )
     if any(r.subject == UNKNOWN_SUBJECT for r in d.dataset.recordings):
-        message = "the people of some recordings are not known, so they share one time shift"
-        warnings.append(Sentence(message, "some_people_unknown"))
+        warnings.append(Message("the people of some recordings are not known, so they share one time shift"))
     if not {r.subject for r in d.dataset.recordings} - {NOBODY, UNKNOWN_SUBJECT}:
-        warnings.append(Sentence("no recording has a known person", "nobody_known"))
+        warnings.append(Message("no recording has a known person"))
     return warnings

@@ -67,11 +67,12 @@ def _refuse_changed(table: PackageTable, rows: Iterable[Row]) -> None:
         if column.kind == TEXT and (text := changed_text(_cell(row[column.name]) for row in rows)) is not None:
             where = PEOPLE if table.name == "subjects" else HEAD
             raise DatasetError(
-                f"'{table.file}' would have the {column.name} '{text}', which other programs read as a number, a truth "
-                f"value or no value: write it in other words, or leave it empty, in '{where}' of the data set.",
-                reason="text_misread",
+                "'{file}' would have the {column} '{text}', which other programs read as a number, a truth value or "
+                "no value: write it in other words, or leave it empty, in '{where}' of the data set.",
+                file=table.file,
                 column=column.name,
                 text=text,
+                where=where,
             )
 
 
@@ -211,11 +212,7 @@ def write_zip(root: Path, target: Path, finishing: Callable[[], AbstractContextM
                 entry = zip_entry(path.relative_to(root).as_posix())
                 archive.writestr(entry, path.read_bytes())
         if target.exists() and not filecmp.cmp(part, target, shallow=False):
-            raise DatasetError(
-                f"'{target}' is already there: nothing is overwritten, give another OUT.",
-                reason="name_exists",
-                name=target.name,
-            )
+            raise DatasetError("'{path}' is already there: nothing is overwritten, give another OUT.", path=target)
 
 
 @contextmanager
@@ -230,9 +227,7 @@ def open_package(package: Path) -> Iterator[Path]:
         return
     if not package.is_file() or not zipfile.is_zipfile(package):
         raise DatasetError(
-            f"'{package}' is no package: give the folder or the zip that  plushsense publish  made.",
-            reason="not_a_package",
-            name=package.name,
+            "'{path}' is no package: give the folder or the zip that  plushsense publish  made.", path=package
         )
     with temporary_folder() as scratch:
         target = scratch.resolve() / "package"
@@ -241,17 +236,15 @@ def open_package(package: Path) -> Iterator[Path]:
             refused = unpack(package, target, _LIMITS)
         except OSError as cause:
             raise DatasetError(
-                f"'{package}' cannot be unpacked: {cause.strerror or cause}.",
-                reason="package_not_unpacked",
-                name=package.name,
-                why=cause.strerror or str(cause),
+                "'{path}' cannot be unpacked: {why}.", path=package, why=cause.strerror or cause
             ) from None
         if refused:
             name, reason = refused[0]
             raise DatasetError(
-                f"'{package}' is not used, since its entry '{name}' is refused: {reason}.",
-                reason="package_refused",
-                name=package.name,
+                "'{path}' is not used, since its entry '{entry}' is refused: {reason}.",
+                path=package,
+                entry=name,
+                reason=reason,
             )
         inside = list(target.iterdir())
         yield inside[0] if len(inside) == 1 and inside[0].is_dir() else target

@@ -11,7 +11,7 @@ from typing import Any
 
 from plushsense.core.errors import ConfigError, DatasetError, nearest
 from plushsense.core.recorder_csv import Frames, ReadResult, parse_name, read_recording, read_stream
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.marks import Mark, match_ids, read_marks
 from plushsense.dataset.quality import comparisons, recordings
 from plushsense.dataset.quality.findings import SEVERITIES, CheckLimits, Finding, Issue, Severity
@@ -295,9 +295,8 @@ def _merge_common(findings: list[Finding], recordings: int) -> Iterator[Finding]
         yield Finding(
             check=check,
             severity=min((f.severity for f in findings if f.check == check), key=SEVERITIES.index),
-            message=Sentence(
-                f"so in {concerned[check]} of {recordings} recordings, for instance {first.recording}: {first.message}",
-                "in_most",
+            message=Message(
+                "so in {n} of {of} recordings, for instance {recording}: {message}",
                 n=concerned[check],
                 of=recordings,
                 recording=first.recording,
@@ -316,9 +315,7 @@ def author_name(who: str | None) -> str:
     try:
         return who or getpass.getuser()
     except (OSError, KeyError, ImportError):
-        raise ConfigError(
-            "This computer gives no login name: name the person who decides with --who NAME.", reason="who_missing"
-        ) from None
+        raise ConfigError("This computer gives no login name: name the person who decides with --who NAME.") from None
 
 
 def exclusions(

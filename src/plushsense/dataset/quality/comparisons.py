@@ -10,7 +10,7 @@ import numpy as np
 
 from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import BINARY, COUNT
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.quality.copies import CopiedStretch, find_copied_stretches
 from plushsense.dataset.quality.findings import PARTLY_THERE, Issue
 from plushsense.dataset.quality.measurements import (
@@ -73,6 +73,27 @@ def _is_cut_by_the_file(o: RecordingSummary, w: DatasetSummary) -> bool:
     return info.first_row == 0 or info.first_row + info.rows == rows
 
 
+# By whether the person usually takes as long, and whether it is longer than the mean.
+_DURATIONS = {
+    (False, False): (
+        "lasts {seconds:.2f} s, {percent:.0f} % less than the mean of its gesture ({mean:.2f} s); this person's "
+        "median is {median:.2f} s"
+    ),
+    (False, True): (
+        "lasts {seconds:.2f} s, {percent:.0f} % more than the mean of its gesture ({mean:.2f} s); this person's "
+        "median is {median:.2f} s"
+    ),
+    (True, False): (
+        "lasts {seconds:.2f} s, {percent:.0f} % less than the mean of its gesture ({mean:.2f} s), as this person's "
+        "others do (their median {median:.2f} s)"
+    ),
+    (True, True): (
+        "lasts {seconds:.2f} s, {percent:.0f} % more than the mean of its gesture ({mean:.2f} s), as this person's "
+        "others do (their median {median:.2f} s)"
+    ),
+}
+
+
 def duration(w: DatasetSummary) -> Iterator[Issue]:
     share = w.limits.duration
     for group in w.groups.values():
@@ -88,18 +109,8 @@ def duration(w: DatasetSummary) -> Iterator[Issue]:
             # It is no fault of the recording if this person always takes longer (or less long) than others.
             median = float(np.median(own[o.info.subject]))
             habit = bool(median) and len(own[o.info.subject]) >= 3 and abs(o.seconds / median - 1) <= share
-            others = "as this person's others do (their median " if habit else "this person's median is "
-            message = (
-                f"lasts {o.seconds:.2f} s, {abs(off) * 100:.0f} % {'more' if off > 0 else 'less'} than the mean of its "
-                f"gesture ({mean:.2f} s){',' if habit else ';'} {others}{median:.2f} s{')' if habit else ''}"
-            )
-            sentence = Sentence(
-                message,
-                f"duration_{'more' if off > 0 else 'less'}{'_habit' if habit else ''}",
-                seconds=round(o.seconds, 2),
-                percent=round(abs(off) * 100),
-                mean=round(mean, 2),
-                median=round(median, 2),
+            sentence = Message(
+                _DURATIONS[habit, off > 0], seconds=o.seconds, percent=abs(off) * 100, mean=mean, median=median
             )
             yield Issue(
                 sentence,
@@ -122,9 +133,8 @@ def flat(w: DatasetSummary) -> Iterator[Issue]:
     always = np.where(discrete, constant.all(axis=0), constant.mean(axis=0) > 0.5)
     for c in np.flatnonzero(always):
         n, of = int(constant[:, c].sum()), len(long)
-        message = f"channel {names[c]} does not change in {n} of {of} recordings"
         yield Issue(
-            Sentence(message, "flat_in_most", channel=names[c], n=n, of=of),
+            Message("channel {channel} does not change in {n} of {of} recordings", channel=names[c], n=n, of=of),
             channels=(int(c),),
             severity="warning",
         )
@@ -132,12 +142,10 @@ def flat(w: DatasetSummary) -> Iterator[Issue]:
         dead = np.flatnonzero((o.runs >= o.rows) & ~always & ~discrete & ~(w.zeroed & (o.zeros == o.rows)))
         if len(dead):
             stream = isinstance(o.info, StreamInfo)
-            message = (
-                f"{_channels(names, dead)} {'has' if len(dead) == 1 else 'have'} one value throughout"
-                f"{' the session' if stream else ''}"
-            )
+            subject = f"{_channels(names, dead)} {'has' if len(dead) == 1 else 'have'}"
+            template = "{subject} one value throughout the session" if stream else "{subject} one value throughout"
             yield Issue(
-                Sentence(message, "flat_stream" if stream else "flat", channels=_names(names, dead)),
+                Message(template, subject=subject, channels=_names(names, dead)),
                 () if stream else ((o.first_row, o.first_row + o.rows),),
                 tuple(dead.tolist()),
                 o.info.id,
@@ -161,16 +169,17 @@ def zeroed(w: DatasetSummary) -> Iterator[Issue]:
         limit, names = zeroing_limit(w.dataset.layout), w.dataset.layout.names
         percent = round(100 * float(zeros.sum(axis=0).max()) / sum(o.rows for o in w.recordings), 1)
         n = int(zeros.any(axis=1).sum())
-        message = Sentence(
-            f"{_channels(names, affected)} {'reads' if len(affected) == 1 else 'read'} exactly 0 in up to "
-            f"{percent:.1f} % of the rows ({n} of {len(zeros)} recordings) and never less than {limit}: the authors' "
-            f"recorder writes 0 for every value under {limit}, so that magnitude and direction are wrong there",
-            "zeroed",
-            channels=_names(names, affected),
+        message = Message(
+            "{subject} {more} exactly 0 in up to {percent:.1f} % of the rows ({n} of {of} recordings) and never "
+            "less than {limit}: the authors' recorder writes 0 for every value under {limit}, so that magnitude and "
+            "direction are wrong there",
+            subject=_channels(names, affected),
+            more="reads" if len(affected) == 1 else "read",
             percent=percent,
             n=n,
             of=len(zeros),
             limit=limit,
+            channels=_names(names, affected),
         )
         yield Issue(message, channels=tuple(affected.tolist()))
 
@@ -191,13 +200,15 @@ def stuck(w: DatasetSummary) -> Iterator[Issue]:
         c = int(affected[np.argmax(run_ms[affected])])
         first = int(o.run_at[c]) + o.first_row
         seconds, usual = float(run_ms[c]) / 1000, float(w.usual_run_ms[c]) / 1000
-        message = (
-            f"{_channels(names, affected)} {'holds' if len(affected) == 1 else 'hold'} one value for up to "
-            f"{seconds:.1f} s (from row {first + 1}); usual is {usual:.2f} s"
-        )
-        values = {"seconds": round(seconds, 1), "row": first + 1, "usual": round(usual, 2)}
         yield Issue(
-            Sentence(message, "stuck", channels=_names(names, affected), **values),
+            Message(
+                "{subject} one value for up to {seconds:.1f} s (from row {row}); usual is {usual:.2f} s",
+                subject=f"{_channels(names, affected)} {'holds' if len(affected) == 1 else 'hold'}",
+                seconds=seconds,
+                row=first + 1,
+                usual=usual,
+                channels=_names(names, affected),
+            ),
             ((first, first + int(o.runs[c])),),
             tuple(affected.tolist()),
             o.info.id,
@@ -235,14 +246,19 @@ def saturated(w: DatasetSummary) -> Iterator[Issue]:
         c = int(affected[np.argmax(run_ms[affected])])
         first = int(o.top_at[c]) + o.first_row
         value, unit = channels[c].in_units(int(o.top[c]))
-        message = (
-            f"{_channels(names, affected)} {'stays' if len(affected) == 1 else 'stay'} at the highest or lowest value, "
-            f"{names[c]} for {run_ms[c]:.0f} ms at {value:g}{unit} (from row {first + 1}), {o.top_rows[c]} rows in all"
-        )
-        values = {"ms": round(float(run_ms[c])), "value": value, "unit": unit}
-        values |= {"row": first + 1, "rows": int(o.top_rows[c])}
         yield Issue(
-            Sentence(message, "saturated", channels=_names(names, affected), channel=names[c], **values),
+            Message(
+                "{subject} at the highest or lowest value, {channel} for {ms} ms at {value:g}{unit} (from row {row}), "
+                "{rows} rows in all",
+                subject=f"{_channels(names, affected)} {'stays' if len(affected) == 1 else 'stay'}",
+                channel=names[c],
+                ms=round(float(run_ms[c])),
+                value=value,
+                unit=unit,
+                row=first + 1,
+                rows=int(o.top_rows[c]),
+                channels=_names(names, affected),
+            ),
             ((first, first + int(o.top_runs[c])),),
             tuple(affected.tolist()),
             o.info.id,
@@ -267,20 +283,18 @@ def drift(w: DatasetSummary) -> Iterator[Issue]:
             c = int(affected[np.argmax(np.abs(share[affected]))])
             percent = round(float(abs(share[c])) * 100)
             by, unit = layout.channels[c].in_units(round(float(change[c])))
-            message = (
-                f"the baseline of {_channels(layout.names, affected)} drifts over {key}, {layout.names[c]} by "
-                f"{by:+g}{unit}: {percent} % of its signal when touched"
-            )
             channels = _names(layout.names, affected)
             yield Issue(
-                Sentence(
-                    message,
-                    "drift",
-                    channels=channels,
+                Message(
+                    "the baseline of {subject} drifts over {key}, {channel} by {by:+g}{unit}: {percent} % of its "
+                    "signal when touched",
+                    subject=_channels(layout.names, affected),
+                    key=key,
                     channel=layout.names[c],
                     by=by,
                     unit=unit,
                     percent=percent,
+                    channels=channels,
                 ),
                 channels=tuple(affected.tolist()),
                 about=about,
@@ -327,9 +341,11 @@ def no_onset(w: DatasetSummary) -> Iterator[Issue]:
                 and not never_stopped(o, group)
             ):
                 percent = round(100 * float(peak) / usual)
-                message = f"no onset is visible: the strongest moment has {percent} % of what is usual for this gesture"
                 yield Issue(
-                    Sentence(message, "no_onset", percent=percent),
+                    Message(
+                        "no onset is visible: the strongest moment has {percent} % of what is usual for this gesture",
+                        percent=percent,
+                    ),
                     about=o.info.id,
                 )
 
@@ -369,12 +385,14 @@ def several_gestures(w: DatasetSummary) -> Iterator[Issue]:
                 rows = tuple((a * o.hop + o.first_row, b * o.hop + o.first_row) for a, b in parts)
                 still = max((b[0] - a[1]) * o.period_ms / 1000 for a, b in itertools.pairwise(rows))
                 n, row = len(parts), rows[1][0] + 1
-                message = (
-                    f"{n} separate gestures in one recording, with up to {still:.1f} s of stillness between "
-                    f"(second from row {row})"
-                )
                 yield Issue(
-                    Sentence(message, "several_gestures", n=n, seconds=round(still, 1), row=row),
+                    Message(
+                        "{n} separate gestures in one recording, with up to {seconds:.1f} s of stillness between "
+                        "(second from row {row})",
+                        n=n,
+                        seconds=still,
+                        row=row,
+                    ),
                     rows,
                     about=o.info.id,
                 )
@@ -391,7 +409,7 @@ def duplicate(w: DatasetSummary) -> Iterator[Issue]:
     for o in (*sorted(varying, key=lambda o: o.info.id), *w.streams):
         original = originals.setdefault(o.content or o.info.sha256, o.info.id)
         if original != o.info.id:
-            message = Sentence(f"the same content as {original}", "duplicate", original=original)
+            message = Message("the same content as {original}", original=original)
             yield Issue(message, about=o.info.id)
     by_id = {o.info.id: o for o in w.recordings}
     longest: dict[str, CopiedStretch] = {}
@@ -405,9 +423,15 @@ def duplicate(w: DatasetSummary) -> Iterator[Issue]:
     for about, stretch in longest.items():
         first, row = stretch.first.start + stretch.first_row, stretch.second.start + stretch.second_row
         n, of, other = stretch.rows, by_id[about].rows, stretch.first.id
-        text = f"{n} of its {of} rows (from row {row + 1}) are also in {other} (from row {first + 1})"
         yield Issue(
-            Sentence(text, "copied_rows", n=n, of=of, row=row + 1, other=other, from_row=first + 1),
+            Message(
+                "{n} of its {of} rows (from row {row}) are also in {other} (from row {from_row})",
+                n=n,
+                of=of,
+                row=row + 1,
+                other=other,
+                from_row=first + 1,
+            ),
             ((row, row + n),),
             about=about,
         )
@@ -428,7 +452,7 @@ def overlap(w: DatasetSummary) -> Iterator[Issue]:
             if shared > _OVERLAP * (now[2] - now[1]):
                 of, other = now[2] - now[1], open_at[3].info.id
                 yield Issue(
-                    Sentence(f"{shared} of its {of} rows are in {other} too", "overlap", n=shared, of=of, other=other),
+                    Message("{n} of its {of} rows are in {other} too", n=shared, of=of, other=other),
                     ((0, shared),),
                     about=now[3].info.id,
                 )
@@ -453,7 +477,7 @@ def missing(w: DatasetSummary) -> Iterator[Issue]:
     cells = Counter(n for counts in people.values() for n in counts.values())
     if not cells:
         return
-    short: dict[str, list[Sentence]] = {}
+    short: dict[str, list[Message]] = {}
     for gesture in sorted({g for counts in people.values() for g in counts}):
         made = Counter(counts[gesture] for counts in people.values() if counts[gesture])
         if made.total() < _MADE_BY * len(people):
@@ -465,33 +489,42 @@ def missing(w: DatasetSummary) -> Iterator[Issue]:
         for subject, counts in people.items():
             if counts[gesture] < usual:
                 n = counts[gesture]
-                lack = Sentence(f"{n} of {usual} '{gesture}'", "missing_gesture", n=n, usual=usual, gesture=gesture)
+                lack = Message("{n} of {usual} '{gesture}'", n=n, usual=usual, gesture=gesture)
                 short.setdefault(subject, []).append(lack)
     for subject in sorted(short):
         listed = short[subject]
         more = f" and {len(listed) - 6} more gestures" if len(listed) > 6 else ""
-        message = f"{subject} has {', '.join(listed[:6])}{more}"
         missed = [*listed[:6], *(["…"] if more else [])]
-        yield Issue(Sentence(message, "missing", person=subject, listed=missed), about=subject)
+        yield Issue(
+            Message(
+                "{person} has {few}{more}",
+                person=subject,
+                few=", ".join(listed[:6]),
+                more=more,
+                listed=missed,
+            ),
+            about=subject,
+        )
+
+
+_BALANCE = {
+    "gestures": "{n} of {of} gestures have far fewer or more recordings than the median ({usual}): {listed}",
+    "people": "{n} of {of} people have far fewer or more recordings than the median ({usual}): {listed}",
+}
 
 
 def _balance(counts: dict[str, int], noun: str, factor: float) -> Iterator[Issue]:
     """Report the names whose count is more than ``factor`` times above or below the median."""
     usual = float(np.median(list(counts.values()))) if counts else 0.0
-    key = "gesture" if noun == "gestures" else "person"
     odd = [
-        Sentence(f"{name} {n}", f"count_of_{key}", n=n, **{key: name})
+        Message("{gesture} {n}", gesture=name, n=n) if noun == "gestures" else Message("{person} {n}", person=name, n=n)
         for name, n in counts.items()
         if usual and (n * factor < usual or n > factor * usual)
     ]
     if odd:
         listed = [*odd[:8], *(["…"] if len(odd) > 8 else [])]
-        message = (
-            f"{len(odd)} of {len(counts)} {noun} have far fewer or more recordings than the median ({usual:.0f}): "
-            f"{', '.join(listed)}"
-        )
         values = {"n": len(odd), "of": len(counts), "usual": round(usual), "listed": listed}
-        yield Issue(Sentence(message, f"balance_of_{noun}", **values))
+        yield Issue(Message(_BALANCE[noun], **values))
 
 
 def class_balance(w: DatasetSummary) -> Iterator[Issue]:
@@ -516,11 +549,11 @@ def not_in_stream(w: DatasetSummary) -> Iterator[Issue]:
         # Recordings of the untouched toy have the subject nobody but are in the folder of the session's person.
         folder = o.info.id.split("/", 1)[0]
         if o.info.stream_row < 0 and (folder, o.info.session) in streamed:
-            yield Issue(Sentence("not found in the session's stream", "not_in_stream"), about=o.info.id)
+            yield Issue(Message("not found in the session's stream"), about=o.info.id)
         for flag in o.info.flags:
             if flag.startswith(PARTLY_THERE):
                 rows = int(flag.removeprefix(PARTLY_THERE).split()[0])
-                yield Issue(Sentence(flag, "partly_in_stream", rows=rows), about=o.info.id)
+                yield Issue(Message("{flag}", flag=flag, rows=rows), about=o.info.id)
 
 
 def unknown_label(w: DatasetSummary) -> Iterator[Issue]:
@@ -531,5 +564,12 @@ def unknown_label(w: DatasetSummary) -> Iterator[Issue]:
         gesture = w.dataset.gestures.find(label)
         if gesture is None or gesture.affect == "none":
             name, counted = w.dataset.gestures.name, f"{n} recording{'s' if n > 1 else ''}"
-            message = f"the label '{label}' ({counted}) is not in the gesture set '{name}': no affect"
-            yield Issue(Sentence(message, "unknown_label", label=label, n=n, set=name))
+            yield Issue(
+                Message(
+                    "the label '{label}' ({counted}) is not in the gesture set '{set}': no affect",
+                    label=label,
+                    counted=counted,
+                    set=name,
+                    n=n,
+                )
+            )

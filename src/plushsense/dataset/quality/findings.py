@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Literal, Self
 
 from plushsense.core.errors import ConfigError, nearest
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 
 Severity = Literal["info", "warning", "error"]
 PARTLY_THERE = "only its first"
@@ -79,7 +79,7 @@ class Issue:
     unless it differs from that of the check.
     """
 
-    message: Sentence
+    message: Message
     rows: tuple[tuple[int, int], ...] = ()
     channels: tuple[int, ...] = ()
     about: str = ""
@@ -100,7 +100,7 @@ class Finding:
     gesture: str = ""
     check: str
     severity: Severity
-    message: Sentence
+    message: Message
     action: str
     accepted: bool = False
     rows: tuple[tuple[int, int], ...] = ()

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.quality.findings import CheckLimits, Issue, Severity
 from plushsense.dataset.quality.measurements import (
     NEVER_STOPPED_FACTOR,
@@ -49,16 +49,14 @@ def _weight(share: float, limits: CheckLimits) -> Severity | None:
 def rows_against_name(s: Examination) -> Iterator[Issue]:
     rows = len(s.frames) if s.rows_in_file is None else s.rows_in_file
     if s.rows_named is not None and s.rows_named != rows:
-        message = f"holds {rows} rows, but its name states {s.rows_named}"
-        yield Issue(Sentence(message, "rows_differ", rows=rows, named=s.rows_named))
+        yield Issue(Message("holds {rows} rows, but its name states {named}", rows=rows, named=s.rows_named))
 
 
 def never_stopped(s: Examination) -> Iterator[Issue]:
     if s.usual_rows is not None and len(s.frames) > NEVER_STOPPED_FACTOR * s.usual_rows:
         rows, usual = len(s.frames), round(s.usual_rows)
-        message = f"holds {rows} rows where this gesture usually has {usual}: never stopped?"
         yield Issue(
-            Sentence(message, "never_stopped", rows=rows, usual=usual),
+            Message("holds {rows} rows where this gesture usually has {usual}: never stopped?", rows=rows, usual=usual),
             ((s.first_row, s.first_row + len(s.frames)),),
         )
 
@@ -68,8 +66,7 @@ def too_short(s: Examination) -> Iterator[Issue]:
     seconds = duration_s(rows, measured_rate_hz(s.frames.device_ms))
     # A clock that stands still gives no duration.
     if seconds < s.limits.short_s and not rows_at_one_time(s.frames.device_ms):
-        message = f"holds {_plural(rows, 'row')} ({seconds:.2f} s): too short for a gesture"
-        yield Issue(Sentence(message, "too_short", rows=rows, seconds=round(seconds, 3)))
+        yield Issue(Message("holds {rows:row} ({seconds:.2f} s): too short for a gesture", rows=rows, seconds=seconds))
 
 
 def garbage(s: Examination) -> Iterator[Issue]:
@@ -83,9 +80,8 @@ def garbage(s: Examination) -> Iterator[Issue]:
         n, row = int(outside.sum()), s.row(int(np.argmax(rows)))
         least, most = s.layout.valid_min_int, s.layout.valid_max_int
         beyond = np.maximum(least - values, values - most) > _BEYOND * (most - least)
-        message = f"{_plural(n, 'value')} outside the valid range ({', '.join(names)}; first in row {row})"
         yield Issue(
-            Sentence(message, "out_of_range", n=n, channels=names, row=row),
+            Message("{n:value} outside the valid range ({channels}; first in row {row})", n=n, channels=names, row=row),
             _ranges(np.flatnonzero(rows), s),
             tuple(channels),
             severity="error" if beyond.any() and not s.stream else _weight(float(rows.mean()), s.limits),
@@ -98,9 +94,7 @@ def blank_rows(s: Examination) -> Iterator[Issue]:
     if sum(not ch.is_discrete for ch in s.layout.channels) > 1 and rows.any():
         n, row = int(rows.sum()), s.row(int(np.argmax(rows)))
         yield Issue(
-            Sentence(
-                f"{_plural(n, 'row')} in which every channel reads 0 (first row {row})", "blank_rows", n=n, row=row
-            ),
+            Message("{n:row} in which every channel reads 0 (first row {row})", n=n, row=row),
             _ranges(np.flatnonzero(rows), s),
             severity=_weight(float(rows.mean()), s.limits),
         )
@@ -125,11 +119,12 @@ def spikes(s: Examination) -> Iterator[Issue]:
     failed = far & (size > _FAILED * usual) & (usual >= _MOVES)
     if len(rows):
         n, row = len(rows), s.row(rows[0])
-        message = (
-            f"{_plural(n, 'row')} in which a value jumps far away and back (first row {row}): a reading that failed?"
-        )
         yield Issue(
-            Sentence(message, "spikes", n=n, row=row),
+            Message(
+                "{n:row} in which a value jumps far away and back (first row {row}): a reading that failed?",
+                n=n,
+                row=row,
+            ),
             _ranges(rows, s),
             severity="error" if failed.any() else _weight(len(rows) / len(values), s.limits),
         )
@@ -137,12 +132,12 @@ def spikes(s: Examination) -> Iterator[Issue]:
 
 def malformed(s: Examination) -> Iterator[Issue]:
     if s.malformed:
-        yield Issue(Sentence(f"{_plural(s.malformed, 'malformed line')} left out", "malformed", n=s.malformed))
+        yield Issue(Message("{n:malformed line} left out", n=s.malformed))
 
 
 def cut_line(s: Examination) -> Iterator[Issue]:
     if s.cut:
-        yield Issue(Sentence("the last line is cut off: left out", "cut_line"))
+        yield Issue(Message("the last line is cut off: left out"))
 
 
 def format_duration(ms: float) -> str:
@@ -156,12 +151,16 @@ def format_duration(ms: float) -> str:
 def clock_still(s: Examination) -> Iterator[Issue]:
     n, of = rows_at_one_time(s.frames.device_ms), len(s.frames)
     if n:
-        share = f"all {of} rows have one time" if n == of else f"{n} rows in turn have one time"
-        message = (
-            f"the clock stands still: {share} (were digits lost in a spreadsheet, or as float32? export the times "
-            "again, or give row_rate_hz in a pattern)"
+        template = (
+            "the clock stands still: all {n} rows have one time (were digits lost in a spreadsheet, or as float32? "
+            "export the times again, or give row_rate_hz in a pattern)"
         )
-        yield Issue(Sentence(message, "clock_still" if n == of else "clock_stalls", n=n))
+        if n < of:
+            template = (
+                "the clock stands still: {n} rows in turn have one time (were digits lost in a spreadsheet, or as "
+                "float32? export the times again, or give row_rate_hz in a pattern)"
+            )
+        yield Issue(Message(template, n=n))
 
 
 def clock_reset(s: Examination) -> Iterator[Issue]:
@@ -172,20 +171,21 @@ def clock_reset(s: Examination) -> Iterator[Issue]:
         of_stream = "info" if len(back) and back.max() < _LEFT_OVER else "warning"
     if len(back):
         n, row, by = len(back), s.row(back[0]), format_duration(-int(s.steps[back[0]]))
-        message = f"the device clock runs backwards {n}× (first after row {row}, by {by})"
         yield Issue(
-            Sentence(message, "clock_back", n=n, row=row, by=by),
+            Message("the device clock runs backwards {n}× (first after row {row}, by {by})", n=n, row=row, by=by),
             _ranges(back, s, 2),
             severity=of_stream,
         )
     if len(s.jumps):
         n, row, most = len(s.jumps), s.row(s.jumps[0]), format_duration(int(s.steps[s.jumps].max()))
-        message = (
-            f"the device clock leaps ahead {n}× (first after row {row}, at most {most}) while hardly any time passes "
-            "on the computer"
-        )
         yield Issue(
-            Sentence(message, "clock_ahead", n=n, row=row, most=most),
+            Message(
+                "the device clock leaps ahead {n}× (first after row {row}, at most {most}) while hardly any time "
+                "passes on the computer",
+                n=n,
+                row=row,
+                most=most,
+            ),
             _ranges(s.jumps, s, 2),
             severity="info" if s.jumps.max() < _LEFT_OVER else of_stream,
         )
@@ -195,9 +195,8 @@ def clock_value(s: Examination) -> Iterator[Issue]:
     """Find single rows with an impossible time, as where the recorder could not read the clock and wrote 0."""
     if len(s.stray):
         n, row = len(s.stray), s.row(int(s.stray[0]))
-        message = f"{_plural(n, 'row')} with an impossible clock value between possible ones (first row {row})"
         yield Issue(
-            Sentence(message, "clock_value", n=n, row=row),
+            Message("{n:row} with an impossible clock value between possible ones (first row {row})", n=n, row=row),
             _ranges(s.stray, s),
             severity=_weight(n / len(s.frames), s.limits),
         )
@@ -208,8 +207,10 @@ def out_of_order(s: Examination) -> Iterator[Issue]:
     _, late = s.back
     if len(late):
         n, row, by = len(late), s.row(int(late[0]) + 1), format_duration(-int(s.steps[late].min()))
-        message = f"{_plural(n, 'row')} out of order by the device clock (first row {row}, by at most {by})"
-        yield Issue(Sentence(message, "out_of_order", n=n, row=row, by=by), _ranges(late, s, 2))
+        yield Issue(
+            Message("{n:row} out of order by the device clock (first row {row}, by at most {by})", n=n, row=row, by=by),
+            _ranges(late, s, 2),
+        )
 
 
 def gaps(s: Examination) -> Iterator[Issue]:
@@ -217,9 +218,14 @@ def gaps(s: Examination) -> Iterator[Issue]:
         longest = int(s.ordered_steps[s.gaps].max())
         at = int(s.gaps[int(np.argmax(s.ordered_steps[s.gaps]))])
         n, limit, row = len(s.gaps), round(s.gap_ms), s.row(at)
-        message = f"{_plural(n, 'gap')} over {limit} ms, the longest {longest} ms (after row {row})"
         yield Issue(
-            Sentence(message, "gaps", n=n, limit=limit, longest=longest, row=row),
+            Message(
+                "{n:gap} over {limit} ms, the longest {longest} ms (after row {row})",
+                n=n,
+                limit=limit,
+                longest=longest,
+                row=row,
+            ),
             _ranges(s.gaps, s, 2),
             severity="error" if not s.stream and longest > s.limits.long_gap_ms else None,
         )
@@ -245,9 +251,13 @@ def lost_frames(s: Examination) -> Iterator[Issue]:
             lost, share = counted, counted / (counted + len(s.frames))
     if lost >= _FEW_LOST and share > s.limits.lost:
         of = lost + len(s.frames)
-        message = f"about {lost} of {of} frames are lost ({100 * share:.1f} %) by the device clock"
         yield Issue(
-            Sentence(message, "lost_frames", n=lost, of=of, percent=round(100 * share, 1)),
+            Message(
+                "about {n} of {of} frames are lost ({percent:.1f} %) by the device clock",
+                n=lost,
+                of=of,
+                percent=100 * share,
+            ),
             _ranges(long, s, 2),
         )
 
@@ -257,10 +267,13 @@ def jitter(s: Examination) -> Iterator[Issue]:
         return
     low, high = s.spread_ms
     if s.jitters:
-        message = f"the time between frames varies from {low:.0f} to {high:.0f} ms (median {s.period_ms:.0f} ms)"
-        message += ": frames are stamped several at once" if s.in_bursts else ""
-        values = {"low": round(low), "high": round(high), "median": round(s.period_ms)}
-        yield Issue(Sentence(message, "jitter_bursts" if s.in_bursts else "jitter", **values))
+        template = "the time between frames varies from {low:.0f} to {high:.0f} ms (median {median:.0f} ms)"
+        if s.in_bursts:
+            template = (
+                "the time between frames varies from {low:.0f} to {high:.0f} ms (median {median:.0f} ms): frames are "
+                "stamped several at once"
+            )
+        yield Issue(Message(template, low=low, high=high, median=s.period_ms))
 
 
 def rate(s: Examination) -> Iterator[Issue]:
@@ -272,8 +285,13 @@ def rate(s: Examination) -> Iterator[Issue]:
         return
     measured = 1000.0 * len(even) / float(even.sum())
     if abs(measured - nominal) > s.limits.rate * nominal:
-        message = f"measured {measured:.1f} Hz, but the rate of the layout is {nominal:g} Hz"
-        yield Issue(Sentence(message, "rate", measured=round(measured, 1), nominal=nominal))
+        yield Issue(
+            Message(
+                "measured {measured:.1f} Hz, but the rate of the layout is {nominal:g} Hz",
+                measured=measured,
+                nominal=nominal,
+            )
+        )
 
 
 def resumed(s: Examination) -> Iterator[Issue]:
@@ -289,11 +307,13 @@ def resumed(s: Examination) -> Iterator[Issue]:
     # The time zone of the recorder, and so midnight, is unknown: guess from the length of the pause.
     days = longest > _NIGHT_MS
     n, most, row = len(at), format_duration(longest), s.row(at[0])
-    message = (
-        f"goes on after a pause {n}× (the longest {most} by the computer's clock, first after row {row}"
-        f"{', most likely on another day' if days else ''})"
-    )
+    template = "goes on after a pause {n}× (the longest {most} by the computer's clock, first after row {row})"
+    if days:
+        template = (
+            "goes on after a pause {n}× (the longest {most} by the computer's clock, first after row {row}, most "
+            "likely on another day)"
+        )
     yield Issue(
-        Sentence(message, "resumed_days" if days else "resumed", n=n, most=most, row=row),
+        Message(template, n=n, most=most, row=row),
         _ranges(at, s, 2),
     )

@@ -58,11 +58,14 @@ def recorded_frames(dataset: Dataset, layout: Layout, *, subjects: Sequence[str]
     """
     if not dataset.layout.reads_as(layout):
         raise ConfigError(
-            f"The data set '{dataset.head.name}' holds layout '{dataset.layout.name}' "
-            f"({', '.join(dataset.layout.names)}), but the model reads '{layout.name}' ({', '.join(layout.names)}), "
+            "The data set '{name}' holds layout '{layout}' ({names}), but the model reads '{model_layout}' "
+            "({model_names}), "
             "or other units or steps: give recordings of the model's layout.",
-            reason="vectors_layout",
             name=dataset.head.name,
+            layout=dataset.layout.name,
+            names=", ".join(dataset.layout.names),
+            model_layout=layout.name,
+            model_names=", ".join(layout.names),
         )
     known = sorted({r.subject for r in dataset.recordings} | {s.subject for s in dataset.streams})
     for subject in subjects:
@@ -217,36 +220,43 @@ class Export:
             comparison = compare(answers_of(self.model, frames), answers.astype("<i4").tobytes(), self.labels)
             if comparison.first:
                 raise BadInput(
-                    f"The golden vectors in '{self.folder / GOLDEN}' are not those of {BUNDLE}: they are damaged, or "
-                    f"of another model ({comparison.first}); export the model again.",
-                    reason="export_damaged",
+                    "The golden vectors in '{path}' are not those of {bundle}: they are damaged, or of another model "
+                    "({first}); export the model again.",
+                    path=self.folder / GOLDEN,
+                    bundle=BUNDLE,
+                    first=comparison.first,
                     name=self.folder.name,
                 )
 
     def _require_file(self, name: str) -> Path:
         path = self.folder / name
         if not path.is_file():
-            message = f"The export '{self.folder}' lacks {name}: export the model again."
-            raise BadInput(message, reason="export_damaged", name=self.folder.name)
+            raise BadInput("The export '{path}' lacks {file}: export the model again.", path=self.folder, file=name)
         return path
 
     def _read_file(self, name: str) -> bytes:
         try:
             return read_bytes(self._require_file(name), MOST_FILE_BYTES)
         except OSError as cause:
-            message = f"'{self.folder / name}' cannot be read ({cause.strerror or cause}): export the model again."
-            raise BadInput(message, reason="export_damaged", name=self.folder.name) from None
+            raise BadInput(
+                "'{folder}' cannot be read ({why}): export the model again.",
+                folder=self.folder / name,
+                why=cause.strerror or cause,
+                name=self.folder.name,
+            ) from None
 
     def require_unchanged(self) -> None:
         """Raise BadInput if files were changed, as running changed code is not safe, and vouching for it not honest."""
         if self.changed:
             one = len(self.changed) == 1
             raise BadInput(
-                f"{', '.join(self.changed)} in '{self.folder}' {'is' if one else 'are'} not what this PlushSense "
-                f"writes for {BUNDLE}, and nothing was compiled: export the model again, or give --trust to verify the "
-                "folder all the same, which runs its C on this computer.",
-                reason="export_changed",
+                "{files} in '{folder}' {more} not what this PlushSense writes for {bundle}, and nothing was "
+                "compiled: export the model again, or give --trust to verify the folder all the same, which runs its "
+                "C on this computer.",
                 files=", ".join(self.changed),
+                folder=self.folder,
+                more="is" if one else "are",
+                bundle=BUNDLE,
             )
 
     def code(self, room: Path) -> Path:
@@ -333,8 +343,9 @@ class Export:
                 break
             rows += max(samples - n_samples, rows // 4)
         if not len(frames):
-            message = f"The data set '{dataset.head.name}' holds nothing to stream: give another one."
-            raise ConfigError(message, reason="vectors_empty", name=dataset.head.name)
+            raise ConfigError(
+                "The data set '{name}' holds nothing to stream: give another one.", name=dataset.head.name
+            )
         name = "simulated recordings" if dataset.head.simulated else "recordings"
         return [self.answered(name, part) for part in in_parts(frames)]
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from plushsense.core.errors import BuildError, ProgramError, ToolError
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.deploy.emit import IMAGE, LIBRARY, MODEL
 from plushsense.deploy.proof.mutants import RULES, Mutant, mutants_of
 from plushsense.deploy.proof.vectors import Counts, Export, RowComparison, Vectors, compare, counted
@@ -293,14 +293,13 @@ def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[li
             require(name)
         runnable += here
         if not here:
-            not_run.append((name, next(iter(lacks.values()), Sentence("no setting was selected", reason="no_setting"))))
+            not_run.append((name, next(iter(lacks.values()), Message("no setting was selected"))))
         else:
             not_run += [(f"{name}, {s.compiler} {s.options}", why) for s, why in lacks.items() if why]
     if not runnable:
         raise ToolError(
-            "Nothing can be checked here, because no compiler is installed: install one "
-            f"({'; '.join(f'{name}: {why}' for name, why in not_run)}).",
-            reason="no_compiler",
+            "Nothing can be checked here, because no compiler is installed: install one ({not_run}).",
+            not_run="; ".join(f"{name}: {why}" for name, why in not_run),
         )
     return runnable, not_run
 
@@ -312,7 +311,7 @@ def _lacks(setting: Setting) -> str:
         missing.append("g++")
     if missing:
         packages = " ".join(missing)
-        return Sentence(f"not installed: Debian's {packages}", reason="not_installed", packages=packages)
+        return Message("not installed: Debian's {packages}", packages=packages)
     return _no_sanitizers(setting) if SANITIZERS[0] in setting.flags else ""
 
 
@@ -325,8 +324,9 @@ def _no_sanitizers(setting: Setting) -> str:
             build(setting.target, [source], Path(work), cc=setting.cc, flags=setting.flags).run()
         except ToolError:
             also = " (Debian's libclang-rt-dev)" if setting.compiler == "clang" else ""
-            message = f"{setting.compiler} makes no program with sanitizers here{also}"
-            return Sentence(message, reason="no_sanitizers", compiler=setting.compiler)
+            return Message(
+                "{compiler} makes no program with sanitizers here{also}", compiler=setting.compiler, also=also
+            )
     return ""
 
 

@@ -11,7 +11,7 @@ from typing import Self
 
 import numpy as np
 
-from plushsense.core.errors import ConfigError, DeviceError
+from plushsense.core.errors import AddressError, ConfigError, DeviceError
 from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Layout
 from plushsense.devices.base import Counters, Frame, PacedDevice, now_ms
 from plushsense.devices.opening import DeviceAddress
@@ -391,7 +391,7 @@ class VirtualDevice(PacedDevice):
                 return None
             if self._next is not None and not self._next.connected:
                 self._parser.finish()
-                raise DeviceError(f"'{self.url}' went away: so its scenario says.", reason="toy_gone", url=self.url)
+                raise DeviceError("'{url}' went away: so its scenario says.", url=self.url)
         return self._parser.frames(b"".join(line.data for line in lines), now_ms())
 
     def _take(self) -> ToyLine:
@@ -416,7 +416,7 @@ class VirtualDevice(PacedDevice):
             return None
         while self._next_ms() is not None and self._next is not None and not self._next.connected:
             if self._pacer.due_s(self._next.passed_ms) > 0.0:
-                raise DeviceError(f"'{self.url}' is not connected.", reason="toy_unreachable", url=self.url)
+                raise DeviceError("'{url}' is not connected.", url=self.url)
             self._take()
         self.closed = False
         self.counters = Counters()
@@ -441,8 +441,9 @@ def open_virtual(address: DeviceAddress, layout: Layout) -> VirtualDevice:
     if "scenario" in address.query:
         for key in _NOT_WITH_SCENARIO:
             if key in address.query:
-                message = f"'{address.url}': the scenario says the {key}; leave {key} out."
-                raise ConfigError(message, reason="toy_setting", key=key, known="scenario")
+                raise AddressError(
+                    "'{url}': the scenario says the {key}; leave {key} out.", url=address.url, key=key, known="scenario"
+                )
         seed = address.whole("seed", 0) if "seed" in address.query else None
         spec = ToySpec.of(load_scenario(address.query["scenario"]), seed, lost, garbled, glitch)
     else:

@@ -22,7 +22,7 @@ import numpy as np
 
 from plushsense.core.errors import BadInput, ConfigError, python_warning
 from plushsense.core.files import write_file
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.search.halving import (
@@ -160,19 +160,28 @@ def prepare(
     costs = Costs(epoch, spec, len(settled.seeds))
     costs.check()
     if spec.share is None and costs.share > QUARTER:
-        sentence = (
-            f"{len(last.trials)} networks are too few to find the best for a quarter of their cost: up to "
-            f"{costs.share:.0%} may be spent"
+        warn(
+            Message(
+                "{n} networks are too few to find the best for a quarter of their cost: up to {share:.0%} may be spent",
+                n=len(last.trials),
+                share=costs.share,
+                percent=round(100 * costs.share),
+            )
         )
-        warn(Sentence(sentence, "few_networks", n=len(last.trials), percent=round(100 * costs.share)))
     over = dict.fromkeys(arch for arch in archs if spec.over(arch))
     if over:
         filters: dict[str, list[str]] = {}
         for arch in over:
             filters.setdefault(arch.symbol, []).append(slashed(arch.filters))
         named = "; ".join(f"{symbol} with {', '.join(several)}" for symbol, several in filters.items())
-        sentence = f"{len(over)} of {len(dict.fromkeys(archs))} networks are beyond the limits and left out: {named}"
-        warn(Sentence(sentence, "beyond_limits", n=len(over), of=len(dict.fromkeys(archs)), names=named))
+        warn(
+            Message(
+                "{n} of {of} networks are beyond the limits and left out: {names}",
+                n=len(over),
+                of=len(dict.fromkeys(archs)),
+                names=named,
+            )
+        )
     return SearchPlan(settled, spec, tuple(plans), costs, tuple(over))
 
 

@@ -526,7 +526,11 @@ def path_in(workspace: Workspace, kind: str, name: str) -> Path:
     """
     place = workspace.inside(workspace.folder / kind / name)
     if place.parent != workspace.folder / kind or len(place.name.encode()) > _MAX_NAME:
-        raise ConfigError(f"'{name}' cannot be a name in '{workspace.folder / kind}'.", reason="name_bad", name=name)
+        raise ConfigError(
+            "“{name}” cannot be a name. Use at most 64 letters, digits, spaces, points and hyphens.",
+            name=name,
+            field="name",
+        )
     return place
 
 

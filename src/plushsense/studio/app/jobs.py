@@ -18,6 +18,7 @@ from typing import Any
 
 from plushsense.core.errors import ConfigError
 from plushsense.core.files import write_file
+from plushsense.core.sentences import Message
 from plushsense.studio.app.workspace import WORK, ChangeSignal, Workspace
 
 UNFINISHED = ".unfinished-"
@@ -39,8 +40,8 @@ class StudioJob:
         id: unique number as a string; later jobs have larger numbers.
         task: a key of `plushsense.studio.tasks.TASKS`.
         spec: the argument of the task, as JSON values.
-        state: `RUNNING`, `DONE`, `REFUSED` (``message`` says why; ``reason`` and ``values`` are those of the error) or
-            `STOPPED` (by a person, or because the process or the studio ended).
+        state: `RUNNING`, `DONE`, `REFUSED` or `STOPPED` (by a person, or because the process or the studio ended).
+        refusal: why the task failed, as `Message.to_json` has it; {} if it did not.
         warnings: arguments of `plushsense.studio.app.words.Words.sentence`.
         progress: the newest report of the task, as JSON values; ``reports`` has earlier ones too, thinned out if many.
         result: the value that the task returned.
@@ -56,11 +57,14 @@ class StudioJob:
     reports: list[dict[str, Any]] = field(default_factory=list)
     warnings: list[Any] = field(default_factory=list)
     result: dict[str, Any] = field(default_factory=dict)
-    message: str = ""
-    reason: str = ""
-    values: dict[str, Any] = field(default_factory=dict)
+    refusal: dict[str, Any] = field(default_factory=dict)
     begun_s: float = 0.0
     ended_s: float = 0.0
+
+    @property
+    def message(self) -> str:
+        """Why the task failed, in English; "" if it did not."""
+        return str(self.refusal.get("message", ""))
 
 
 class Jobs:
@@ -80,7 +84,7 @@ class Jobs:
         for path in sorted(self._folder.glob("*.json")):
             with contextlib.suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
                 stored = json.loads(path.read_text(encoding="utf-8"))
-                job = StudioJob(**{"message": stored.pop("said", ""), **stored})
+                job = StudioJob(**stored)
                 if job.id != path.stem:
                     continue
                 if job.spec.get("dry"):
@@ -101,8 +105,7 @@ class Jobs:
         try:
             return self._jobs[identity]
         except KeyError:
-            message = f"There is no job '{identity}': it may have been removed."
-            raise ConfigError(message, reason="job_gone") from None
+            raise ConfigError("This job is not in the list any more.") from None
 
     def start(self, task: str, spec: dict[str, Any], title: str) -> StudioJob:
         """Start a task in a separate process."""
@@ -120,8 +123,7 @@ class Jobs:
         for job in self.all():
             if job.state == RUNNING and str(path) in map(str, job.spec.values()):
                 raise ConfigError(
-                    f"'{job.title}' is running and uses '{path.name}': wait for it, or stop it first.",
-                    reason="in_use",
+                    "“{name}” is in use by the job “{job}”. Wait for it, or stop it first.",
                     job=job.title,
                     name=path.name,
                 )
@@ -143,8 +145,7 @@ class Jobs:
         with self._lock:
             if job.state == RUNNING:
                 return job
-            job.state, job.message, job.result, job.reports, job.warnings = RUNNING, "", {}, [], []
-            job.reason, job.values = "", {}
+            job.state, job.refusal, job.result, job.reports, job.warnings = RUNNING, {}, {}, [], []
         self._run(job)
         return job
 
@@ -157,7 +158,7 @@ class Jobs:
         job = self.get(identity)
         with self._lock:
             if job.state == RUNNING:
-                raise ConfigError(f"'{job.title}' is running: stop it first.", reason="job_running", job=job.title)
+                raise ConfigError("The job “{job}” is running. Stop it first.", job=job.title)
             (self._folder / f"{job.id}.json").unlink(missing_ok=True)
             self._jobs.pop(job.id, None)
         self.changed.notify()
@@ -197,8 +198,8 @@ class Jobs:
         except OSError as cause:
             where = cause.filename or self._folder
             why = str(cause.strerror or cause)
-            job.state, job.message = REFUSED, f"The work cannot begin: '{where}': {why}."
-            job.reason, job.values = "system", {"where": f" ('{where}')", "why": why}
+            message = Message("The computer refused: {why}{where}.", why=why, where=f" ('{where}')")
+            job.state, job.refusal = REFUSED, message.to_json()
             job.ended_s = time.time()
             self.changed.notify()
             return
@@ -242,8 +243,7 @@ class Jobs:
             if "result" in outcome:
                 job.state, job.result = DONE, outcome["result"]
             elif "refused" in outcome:
-                job.state, job.message = REFUSED, str(outcome["refused"])
-                job.reason, job.values = outcome.get("reason", ""), outcome.get("values", {})
+                job.state, job.refusal = REFUSED, outcome["refused"]
             else:
                 job.state = STOPPED
             with contextlib.suppress(OSError):
@@ -257,7 +257,6 @@ class Jobs:
     def _store(self, job: StudioJob) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
         stored = asdict(job)
-        stored["said"] = stored.pop("message")
         for key in _SECRET_KEYS:
             stored["spec"].pop(key, None)
         write_file(self._folder / f"{job.id}.json", json.dumps(stored, default=str))

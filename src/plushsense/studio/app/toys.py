@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from plushsense.core.errors import ConfigError, DeviceError, PlushSenseError
 from plushsense.core.layouts import Layout, layout_names
 from plushsense.core.recorder_csv import Frames
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.devices.base import Device, Frame
 from plushsense.devices.opening import (
     DEFAULT_LAYOUT,
@@ -160,7 +160,7 @@ class TappedDevice(Device):
         return list(getattr(self.device, "gaps", ()))
 
     @property
-    def mismatch(self) -> Sentence:
+    def mismatch(self) -> Message:
         """As in `Device`, of the wrapped device."""
         return self.device.mismatch
 
@@ -221,16 +221,15 @@ def _unfit(url: str, device: Device) -> DeviceError:
     layout, malformed = device.layout.name, device.counters.malformed
     if malformed:
         return DeviceError(
-            f"'{url}' sends lines ({malformed}) that are no frames of the layout '{layout}': "
-            f"name its layout, as in ?layout=plush-14 at the end of the address. {device.mismatch}".rstrip(),
-            reason="toy_unreadable",
+            "{url} sends {lines} lines that are not of the layout {layout}. {why}",
             url=url,
             layout=layout,
             lines=malformed,
             why=device.mismatch,
         )
-    message = f"'{url}' sent nothing within {_TIMEOUT_S:g} s: check that the toy is switched on."
-    return DeviceError(message, reason="toy_silent", url=url, s=f"{_TIMEOUT_S:g}")
+    return DeviceError(
+        "{url} sent nothing for {s} s. Check that the toy is switched on and near.", url=url, s=f"{_TIMEOUT_S:g}"
+    )
 
 
 @dataclass
@@ -316,7 +315,7 @@ class Toys:
             trial.result = self.test(trial.url)
         except Exception as cause:  # noqa: BLE001, RUF100
             trial.error = cause
-        unreadable = getattr(trial.error, "reason", "") == "toy_unreadable"
+        unreadable = isinstance(trial.error, PlushSenseError) and "lines" in trial.error.message.values
         if unreadable or (trial.result is not None and not trial.result.fits):
             trial.layout = self._fitting_layout(trial.url)
         trial.running = False
@@ -335,8 +334,7 @@ class Toys:
     def person(self, number: int) -> str:
         """Choose the virtual toy used by virtual person ``number``, and return its URL."""
         if not 1 <= number <= PERSONS:
-            message = f"There is no virtual person {number}: give 1 to {PERSONS}."
-            raise ConfigError(message, reason="no_virtual_person", n=number, most=PERSONS)
+            raise ConfigError("There is no virtual person {n}. Choose one from 1 to {most}.", n=number, most=PERSONS)
         return self.choose(f"virtual://?person={number}")
 
     @property
@@ -353,7 +351,7 @@ class Toys:
         """
         url = url or self._workspace.toy
         if not url:
-            raise ConfigError("No toy is chosen: choose one first.", reason="no_toy")
+            raise ConfigError("No toy is chosen. Choose one first.", field="toy")
         url = with_speed(url, self._workspace.speed)
         speed = speed_of(url) or 1.0
         frames, first, last = 0, None, None

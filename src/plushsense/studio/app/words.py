@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import gettext
-import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +14,15 @@ from babel import Locale
 from babel.messages.catalog import Catalog
 from babel.messages.pofile import read_po
 
-from plushsense.core.errors import PlushSenseError, single_stops
-from plushsense.core.sentences import Sentence
+from plushsense.core.errors import PlushSenseError
+from plushsense.core.sentences import Filler, Message, single_stops
 
 LANGUAGES = {"en": "English", "lv": "Latviešu"}
-"""Maps language code to name. Each language but English has a file ``locale/<code>.po`` of translations."""
+"""Maps language code to name.
+
+The file ``locale/<code>.po`` has the translations. That of English only rewords messages of the library that are
+written for the command line.
+"""
 
 Texts = Mapping[str, str]
 """Annotation of a table of English texts that `Words` translates; a test looks for texts in such tables, too."""
@@ -62,7 +64,6 @@ class Words:
     def __init__(self, language: str) -> None:
         self.language = language if language in LANGUAGES else next(iter(LANGUAGES))
         self._catalog, self._plural_form = _catalog(self.language)
-        self._texts = _sentences(self.language)
         symbols = Locale(self.language).number_symbols["latn"]
         self.decimal_point, self._group = symbols["decimal"], symbols["group"]
 
@@ -105,50 +106,34 @@ class Words:
         """Return the name of a sensor channel in this language, or ``name`` itself if it has none."""
         return self(in_context("channel", name))
 
-    def sentence(self, sentence: str | Mapping[str, Any]) -> str:
-        """Return a `Sentence` of the library, or the table of its `to_dict`, in this language.
+    def sentence(self, message: str | Mapping[str, Any]) -> str:
+        """Return a `Message` of the library, or its JSON, in this language.
 
         Any other text is quoted, with a remark that it is in English; "" stays "".
         """
-        if isinstance(sentence, Sentence):
-            sentence = sentence.to_dict()
-        elif isinstance(sentence, str):
-            sentence = {"message": sentence}
-        text = self._texts.get(f"{sentence.get('reason')}")
-        if text:
-            values = {key: self._value(key, value) for key, value in sentence.get("values", {}).items()}
+        return self._translated(message, "(In English:) {message}")
+
+    def error(self, error: PlushSenseError | Message) -> str:
+        """Return the sentence of an error in this language, see `failure`."""
+        return self.failure(error.message if isinstance(error, PlushSenseError) else error)
+
+    def failure(self, message: str | Mapping[str, Any]) -> str:
+        """Return a `Message` about something that failed, or its JSON, in this language; "" for none.
+
+        One without a translation is quoted, with a remark that it is in English.
+        """
+        return self._translated(message, "It did not work. The program says in English: {message}")
+
+    def _translated(self, message: str | Mapping[str, Any], quoted: str) -> str:
+        if isinstance(message, str):
+            message = message.to_json() if isinstance(message, Message) else {"message": message}
+        translation = self._translation(message["template"]) if message.get("template") else ""
+        if translation:
             # A stored job of another version may lack a value.
             with suppress(KeyError):
-                return single_stops(text.format(**values))
-        return self._texts["note"].format(message=sentence["message"]) if sentence["message"] else ""
-
-    def _value(self, key: str, value: object) -> str:
-        if value is None or value == [] or value == ():
-            return self("none")
-        if isinstance(value, list | tuple):
-            return ", ".join(self._value(key, each) for each in value)
-        if isinstance(value, Sentence | Mapping):
-            return self.sentence(value)
-        if isinstance(value, float):
-            return f"{value:.10g}".replace(".", self.decimal_point)
-        if key in ("channel", "channels"):
-            return self.channel(str(value))
-        return self.gesture(str(value)) if key in ("gesture", "gestures") else str(value)
-
-    def error(self, error: PlushSenseError | Sentence) -> str:
-        """Return the sentence of an error, or another one of the library, in this language, see `explain`."""
-        return self.explain(str(error), error.reason, error.values)
-
-    def explain(self, message: str, reason: str = "", values: Mapping[str, object] | None = None) -> str:
-        """Return the sentence for the user about something that failed.
-
-        Args:
-            message: the sentence in English, as the command line prints it.
-            reason, values: those of the `PlushSenseError`. Without a text for ``reason``, ``message`` is quoted.
-        """
-        if f"{reason}" in self._texts:
-            return self.sentence({"message": message, "reason": reason, "values": values or {}})
-        return self._texts["other"].format(message=message) if message else ""
+                return single_stops(_ValueFiller(self).vformat(str(translation), (), message["values"]))
+        text = str(message.get("message", ""))
+        return self(quoted, message=text) if text and self.language != next(iter(LANGUAGES)) else text
 
     def unit(self, unit: str) -> str:
         """Return the name of a unit in this language, or ``unit`` itself if it has none."""
@@ -157,6 +142,33 @@ class Words:
     def affect(self, affect: str | None) -> str:
         """Return the name of an affect in this language; None means the same as "none"."""
         return self(AFFECTS[affect or "none"])
+
+
+class _ValueFiller(Filler):
+    """Fill values of a `Message` into its translation, in the form that the language has for them."""
+
+    def __init__(self, words: Words) -> None:
+        self._words = words
+
+    def get_value(self, key: int | str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+        return self._worded(str(key), kwargs[str(key)])
+
+    def _worded(self, key: str, value: Any) -> Any:
+        words = self._words
+        if value is None or value == [] or value == ():
+            return words("none")
+        if isinstance(value, list | tuple):
+            return [self._worded(key, each) for each in value]
+        if isinstance(value, Message | Mapping):
+            return words.sentence(value)
+        if key in ("channel", "channels"):
+            return words.channel(str(value))
+        return words.gesture(str(value)) if key in ("gesture", "gestures") else value
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if isinstance(value, float):
+            return format(value, format_spec or ".10g").replace(".", self._words.decimal_point)
+        return super().format_field(value, format_spec)
 
 
 @cache
@@ -168,9 +180,3 @@ def _catalog(language: str) -> tuple[Catalog, Callable[[int], int]]:
     with path.open("rb") as file:
         catalog = read_po(file)
     return catalog, gettext.c2py(catalog.plural_expr)
-
-
-@cache
-def _sentences(language: str) -> dict[str, str]:
-    text = resources.files(__package__).joinpath(f"words/{language}.toml").read_text(encoding="utf-8")
-    return dict(tomllib.loads(text)["sentences"])

@@ -154,9 +154,7 @@ class Workspace:
             if real in self.models or any(real == root or root in real.parents for root in self.roots()):
                 return real
         raise ConfigError(
-            f"'{path}' lies outside the studio's folders: choose something in '{self.folder}', or start the studio "
-            "with --dataset or --home for the other one.",
-            reason="outside",
+            "“{path}” is not in the studio's folder {folder}. Choose something inside it.",
             path=path,
             folder=self.folder,
         )
@@ -170,8 +168,9 @@ class Workspace:
         real = self.inside(path)
         if real.is_dir():
             if name in [self.title(other) for other in self.datasets() if other != path]:
-                message = f"Another data set is called '{name}': give another name."
-                raise ConfigError(message, reason="name_exists", name=name)
+                raise ConfigError(
+                    "“{name}” exists already. Give another name; nothing is replaced.", name=name, field="name"
+                )
             self._check_name(name)
             change_head(real, lambda head: replace(head, name=name))
             return real
@@ -187,8 +186,7 @@ class Workspace:
         """
         real = self.inside(path)
         if self.folder not in real.parents:
-            message = f"'{path}' lies outside the studio's folder: remove it there yourself."
-            raise ConfigError(message, reason="not_ours", path=path)
+            raise ConfigError("“{path}” is not in the studio's folder, so the studio does not remove it.", path=path)
         inside = real.relative_to(self.folder)
         place, number = self.folder / DISCARDED / inside, 2
         while place.exists():
@@ -214,8 +212,7 @@ class Workspace:
         inside = real.relative_to(self.folder / DISCARDED)
         place = self.folder / inside.with_name(inside.name.partition(_COPY)[0])
         if place.exists():
-            message = f"'{place.name}' exists again in '{place.parent}': rename or discard that first."
-            raise ConfigError(message, reason="exists_again", name=place.name)
+            raise ConfigError("There is another “{name}” in its place. Rename or discard that first.", name=place.name)
         place.parent.mkdir(parents=True, exist_ok=True)
         real.rename(place)
         return place
@@ -231,8 +228,7 @@ class Workspace:
     def _of_discarded(self, path: Path) -> Path:
         real = self.inside(path)
         if real not in self.discarded():
-            message = f"'{path}' is not discarded: it may have been restored or deleted already."
-            raise ConfigError(message, reason="not_discarded", name=real.name)
+            raise ConfigError("“{name}” is not among the discarded files any more.", name=real.name)
         return real
 
     def new(self, kind: str, name: str) -> Path:
@@ -244,8 +240,9 @@ class Workspace:
         plain = self._check_name(name)
         place = self.inside(Path(kind) / plain)
         if place.exists():
-            message = f"'{plain}' exists already in '{place.parent}': give another name, nothing is replaced."
-            raise ConfigError(message, reason="name_exists", name=Path(plain).stem)
+            raise ConfigError(
+                "“{name}” exists already. Give another name; nothing is replaced.", name=Path(plain).stem, field="name"
+            )
         return place
 
     @staticmethod
@@ -254,9 +251,9 @@ class Workspace:
         dotted = plain.startswith(".") or plain.endswith(".")
         if not 0 < len(plain) <= 64 or dotted or _NOT_PLAIN.search(plain) or DEVICE_NAME.match(plain):
             raise ConfigError(
-                f"'{name}' cannot be a name: give at most 64 letters, digits, spaces, points and hyphens.",
-                reason="name_bad",
+                "“{name}” cannot be a name. Use at most 64 letters, digits, spaces, points and hyphens.",
                 name=name,
+                field="name",
             )
         return plain
 

@@ -456,7 +456,7 @@ class WorkPanel:
             if last is not None:
                 bad = last.state == REFUSED
                 message = (
-                    words.explain(last.message, last.reason, last.values)
+                    words.failure(last.refusal)
                     if bad
                     else words("Stopped: {title}. Finished parts are kept.", title=title_of(words, last))
                 )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import PlushSenseError
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.files import sha256_of
 from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.deploy.convert import CONVERTERS
@@ -28,9 +28,9 @@ _NEEDS = {
 """The extra and the modules that an export format needs, by the first word of the format's name."""
 
 
-def _note(error: PlushSenseError, reason: str, path: Path) -> Sentence:
-    """Return the message of an error as a note; ``reason`` is that of an error without one."""
-    return Sentence.of(error) if error.reason else Sentence(str(error), reason=reason, name=path.stem)
+def _note(error: PlushSenseError, template: str, path: Path) -> Message:
+    """Return the message of an error; ``template`` is used for one that is not made of a template."""
+    return error.message if error.message.values else Message(template, name=path.stem)
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class BundleFacts:
 
     path: Path
     bundle: Bundle | None = None
-    problem: Sentence | None = None
-    cannot: Sentence | None = None
+    problem: Message | None = None
+    cannot: Message | None = None
     bytes: int = 0
 
     @classmethod
@@ -49,12 +49,22 @@ class BundleFacts:
         try:
             bundle = Bundle.load(path)
         except PlushSenseError as refusal:
-            return cls(path, problem=_note(refusal, "bundle_unreadable", path))
+            return cls(
+                path,
+                problem=_note(
+                    refusal,
+                    "The network “{name}” cannot be read: its file is damaged, or is none of PlushSense. Get another "
+                    "copy, or train it again.",
+                    path,
+                ),
+            )
         cannot = None
         try:
             integer_model(bundle)
         except PlushSenseError as refusal:
-            cannot = _note(refusal, "bundle_undeployable", path)
+            cannot = _note(
+                refusal, "The network “{name}” cannot run in a toy. Train it again with the default settings.", path
+            )
         return cls(path, bundle, cannot=cannot, bytes=path.stat().st_size)
 
     @property
@@ -74,7 +84,7 @@ class ExportFacts:
     """
 
     folder: Path
-    problem: Sentence | None = None
+    problem: Message | None = None
     facts: dict[str, Any] = field(default_factory=dict)
     files: dict[str, int] = field(default_factory=dict)
     digest: str = ""
@@ -102,7 +112,9 @@ class ExportFacts:
             files = {p.relative_to(folder).as_posix(): p.stat().st_size for p in list_package_files(folder)}
             return cls(folder, None, facts, files, folder_digest(folder), (folder / FACTS).stat().st_mtime)
         except PlushSenseError as refusal:
-            return cls(folder, problem=_note(refusal, "export_damaged", folder))
+            return cls(
+                folder, problem=_note(refusal, "The export “{name}” is damaged. Export the network again.", folder)
+            )
 
 
 def exports_of(workspace: Workspace) -> list[Path]:

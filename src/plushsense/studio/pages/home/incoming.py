@@ -20,8 +20,10 @@ from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY
 from plushsense.core.layouts import layout_names, load_layout
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.importing.archives import UnpackLimits, member_target
+from plushsense.dataset.importing.build import SIMULATED
+from plushsense.dataset.importing.importers import LAYOUT_GUESSED
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead
 from plushsense.models.bundle import Bundle
 from plushsense.studio.app.guard import UPLOAD_BYTES
@@ -59,6 +61,15 @@ _OF_DESKTOPS = (".DS_Store", "Thumbs.db", "desktop.ini")
 _MAX_LINES = 40
 
 
+def _about(file: str, note: Message) -> Message:
+    return Message("{file}: {note}", file=file, note=note)
+
+
+def _is_of_preview(note: str | dict[str, Any]) -> bool:
+    """Return whether the preview shows a note in another way."""
+    return isinstance(note, dict) and note["template"] in (SIMULATED.template, LAYOUT_GUESSED)
+
+
 class Incoming:
     """Uploaded files of one page, and the data set that is made of them, in a folder of their own.
 
@@ -69,7 +80,7 @@ class Incoming:
         self._workspace = workspace
         self.folder = workspace.folder / WORK / INCOMING / uuid.uuid4().hex
         self.dataset = self.folder / "dataset"
-        self.refused: list[Sentence] = []
+        self.refused: list[Message] = []
         self.bundles: list[str] = []
         """Names of the networks that were added."""
         self._names: list[str] = []
@@ -100,17 +111,18 @@ class Incoming:
             OSError: for errors of the disk.
         """
         target = member_target(unquote(file.name))
-        if isinstance(target, Sentence):
-            self.refused.append(Sentence(file.name, reason="about_file", file=unquote(file.name), note=target))
+        if isinstance(target, Message):
+            self.refused.append(_about(unquote(file.name), target))
             return
         if target.name in _OF_DESKTOPS:
             return
         kind = target.suffix.lower()
         self._count, self._bytes = self._count + 1, self._bytes + file.size()
         if self._count > _LIMITS.files or self._bytes > _LIMITS.total_bytes:
-            message = f"More than {_LIMITS.files} files or {_LIMITS.total_bytes / 1e9:g} GB: import them in parts."
             gb = f"{_LIMITS.total_bytes / 1e9:g}"
-            raise ConfigError(message, reason="upload_too_much", files=_LIMITS.files, gb=gb)
+            raise ConfigError(
+                "These are more than {files} files or {gb} GB. Import them in parts.", files=_LIMITS.files, gb=gb
+            )
         table = kind == ".csv" and parse_name(target.name) is None and target.name.lower() != STREAM_NAME
         alone = kind in (".zip", ".parquet", ".plush") or (table and len(target.parts) == 1)
         place = self.folder / ("single" if alone else "files") / (target.name if alone else target)
@@ -126,18 +138,17 @@ class Incoming:
         name = plain_name(stored.stem, "network")
         try:
             if stored.stat().st_size > BUNDLE_BYTES:
-                message = f"'{stored.name}' is larger than {BUNDLE_BYTES / 1e6:g} MB."
-                raise ConfigError(message, reason="bundle_too_large", mb=f"{BUNDLE_BYTES / 1e6:g}")
+                raise ConfigError("a network has at most {mb} MB", mb=f"{BUNDLE_BYTES / 1e6:g}")
             Bundle.load(stored)
             place = self._workspace.new(BUNDLES, f"{name}.plush")
             place.parent.mkdir(parents=True, exist_ok=True)
             stored.rename(place)
             self.bundles.append(name)
         except BundleError:
-            note = Sentence("it is no network of PlushSense, or a damaged one", reason="bundle_damaged")
-            self.refused.append(Sentence(stored.name, reason="about_file", file=stored.name, note=note))
+            note = Message("this is no network, or a damaged one")
+            self.refused.append(_about(stored.name, note))
         except ConfigError as refusal:
-            self.refused.append(Sentence(stored.name, reason="about_file", file=stored.name, note=Sentence.of(refusal)))
+            self.refused.append(_about(stored.name, refusal.message))
         finally:
             stored.unlink(missing_ok=True)
 
@@ -237,10 +248,7 @@ class IncomingSection:
         words, incoming, page = self._words, self._incoming, self._page
         problem, self._problem = self._problem, None
         refused, incoming.refused = incoming.refused, []
-        refused += [
-            Sentence(path, reason="about_file", file=path, note=Sentence("too large", reason="file_too_large", mb=_MB))
-            for path in end["large"]
-        ]
+        refused += [_about(path, Message("the file is larger than {mb} MB", mb=_MB)) for path in end["large"]]
         if end["cancelled"] or not end["ok"]:
             await self._cancel()
             with page.show_errors():
@@ -305,16 +313,17 @@ class IncomingSection:
         self._progress = None
         self._box.clear()
         with self._box, tag(ui.column().classes("ps-row w-full ps-small-gap"), "preview"):
-            reasons = [r["reason"]["reason"] for r in result.get("rejected", ()) if isinstance(r["reason"], dict)]
-            unknown_person = "person_unknown" in (job.reason, *reasons) or UNKNOWN_SUBJECT in result.get("people", ())
+            reasons = [r["reason"] for r in result.get("rejected", ())]
+            needs = {r["values"].get("needs") for r in (job.refusal, *reasons) if isinstance(r, dict) and r}
+            unknown_person = "person" in needs or UNKNOWN_SUBJECT in result.get("people", ())
             heading(words("What the files contain"), 3)
             if job.state == DONE:
                 self._contents(result)
-            elif job.reason != "person_unknown":
-                message = words.explain(job.message, job.reason, job.values) or words("stopped")
+            elif "person" not in needs:
+                message = words.failure(job.refusal) or words("stopped")
                 tag(notice(message, "error"), "preview-problem")
             if not result.get("restored"):
-                self._settings(str(result.get("layout", self._layout)), unknown_person, job.reason)
+                self._settings(str(result.get("layout", self._layout)), unknown_person, "layout" in needs)
             if job.state == DONE:
                 self._keep_row(result)
             else:
@@ -334,8 +343,7 @@ class IncomingSection:
         facts(rows)
         gestures = [f"{words.gesture(label)}: {n}" for label, n in sorted(result["gestures"].items())]
         self._lines("preview_gestures", gestures)
-        own = ("simulated", "layout_guessed")
-        notes = [words.sentence(n) for n in result["notes"] if not isinstance(n, dict) or n["reason"] not in own]
+        notes = [words.sentence(n) for n in result["notes"] if not _is_of_preview(n)]
         if result["flagged"]:
             notes.append(
                 words("Recordings with something to look at: {n}. The page Review shows them.", n=result["flagged"])
@@ -354,7 +362,7 @@ class IncomingSection:
             if len(lines) > _MAX_LINES:
                 ui.label(self._words("and {n} more", n=len(lines) - _MAX_LINES)).classes("ps-dim")
 
-    def _settings(self, current: str, unknown_person: bool, reason: str) -> None:
+    def _settings(self, current: str, unknown_person: bool, unknown_layout: bool) -> None:
         """Add the fields of what the files do not state: the layout, and the person where it is not known."""
         words = self._words
 
@@ -375,7 +383,7 @@ class IncomingSection:
             if current and not self._layout
             else ""
         )
-        if reason == "layout_unknown":
+        if unknown_layout:
             layout.error = words("It is not clear which sensors these files are from. Choose them.")
         if unknown_person or self._person:
             with ui.row().classes("items-start ps-small-gap w-full"):

@@ -15,7 +15,7 @@ from typing import Any
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import parse_name
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.importing.build import RECORDER
 from plushsense.dataset.marks import MARKS
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead, RecordingInfo, read_index
@@ -186,12 +186,10 @@ class Overview:
         return self._cache[path][1]
 
 
-def _refusal(path: Path, cause: Exception) -> Sentence:
-    if isinstance(cause, PlushSenseError) and cause.reason:
-        return Sentence.of(cause)
-    known = isinstance(cause, PlushSenseError)
-    message = str(cause) if known else f"'{path}' cannot be read: {getattr(cause, 'strerror', None) or cause}."
-    return Sentence(message, reason="entry_unreadable", path=path)
+def _refusal(path: Path, cause: Exception) -> Message:
+    if isinstance(cause, PlushSenseError) and cause.message.values:
+        return cause.message
+    return Message("This cannot be read: a file in it is damaged or missing ({path}).", path=str(path))
 
 
 def _dataset(path: Path) -> DatasetEntry:

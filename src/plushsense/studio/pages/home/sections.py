@@ -310,7 +310,7 @@ class JobList:
         else:
             ui.label(f"{words(_JOB_STATES[job.state])} · {moment(job.ended_s or job.begun_s)}").classes("ps-dim")
         if job.state == REFUSED:
-            ui.label(words.explain(job.message, job.reason, job.values)).classes("ps-bad ps-break")
+            ui.label(words.failure(job.refusal)).classes("ps-bad ps-break")
         if job.state == DONE:
             self._result(job)
         with ui.row().classes("items-center ps-small-gap"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from nicegui import ui
 
 from plushsense.core.errors import PlushSenseError
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.studio.app.shell import Page, button, on_change, on_page, tag
 from plushsense.studio.app.toys import PERSONS, Toys, ToyTrial, with_layout
 from plushsense.studio.app.words import Texts
@@ -114,7 +114,7 @@ class ToySection:
             error = trial.error
             if isinstance(error, PlushSenseError):
                 return "error", words.error(error)
-            return "error", words.explain(" ".join(str(error).split()) or type(error).__name__)
+            return "error", words.failure(" ".join(str(error).split()) or type(error).__name__)
         assert result is not None
         values = {"seconds": words.number(result.seconds, 1), "rate": words.number(result.rate_hz)}
         key = "good" if result.fits and result.on_time else "slow" if result.fits else "malformed"
@@ -127,7 +127,7 @@ class ToySection:
         given = [(url, "", words("given when the studio was started")) for url in self._page.workspace.devices]
         found = [d for d in toys.listing.devices if d.kind != "virtual"]
         # The description of a serial port is that of the system.
-        listed = [(d.url, d.name, words.sentence(a) if isinstance(a := d.description, Sentence) else a) for d in found]
+        listed = [(d.url, d.name, words.sentence(a) if isinstance(a := d.description, Message) else a) for d in found]
         with self._others:
             for url, name, about in [*given, *listed]:
                 with ui.row().classes("ps-row items-center justify-between w-full no-wrap"):

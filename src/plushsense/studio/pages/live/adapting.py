@@ -61,7 +61,7 @@ class Adapting:
         with self._lock:
             subject, choice = check_subject(subject.strip()), self._reader.choice
             if choice.bundle is None:
-                raise ConfigError("No network is in use: start a toy first.", reason="no_network")
+                raise ConfigError("No network is chosen. Choose one, or train one first.", field="network")
             bundle = Bundle.load(self._workspace.inside(choice.bundle))
             done = adapt(bundle, self._workspace.inside(recordings), subject=subject)
             if not done.accepted:

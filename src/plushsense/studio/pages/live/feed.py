@@ -13,7 +13,7 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
 from plushsense.core.errors import PlushSenseError
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.studio.app.guard import is_loopback
 from plushsense.studio.app.shell import AFFECT_COLOURS, AFFECT_SIGNS, LINES, on_change
@@ -103,7 +103,7 @@ _CLOCK_S = 0.001
 _MAX_BEHIND = 60
 """Number of unconfirmed messages after which sending pauses; a page confirms messages about once a second."""
 
-Message = dict[str, Any]
+FeedMessage = dict[str, Any]
 
 
 class Feed:
@@ -119,7 +119,7 @@ class Feed:
         explain: returns the sentence of an error in the language of the page.
     """
 
-    def __init__(self, reader: LiveReader, explain: Callable[[PlushSenseError | Sentence], str] = str) -> None:
+    def __init__(self, reader: LiveReader, explain: Callable[[PlushSenseError | Message], str] = str) -> None:
         self._reader, self._explain = reader, explain
         self.plot_s, self.decision_s = 1.0 / PLOT_HZ, PACE_S
         self.hidden = self.away = False
@@ -158,13 +158,13 @@ class Feed:
         self._generation = -1
         self._seen = self._sent
 
-    def scene(self) -> Message:
+    def scene(self) -> FeedMessage:
         """Return the whole state, for a page that opens or becomes visible, or after a change of toy or bundle."""
         reader = self._reader
         now, device, bundle = reader.now, reader.device, reader.bundle
         self._generation = now.generation
         self._change = self._performed = 0
-        scene: Message = {"window": WINDOW_S, "strip": STRIP_S, "simulated": reader.choice.simulated}
+        scene: FeedMessage = {"window": WINDOW_S, "strip": STRIP_S, "simulated": reader.choice.simulated}
         scene |= {"channels": [], "classes": [], "gate_rules": 0, "layout": "", "numbers": 0, "person": False}
         self._place = 0
         if device is not None and bundle is not None:
@@ -180,7 +180,7 @@ class Feed:
         self._rare = ()
         return scene | {"first": self._message(now, True, True)}
 
-    def message(self) -> tuple[str, Message] | None:
+    def message(self) -> tuple[str, FeedMessage] | None:
         """Return the method to call in the browser and its argument, or None if nothing should be sent."""
         if self.holds:
             return None
@@ -198,13 +198,13 @@ class Feed:
             return "scene", self.scene()
         return ("update", self._message(now, plot, decision)) if plot or decision else None
 
-    def _message(self, now: LiveState, plot: bool, decision: bool) -> Message:
+    def _message(self, now: LiveState, plot: bool, decision: bool) -> FeedMessage:
         """Return the signals, the decision, or both, as far as the page does not have them."""
         device = self._reader.device
         self._sent += 1
         if self._watched is None:
             self._watched = (self._sent, time.perf_counter())
-        message: Message = {
+        message: FeedMessage = {
             "n": self._sent,
             "t": round(now.t_s, 3),
             "at": round(1000.0 * now.arrived, 2),
@@ -221,10 +221,10 @@ class Feed:
             message["round"] = round(self._round_ms, 1)
         return message | self._decision(now) if decision else message
 
-    def _decision(self, now: LiveState) -> Message:
+    def _decision(self, now: LiveState) -> FeedMessage:
         # Integer thousandths are precise enough for the length of a bar.
         shares = now.probabilities
-        message: Message = {"p": None if shares is None else [round(1000.0 * p) for p in shares]}
+        message: FeedMessage = {"p": None if shares is None else [round(1000.0 * p) for p in shares]}
         if now.changes > self._change:
             message["spans"] = [_span(s) for s in self._reader.spans(self._change)]
             self._change = now.changes
@@ -233,7 +233,7 @@ class Feed:
             self._performed = now.performed
         # These values change rarely, so they are sent only after a change.
         situation = _situation(now.situation)
-        unread = now.mismatch if now.situation.kind == "unreadable" else Sentence()
+        unread = now.mismatch if now.situation.kind == "unreadable" else Message()
         warnings = [self._explain(each) for each in now.warnings if each != now.mismatch]
         rare = (situation, now.ended, now.next_gesture, unread, warnings)
         if rare != self._rare:
@@ -247,12 +247,12 @@ class Feed:
         return message
 
 
-def _situation(situation: Situation) -> Message:
+def _situation(situation: Situation) -> FeedMessage:
     sure = None if situation.confidence is None else round(100.0 * situation.confidence)
     return {**vars(situation), "confidence": sure}
 
 
-def _performed(performed: Performed) -> Message:
+def _performed(performed: Performed) -> FeedMessage:
     return {
         "id": performed.number,
         "from": round(performed.begin_s, 2),
@@ -261,7 +261,7 @@ def _performed(performed: Performed) -> Message:
     }
 
 
-def _span(span: EventSpan) -> Message:
+def _span(span: EventSpan) -> FeedMessage:
     return {
         "id": span.number,
         "from": round(span.begin_s, 2),

@@ -36,8 +36,6 @@ _RATES: Texts = {
 }
 
 _GRID = "display: grid; grid-template-columns: repeat(auto-fit, minmax(230px, 1fr)); gap: 12px; margin-top: 8px"
-_OF_NETWORK = ("no_network", "no_common_gesture", "toy_layout_differs")
-"""Reasons of errors that belong to the field of the network."""
 
 
 def show(page: Page) -> None:
@@ -179,7 +177,7 @@ class _Controls:
                 await asyncio.to_thread(command, *args)
                 done = True
             except PlushSenseError as refusal:
-                of_network = isinstance(refusal, BundleError) or refusal.reason in _OF_NETWORK
+                of_network = isinstance(refusal, BundleError) or refusal.message.values.get("field") == "network"
                 field = self._bundle if of_network else self._toy
                 if self._reader.now.running:
                     # First, because a change of its value clears the error of a field.
@@ -196,7 +194,7 @@ class _Controls:
 
         def start() -> None:
             if not url.strip():
-                raise ConfigError("No toy is chosen: choose one first.", reason="no_toy")
+                raise ConfigError("No toy is chosen. Choose one first.", field="toy")
             chosen = LiveChoice(self._toys.choose(url), path, self._engine.value, self._reactions.value, simulated)
             self._reader.start(chosen)
 

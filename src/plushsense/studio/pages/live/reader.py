@@ -178,7 +178,7 @@ class LiveReader:
         """
         person = self.person
         if person is None:
-            raise ConfigError("No virtual toy is being read: start one first.", reason="no_virtual_toy")
+            raise ConfigError("No virtual toy is being read. Start one first.")
         if label is None:
             person.release()
         else:
@@ -267,15 +267,13 @@ class LiveReader:
                 assert bundle_run is not None
                 self._poll(device, bundle_run)
                 if bundle_run.run.over:
-                    ended = DeviceError("The toy's data have ended.", reason="toy_data_ended")
+                    ended = DeviceError("The data of the toy have ended. Press Start to begin again.")
                     break
         except PlushSenseError as cause:
             ended = cause
         except Exception as cause:  # noqa: BLE001, RUF100
             what = f"{type(cause).__name__}: {cause}"
-            ended = DeviceError(
-                f"Reading the toy failed ({what}): start it again.", reason="live_reading_failed", what=what
-            )
+            ended = DeviceError("Reading the toy failed ({what}). Press Start to begin again.", what=what)
         with contextlib.suppress(Exception):
             device.close()
         with self._lock:
@@ -463,7 +461,7 @@ def _kept(_: str) -> None:
 
 
 def _no_bundle() -> ConfigError:
-    return ConfigError("No bundle is chosen: choose one, or train one first.", reason="no_network")
+    return ConfigError("No network is chosen. Choose one, or train one first.", field="network")
 
 
 def _virtual(device: TappedDevice) -> VirtualDevice | None:
@@ -484,18 +482,27 @@ def _simulated(url: str) -> bool:
 
 
 def _load(path: Path) -> Bundle:
-    """Read a bundle; an error has a reason, so that pages in other languages can say it."""
+    """Read a bundle; an error has a message of the studio's own."""
     try:
         return Bundle.load(path)
     except BundleError as cause:
-        raise BundleError(str(cause), reason=cause.reason or "network_unreadable", name=path.stem) from None
+        raise BundleError(
+            "The network {name} cannot be read: the file is missing or damaged, or another version wrote it. Choose "
+            "another one, or train again.",
+            name=path.stem,
+        ) from cause
 
 
 def _classifier(bundle: Bundle, engine: str) -> Any:
     try:
         return classifier_of(bundle, DecideSpec.from_dict(bundle.decision), engine)
     except (BundleError, ArchError) as cause:
-        raise BundleError(str(cause), reason=cause.reason or "engine_unfit") from None
+        if cause.message.values:
+            raise
+        raise BundleError(
+            "This network cannot be computed as on the chip, because it lacks the calibration for it. Train it "
+            "again, or compute as trained."
+        ) from None
 
 
 def _reactor(reactions: str, bundle: Bundle) -> Reactor | None:
@@ -505,10 +512,9 @@ def _reactor(reactions: str, bundle: Bundle) -> Reactor | None:
 def _refuse_strange(fresh: Bundle, running: Bundle) -> None:
     """Raise ConfigError if two bundles have no gesture in common."""
     if not any(running.gestures.find(label) for label in fresh.gestures.labels):
-        new, current = ", ".join(fresh.gestures.labels[:4]), ", ".join(running.gestures.labels[:4])
         raise ConfigError(
-            f"The gesture set of this bundle, '{fresh.gestures.name}' ({new}, …), has no gesture in common with the "
-            f"one in use, '{running.gestures.name}' ({current}, …): stop the toy before you choose this bundle.",
-            reason="no_common_gesture",
+            "This network knows none of the gestures of the one in use (its gesture set: {name}; no gesture in "
+            "common). Stop the toy before you choose it.",
             name=fresh.gestures.name,
+            field="network",
         )

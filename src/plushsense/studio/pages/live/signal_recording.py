@@ -92,7 +92,7 @@ class SignalRecording:
             self.end()
             device, bundle = reader.device, reader.bundle
             if device is None or bundle is None or not reader.now.running:
-                raise ConfigError("No toy is being read: start one first.", reason="no_toy_read")
+                raise ConfigError("No toy is being read. Start one first.")
             self.failed = None
             running = self._open(reader, device, bundle, subject, longest_s)
             try:
@@ -216,11 +216,7 @@ def _take(part: Frames, layout: Layout, gesture: str, repetition: int, first: in
     """Return a recording of ``gesture`` from rows of a stream, of which ``first`` is the first."""
     parsed = parse_name(recording_filename(gesture, 0, 0))
     if parsed is None or plain_label(parsed.label) != plain_label(gesture):
-        raise ConfigError(
-            f"'{gesture}' cannot be the label of a gesture: give a word or two without  \\ / : * ? \" < > | ( )  .",
-            reason="label_bad",
-            label=gesture,
-        )
+        raise ConfigError("“{label}” cannot be the name of a gesture. Give a word or two.", label=gesture)
     host = part.host_ms if part.host_ms is not None else part.device_ms
     as_frames = [
         Frame(int(h), int(d), tuple(int(x) for x in v))
@@ -263,5 +259,8 @@ def _count_losses(take: RecordingTake, layout: Layout) -> None:
 
 def _write_error(folder: Path, cause: Exception) -> DatasetError:
     why = getattr(cause, "strerror", None) or cause
-    message = f"'{folder}' cannot be written ({why}): free some space; what was written before is kept."
-    return DatasetError(message, reason="recording_unwritable", folder=folder.name, why=why)
+    return DatasetError(
+        "{folder} cannot be written ({why}). Free some space; what was written before is kept.",
+        folder=folder.name,
+        why=why,
+    )

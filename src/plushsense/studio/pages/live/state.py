@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from plushsense.core.errors import PlushSenseError
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.live.reactions import Reaction, Reactions
 
 Connection = Literal["", "connecting", "gone", "unreadable"]
@@ -147,8 +147,8 @@ class LiveState:
     running: bool = False
     ended: PlushSenseError | None = None
     connection: Connection = ""
-    mismatch: Sentence = field(default_factory=Sentence)
-    warnings: tuple[Sentence, ...] = ()
+    mismatch: Message = field(default_factory=Message)
+    warnings: tuple[Message, ...] = ()
     state: str = ""
     t_s: float = 0.0
     answer: str | None = None

@@ -118,7 +118,7 @@ class Validation:
         reader = self._reader
         with self._lock:
             if self._run is not None:
-                raise ConfigError("A validation is under way: end it first.", reason="validation_running")
+                raise ConfigError("A validation is under way. End it first.")
             bundle, device, choice = reader.bundle, reader.device, reader.choice
             key = self._recording.begin(reader, subject, _LONGEST_S)
             assert bundle is not None and device is not None
@@ -182,9 +182,8 @@ class Validation:
         path = self._workspace.inside(folder) / RESULT
         try:
             result: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as cause:
-            message = f"'{path}' cannot be read: {cause}."
-            raise ConfigError(message, reason="validation_unreadable", name=folder.name) from None
+        except (OSError, ValueError):
+            raise ConfigError("The result {name} cannot be read.", name=folder.name) from None
         return result
 
     # By the clock of the toy, in the thread of the reader ---------------------------------------------------------
@@ -283,7 +282,7 @@ class Validation:
             failed = cause
         except Exception as cause:  # noqa: BLE001, RUF100
             what = f"{type(cause).__name__}: {cause}"
-            failed = ConfigError(f"The validation cannot be scored: {what}.", reason="validation_failed", what=what)
+            failed = ConfigError("The validation cannot be scored ({what}). Its signals are recorded.", what=what)
         with self._lock:
             self._run = None
             self.status = ValidationStatus(done=len(run.trials), total=len(run.plan), result=result, failed=failed)

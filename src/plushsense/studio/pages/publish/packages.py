@@ -14,7 +14,6 @@ from nicegui import run, ui
 
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.core.recorder_csv import SIMULATION_MARK
-from plushsense.core.sentences import Sentence
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.privacy.pseudonyms import is_drawn
 from plushsense.dataset.publishing.checking import VALIDATORS
@@ -269,7 +268,7 @@ class PackagesSection:
         words = self.words
         with self.page.show_errors():
             if name not in (await run.io_bound(lambda: packages_of(self.workspace)) or []):
-                raise ConfigError(f"There is no package '{name}' in this studio.", reason="no_package", name=name)
+                raise ConfigError("There is no package “{name}” in this studio. Choose one from the list.", name=name)
             package = await run.io_bound(lambda: PackageFacts.of(self.workspace, name))
             assert package is not None
             job = newest_validation(self.workspace.part(Jobs), package)
@@ -322,7 +321,7 @@ class PackagesSection:
                     )
                 self._validators(job.result)
                 for each in job.result.get("sentences", ()):
-                    notice(words.sentence(Sentence.from_dict(each)), "info")
+                    notice(words.sentence(each), "info")
             self._thorough = tag(ui.checkbox(words("Slow validators read every row of the sessions")), "check-thorough")
             check = button("check", words("Check again"), lambda: self._check(package), icon="fact_check")
             check.set_enabled("publish" not in self.lacking)

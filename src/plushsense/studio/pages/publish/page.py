@@ -9,7 +9,6 @@ from typing import Any
 from nicegui import run, ui
 
 from plushsense.core.errors import ConfigError
-from plushsense.core.sentences import Sentence
 from plushsense.dataset.store import Dataset
 from plushsense.studio.app.jobs import StudioJob
 from plushsense.studio.app.shell import Page, address, button, focus, query, tag
@@ -292,7 +291,9 @@ class _Publishing:
             with beside(words, self._name):
                 place = self.workspace.new(PACKAGES, self._name.value or "")
                 if (packed := place.with_name(f"{place.name}.zip")).exists():
-                    raise ConfigError(f"'{packed.name}' exists already.", reason="name_exists", name=packed.name)
+                    raise ConfigError(
+                        "“{name}” exists already. Give another name; nothing is replaced.", name=packed.name
+                    )
             with beside(words, self._key):
                 key = self._key_path((self._key.value or "").strip()) if self._keep.value else key
             if self._ask_again(self._name, self._key):
@@ -381,4 +382,4 @@ class _Publishing:
             for finding in result["findings"]:
                 where = [str(finding[k]) for k in ("file", "line") if finding[k]]
                 times = [f"{finding['times']} ×"] if finding["times"] > 1 else []
-                notice(": ".join([*where, *times, self.words.sentence(Sentence.from_dict(finding["sentence"]))]))
+                notice(": ".join([*where, *times, self.words.sentence(finding["sentence"])]))

@@ -90,7 +90,6 @@ class ToyChoice:
 
 _GESTURES = "plush-18"
 _MOST = 20
-_NAME_ERRORS = ("name_exists", "name_bad")
 
 
 class ProtocolForm:
@@ -131,9 +130,10 @@ class ProtocolForm:
             path = self._controller.save_protocol(str(self._name.value or ""), chosen, repetitions, self._order.value)
         except PlushSenseError as error:
             sentence = words.error(error)
-            if error.reason in _NAME_ERRORS:
+            field = error.message.values.get("field")
+            if field == "name":
                 self._name.error = sentence
-            elif error.reason == "repetitions_bad":
+            elif field == "repetitions":
                 self._repetitions.error = sentence
             else:
                 self._lacking.text = sentence

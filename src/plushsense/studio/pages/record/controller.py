@@ -9,7 +9,7 @@ from pathlib import Path
 
 from plushsense.core.errors import ConfigError, DatasetError, LayoutError
 from plushsense.core.layouts import Layout, layout_names
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.core.toml import builtin_names
 from plushsense.core.version import __version__
 from plushsense.devices.lsl import MARKERS, LslMarkers
@@ -62,7 +62,7 @@ class ActiveSession:
     device: TappedDevice
     request: SessionRequest
     notices: tuple[str, ...] = ()
-    repairs: tuple[Sentence, ...] = ()
+    repairs: tuple[Message, ...] = ()
     mark_first: bool = False
     markers: LslMarkers | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
@@ -98,8 +98,7 @@ class ActiveSession:
             if number != key and number.isdecimal() and int(number) < status.steps:
                 commands[key] = lambda: recorder.go(int(number))
             if key not in commands:
-                message = f"'{key}' is not a command of the recorder: use space, r, s, b, p or go:<step>."
-                raise ConfigError(message, reason="command_unknown", key=key)
+                raise ConfigError("The key {key} is no command here.", key=key)
             if status.seen != seen:
                 return False
             commands[key]()
@@ -156,11 +155,11 @@ class RecordController:
             folder, known = session_folder(self._workspace.recordings, request, new=anew)
             if known is not None:
                 raise ConfigError(
-                    f"{folder.parent.name} has an unfinished session, {folder.name}: resume it, or choose to begin "
-                    "another one.",
-                    reason="session_unfinished",
+                    "{subject} has an unfinished session, {name}. Continue it above, or choose a new session under "
+                    "“More settings”.",
                     subject=folder.parent.name,
                     name=f"{folder.parent.name}/{folder.name}",
+                    field="person",
                 )
             session = self._open(request, folder, None, lsl)
             session.mark_first = mark_first
@@ -194,8 +193,7 @@ class RecordController:
             if known is None:
                 raise self._unknown(name)
             if is_finished(folder):
-                message = f"The session '{name}' is finished: begin a new one."
-                raise ConfigError(message, reason="session_finished", name=name)
+                raise ConfigError("The session {name} is finished. Begin a new one.", name=name)
             url = device or known.device
             request = SessionRequest(device=url, subject=known.subject, speed=self.speed_for(url, known.simulated))
             self._check(request, known.device)
@@ -236,9 +234,7 @@ class RecordController:
     def _closed(self, name: str) -> Path:
         """Return the folder of a session; raise ConfigError if it is open."""
         if self.get(name) is not None:
-            raise ConfigError(
-                f"The session '{name}' is being recorded: end it first.", reason="session_open", name=name
-            )
+            raise ConfigError("The session {name} is being recorded. End it first.", name=name)
         return self._folder(name)
 
     def close_session(self, name: str) -> None:
@@ -307,11 +303,9 @@ class RecordController:
         """Raise ConfigError if the toy, protocol or layout is unknown or refers to a file that was not allowed."""
         check_speed(request.speed)
         if request.protocol and request.protocol not in self.protocols():
-            message = f"'{request.protocol}' is not a protocol of this studio: choose one from the list."
-            raise ConfigError(message, reason="protocol_unknown")
+            raise ConfigError("This list of gestures is gone. Choose another one.", field="protocol")
         if request.layout and request.layout not in self.layouts():
-            message = f"'{request.layout}' is not a layout of this studio: choose one from the list."
-            raise ConfigError(message, reason="layout_gone")
+            raise ConfigError("This sensor layout is gone. Choose another one.")
         self._check_toy(request.device, known_device)
 
     def _check_toy(self, url: str, *known: str) -> None:
@@ -320,8 +314,9 @@ class RecordController:
         given = url in (*self.toys(), *known)
         is_file = address.scheme == "replay" or address.query.get("layout", "plush-15") not in self.layouts()
         if is_file and not given:
-            message = f"'{url}' refers to a file: start the studio with --device {url} to use it."
-            raise ConfigError(message, reason="toy_is_file", url=url)
+            raise ConfigError(
+                "{url} is a file. The studio reads only files that were given to it when it was started.", url=url
+            )
 
     def _folder(self, name: str) -> Path:
         folder = self._workspace.inside(self._workspace.recordings / name)
@@ -330,8 +325,7 @@ class RecordController:
         return folder
 
     def _unknown(self, name: str) -> ConfigError:
-        message = f"There is no session '{name}' in '{self._workspace.recordings}'."
-        return ConfigError(message, reason="session_unknown", name=name)
+        return ConfigError("There is no session {name}.", name=name)
 
     def _tried(self, url: str, speed: float, layout: Layout | str | None) -> TappedDevice:
         """Open a toy, and wait until it has sent frames.
@@ -341,8 +335,8 @@ class RecordController:
         """
         try:
             device = TappedDevice(open_toy(with_speed(url, speed), layout))
-        except LayoutError as cause:
-            raise LayoutError(str(cause), reason="layout_bad", name=layout) from None
+        except LayoutError:
+            raise LayoutError("The sensor layout “{name}” cannot be read. Choose another one.", name=layout) from None
         if isinstance(device.inner, VirtualDevice):
             # Its person waits for what is requested.
             device.inner.follow()
@@ -366,14 +360,16 @@ class RecordController:
             recorder, former = session.recorder, session.device
             self._check_toy(url, session.head.device)
             if is_virtual(url) and not session.head.simulated:
-                message = f"The session '{name}' was begun with a real toy: begin a new one for a virtual toy."
-                raise DatasetError(message, reason="session_of_real_toy", name=name)
+                raise DatasetError(
+                    "The session {name} was begun with a real toy. A virtual toy needs a new session.",
+                    name=name,
+                    field="toy",
+                )
             if self.speed_for(url, session.head.simulated) != session.request.speed:
-                message = f"'{url}' has another speed than the session '{name}'."
-                raise ConfigError(message, reason="other_speed", url=url)
+                raise ConfigError("{url} runs at another speed than this session.", url=url)
             if url == session.request.device:
                 if recorder.status().state != "stopped":
-                    raise ConfigError(f"The session '{name}' uses '{url}' already.", reason="same_toy", url=url)
+                    raise ConfigError("The session uses this toy already. Choose another one.")
                 # A port can be opened only once.
                 former.close()
             device = self._tried(url, session.request.speed, recorder.session.layout)

@@ -10,7 +10,7 @@ from typing import Any
 
 from nicegui import run, ui
 
-from plushsense.core.errors import ConfigError, DeviceError, LayoutError, PlushSenseError
+from plushsense.core.errors import AddressError, ConfigError, DeviceError, LayoutError, PlushSenseError
 from plushsense.recording.plan import DEFAULT, wordings
 from plushsense.recording.request import PROTOCOL, SessionRequest
 from plushsense.recording.session import SessionSummary
@@ -47,9 +47,6 @@ _WORDINGS: Texts = {
 }
 
 _LISTED = 8
-_CODE_ERRORS = ("no_person", "code_bad", "session_unfinished", "session_in_use")
-_PROTOCOL_ERRORS = ("protocol_bad", "protocol_unknown")
-_TOY_ERRORS = ("no_toy", "session_of_real_toy", "layout_bad")
 
 
 async def show(page: Page) -> None:
@@ -232,9 +229,7 @@ class _SessionLists:
 
 
 def _is_of_toy(error: PlushSenseError) -> bool:
-    return (
-        isinstance(error, DeviceError | LayoutError) or error.reason.startswith("toy_") or error.reason in _TOY_ERRORS
-    )
+    return isinstance(error, DeviceError | LayoutError | AddressError) or error.message.values.get("field") == "toy"
 
 
 async def _open_session(
@@ -376,9 +371,10 @@ class _Form:
     def _refused(self, error: PlushSenseError) -> bool:
         """Show an error beside the field that it is about; return whether there is one."""
         sentence = self._page.words.error(error)
-        if error.reason in _CODE_ERRORS:
+        field = error.message.values.get("field")
+        if field == "person":
             self._subject.error = sentence
-        elif error.reason in _PROTOCOL_ERRORS:
+        elif field == "protocol":
             self._protocol.error = sentence
         elif _is_of_toy(error):
             self._toy.show_error(sentence)
@@ -390,6 +386,5 @@ class _Form:
 def _short(value: Any) -> str:
     text = " ".join(str(value or "").split())
     if len(text) > 100:
-        message = f"'{text[:20]}…' is too long: at most 100 characters."
-        raise ConfigError(message, reason="text_long", text=f"{text[:20]}…", most=100)
+        raise ConfigError("“{text}” is too long: at most {most} characters.", text=f"{text[:20]}…", most=100)
     return text

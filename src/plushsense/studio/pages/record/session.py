@@ -61,7 +61,7 @@ def collect(page: Page, folder: Path) -> None:
     jobs, words = page.workspace.part(Jobs), page.words
     head = SessionHead.read(folder)
     if head is None:
-        raise DatasetError(f"'{folder}' holds no session.", reason="session_missing", name=folder.name)
+        raise DatasetError("The folder {name} holds no session.", name=folder.name)
     place = page.workspace.dataset_for(str(head.layout["name"]), head.simulated, words("recordings"))
     name = page.workspace.title(place)
     job = jobs.import_sessions([folder], place, words("Import into the data set “{name}”", name=name))
@@ -72,7 +72,7 @@ def collect(page: Page, folder: Path) -> None:
             ui.navigate.to(address("review", dataset=place))
         elif job.state != RUNNING:
             page.say(
-                words.explain(job.message, job.reason, job.values)
+                words.failure(job.refusal)
                 or words("The recordings were not put into a data set: try it again on the home page."),
                 "error",
             )

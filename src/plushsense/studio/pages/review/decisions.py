@@ -122,8 +122,7 @@ class Decisions:
         if not standing:
             history.pop()
             raise DatasetError(
-                f"'{last.recording}' has been changed in another window or program since then: nothing is undone.",
-                reason="changed_elsewhere",
+                "“{recording}” has been changed in another window or program since then, so nothing is undone.",
                 recording=last.recording,
             )
         undone = replace(last, before=standing)

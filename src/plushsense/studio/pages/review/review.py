@@ -288,11 +288,7 @@ class Review:
         try:
             return self.infos[identity]
         except KeyError:
-            raise DatasetError(
-                f"There is no recording '{identity}' in '{self.dataset.head.name}'.",
-                reason="no_recording",
-                recording=identity,
-            ) from None
+            raise DatasetError("There is no recording “{recording}” in this data set.", recording=identity) from None
 
     # One recording ------------------------------------------------------------------------------------------------
 
@@ -366,25 +362,19 @@ class Review:
         info = self.info(identity)
         if self.is_labelled:
             raise DatasetError(
-                f"'{identity}' is cut where the label changes, so there is nothing to trim.",
-                reason="labelled_not_trimmed",
-                recording=identity,
+                "“{recording}” is cut where the label changes, so there is nothing to trim.", recording=identity
             )
         with self._lock:
             if self.standing(identity).excluded:
                 raise DatasetError(
-                    f"'{identity}' is excluded: take it back in before you trim it.",
-                    reason="excluded_not_trimmed",
-                    recording=identity,
+                    "“{recording}” is excluded. Include it again before you trim it.", recording=identity
                 )
             first, last = self.kept_rows(identity, ends)
             first = first if start is None else min(max(0, start), info.rows - 1)
             last = last if stop is None else min(max(1, stop), info.rows)
             if last <= first:
                 raise DatasetError(
-                    f"Nothing of '{identity}' would be left: set the start before the end.",
-                    reason="nothing_left",
-                    recording=identity,
+                    "Nothing of “{recording}” would be left. Set the start before the end.", recording=identity
                 )
             self._drafts.pop(identity, None)
             if (first, last) != self.trim(identity).current_rows(ends):
@@ -432,8 +422,7 @@ class Review:
                 return False
             if state == LOOKING:
                 raise DatasetError(
-                    f"The start of '{identity}' is still being computed: wait a moment, or set it yourself.",
-                    reason="start_not_ready",
+                    "The start of “{recording}” is still being computed. Wait a moment, or set it yourself.",
                     recording=identity,
                 )
             suggested = current.suggested_rows(ends)
@@ -550,7 +539,7 @@ class Review:
 
 def _check_reason(why: str) -> str:
     if not why.strip():
-        raise ConfigError("A reason is missing: give it in a few words.", reason="reason_missing")
+        raise ConfigError("A reason is missing. Give it in a few words.")
     return why.strip()
 
 
@@ -614,6 +603,4 @@ class Reviews:
             selection = json.loads((self._selections / f"{key}.json").read_text(encoding="utf-8"))
             return str(selection["title"]), [str(r) for r in selection["recordings"]]
         except (OSError, ValueError, KeyError, TypeError):
-            raise ConfigError(
-                f"The selection '{key}' does not exist: follow the link again.", reason="no_selection", key=key
-            ) from None
+            raise ConfigError("The selection “{key}” does not exist. Follow the link again.", key=key) from None

@@ -334,8 +334,7 @@ class ReviewPreparation:
                 self.error = refusal
             except OSError as cause:
                 why = cause.strerror or str(cause)
-                message = f"'{dataset.path}' cannot be read: {why}."
-                self.error = DatasetError(message, reason="not_readable", name=dataset.path.name, why=why)
+                self.error = DatasetError("“{name}” cannot be read: {why}.", name=dataset.path.name, why=why)
             with self._lock:
                 dataset, self._next = self._next, None
                 if dataset is None:

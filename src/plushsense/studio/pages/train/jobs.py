@@ -255,7 +255,7 @@ class _Card:
                 self._saved_network()
             elif job.state == REFUSED:
                 with ui.element("div").classes("ps-message ps-message-error w-full").props('role="alert"'):
-                    tag(ui.label(w.explain(job.message, job.reason, job.values)), "refused")
+                    tag(ui.label(w.failure(job.refusal)), "refused")
             else:
                 self._result()
             charts = progress_charts(job)

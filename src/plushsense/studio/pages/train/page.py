@@ -402,7 +402,7 @@ class TrainingForm:
             try:
                 yield
             except ConfigError as error:
-                name = str(error.values.get("field"))
+                name = str(error.message.values.get("field"))
                 if name not in self._boxes:
                     raise
                 self._boxes[name].error = self._words.error(error)
@@ -470,7 +470,7 @@ class TrainingForm:
         self._estimate_job = None
         self._plan.clear()
         if job.state != DONE:
-            message = self._words.explain(job.message, job.reason, job.values)
+            message = self._words.failure(job.refusal)
             self._page.say(message, "error" if message else "info")
             return
         try:
@@ -492,7 +492,7 @@ class TrainingForm:
             with ui.element("div").classes("ps-message ps-message-error w-full").props('role="alert"'):
                 ui.label(w("This cannot be trained:"))
                 for problem in plan["problems"]:
-                    ui.label(f"• {w.explain(problem)}")
+                    ui.label(f"• {w.failure(problem)}")
             return
         html(score_labels(w, plan["leaky"], plan["simulated"]))
         if task in (TRAIN, EVALUATE):

@@ -14,6 +14,7 @@ from plushsense.dataset.store import HEAD
 from plushsense.models.arch import parse_filters, parse_symbol
 from plushsense.scoring.splits import parse_split
 from plushsense.studio.app.jobs import RUNNING, Jobs
+from plushsense.studio.app.words import Texts
 from plushsense.studio.app.workspace import BUNDLES, Workspace
 from plushsense.workflow.config import RunConfig, from_settings
 
@@ -83,12 +84,16 @@ def job_request(workspace: Workspace, jobs: Jobs, form: Mapping[str, Any]) -> Jo
     """
     kind = form["kind"]
     if not form.get("dataset"):
-        message = "No data set is chosen: record one, or import recordings on the home page."
-        raise ConfigError(message, reason="no_dataset", field="dataset")
+        raise ConfigError(
+            "No data set is chosen. Record a session, or import recordings on the home page.", field="dataset"
+        )
     dataset = workspace.inside(form["dataset"])
     if not (dataset / HEAD).is_file():
-        message = f"The data set '{dataset}' does not exist any more: put it back, or choose another."
-        raise ConfigError(message, reason="dataset_gone", field="dataset", name=dataset.name)
+        raise ConfigError(
+            "The data set “{name}” does not exist any more. Put it back, or choose another.",
+            field="dataset",
+            name=dataset.name,
+        )
     given = {key: value for key, value in form.items() if value not in (None, "")}
     if kind == MAKE:
         request = _make(workspace, jobs, dataset, given)
@@ -102,11 +107,9 @@ def job_request(workspace: Workspace, jobs: Jobs, form: Mapping[str, Any]) -> Jo
         if job.state == RUNNING and not job.spec.get("dry"):
             if job.spec.get("out", 0) == request.spec.get("out"):
                 name = Path(request.spec["out"]).stem
-                message = f"'{name}' is being trained now: give another name."
-                raise ConfigError(message, reason="being_trained", field="name", name=name)
+                raise ConfigError("“{name}” is being trained now. Give another name.", field="name", name=name)
             if job.spec == request.spec or (kind == MAKE and job.spec["dataset"] == str(dataset)):
-                message = "The same job is running already: see the list of jobs below."
-                raise ConfigError(message, reason="running_already")
+                raise ConfigError("The same job is running already: see the list of jobs below.")
     return request
 
 
@@ -148,13 +151,19 @@ def _evaluate(workspace: Workspace, dataset: Path, given: Mapping[str, Any]) -> 
     return JobRequest(EVALUATE, spec, title, shlex.join(command))
 
 
-def _at(field: str, check: Callable[[], T], reason: str = "") -> T:
-    """Return the result of ``check``; add the field, and a reason if there is none, to an error that it raises."""
+def _at(field: str, check: Callable[[], T], template: str = "") -> T:
+    """Return the result of ``check``; an error that it raises gets the field, and ``template`` if it has no values."""
     try:
         return check()
     except (ArchError, ConfigError) as error:
-        values = {**error.values, "field": field}
-        raise ConfigError(str(error), reason=error.reason or reason, **values) from error
+        template = template if template and not error.message.values else error.message.template
+        raise ConfigError(template, **{**error.message.values, "field": field}) from error
+
+
+_BAD: Texts = {
+    "arch": "This is no network. Give the lengths of up to four kernels, such as 14d1_19d2_19d4.",
+    "filters": "Give whole numbers separated by commas, one for each layer, such as 8,12,16.",
+}
 
 
 def _checked(settings: Mapping[str, Any]) -> RunConfig:
@@ -163,7 +172,7 @@ def _checked(settings: Mapping[str, Any]) -> RunConfig:
             _whole(key, settings[key], least)
     for key, parse in (("arch", parse_symbol), ("filters", parse_filters)):
         if key in settings:
-            _at(key, lambda key=key, parse=parse: parse(str(settings[key])), f"{key}_bad")  # type: ignore[misc]
+            _at(key, lambda key=key, parse=parse: parse(str(settings[key])), _BAD[key])  # type: ignore[misc]
     return from_settings(**settings)
 
 
@@ -192,8 +201,7 @@ def _of_grid(workspace: Workspace, kind: str, dataset: Path, given: Mapping[str,
 def _whole(name: str, value: Any, least: int, most: int = 1_000_000_000) -> int:
     """Return ``value`` if it is an integer from ``least`` to ``most``; otherwise raise ConfigError."""
     if not isinstance(value, int) or not least <= value <= most:
-        message = f"{name} is {value!r}: give a whole number from {least} to {most}."
-        raise ConfigError(message, reason="not_whole", field=name, least=least, most=most)
+        raise ConfigError("Give a whole number from {least} to {most}.", field=name, least=least, most=most)
     return value
 
 
@@ -203,8 +211,7 @@ def _share(value: Any) -> float:
     except ValueError:
         share = 0.0
     if not 0.0 < share <= 1.0:
-        message = f"share is {value!r}: give a number above 0 and at most 1."
-        raise ConfigError(message, reason="not_share", field="share")
+        raise ConfigError("Give a number above 0 and at most 1.", field="share")
     return share
 
 

@@ -363,8 +363,7 @@ def read_json(path: Path) -> Any:
 
 
 def _unreadable(path: Path, cause: Exception) -> BadInput:
-    message = f"'{path}' cannot be read ({cause}): compute this result again."
-    return BadInput(message, reason="result_unreadable", name=path.parent.name)
+    return BadInput("The result “{name}” cannot be read. Compute it again.", name=path.parent.name)
 
 
 def _number(text: str) -> float | None:
@@ -450,8 +449,7 @@ class StoredResults:
         found = self.find(identity)
         if found is not None:
             return found
-        message = "This result does not exist any more: its folder was moved or deleted."
-        raise BadInput(message, reason="result_gone")
+        raise BadInput("This result does not exist any more: its folder was moved or deleted.")
 
     def find(self, identity: str) -> ResultRow | None:
         """Return the result with this id, or None."""
