@@ -64,21 +64,26 @@ def path_expression(text: str) -> re.Pattern[str]:
         if part is not None:
             if part not in PARTS:
                 raise ConfigError(
-                    f"'{piece[0]}' in '{text}' is unknown: accepted are {', '.join(f'{{{p}}}' for p in PARTS)}, and * "
-                    f"for anything else.{nearest(part, PARTS)}",
+                    "{problem}",
+                    problem=f"'{piece[0]}' in '{text}' is unknown: accepted are "
+                    f"{', '.join(f'{{{p}}}' for p in PARTS)}, and * for anything else.{nearest(part, PARTS)}",
                     key="paths",
                 )
             expression += f"(?P={part})" if part in seen else f"(?P<{part}>{limit or '[^/]+'})"
             seen.add(part)
         elif brace:
-            raise ConfigError(f"'{text}' has a '{brace}' without its partner: write {{subject}}.", key="paths")
+            raise ConfigError(
+                "{problem}", problem=f"'{text}' has a '{brace}' without its partner: write {{subject}}.", key="paths"
+            )
         else:
             expression += "(?:.*/)?" if folders else ".*" if anything else "[^/]*" if star else "[^/]" if one else ""
             expression += re.escape(plain or "")
     try:
         return re.compile(expression, re.IGNORECASE | re.DOTALL)
     except re.error as cause:
-        raise ConfigError(f"'{text}' has an expression that is not valid: {cause}.", key="paths") from None
+        raise ConfigError(
+            "{problem}", problem=f"'{text}' has an expression that is not valid: {cause}.", key="paths"
+        ) from None
 
 
 @dataclass(frozen=True)

@@ -77,6 +77,10 @@ class Words:
         form = forms[self._plural_form(n)] if isinstance(forms, tuple) else many if n != 1 else one
         return form.rpartition(_CONTEXT)[2].format(n=n)
 
+    def knows(self, text: str) -> bool:
+        """Return whether there is a translation of an English text."""
+        return bool(self._translation(text))
+
     def _translation(self, text: str) -> str | tuple[str, ...]:
         context, _, text = text.rpartition(_CONTEXT)
         message = self._catalog.get(text, context or None)
@@ -127,7 +131,10 @@ class Words:
     def _translated(self, message: str | Mapping[str, Any], quoted: str) -> str:
         if isinstance(message, str):
             message = message.to_json() if isinstance(message, Message) else {"message": message}
-        translation = self._translation(message["template"]) if message.get("template") else ""
+        template = message.get("template", "")
+        translation = self._translation(template) if template else ""
+        if not translation and self.language == next(iter(LANGUAGES)) and _has_message(message.get("values", {})):
+            translation = template
         if translation:
             # A stored job of another version may lack a value.
             with suppress(KeyError):
@@ -142,6 +149,13 @@ class Words:
     def affect(self, affect: str | None) -> str:
         """Return the name of an affect in this language; None means the same as "none"."""
         return self(AFFECTS[affect or "none"])
+
+
+def _has_message(value: object) -> bool:
+    """Return whether there is a further message among values, which may be worded in another way."""
+    if isinstance(value, Mapping):
+        return "template" in value or any(map(_has_message, value.values()))
+    return isinstance(value, Message) or (isinstance(value, list | tuple) and any(map(_has_message, value)))
 
 
 class _ValueFiller(Filler):
@@ -161,6 +175,8 @@ class _ValueFiller(Filler):
             return [self._worded(key, each) for each in value]
         if isinstance(value, Message | Mapping):
             return words.sentence(value)
+        if isinstance(value, Path):
+            return value.name
         if key in ("channel", "channels"):
             return words.channel(str(value))
         return words.gesture(str(value)) if key in ("gesture", "gestures") else value

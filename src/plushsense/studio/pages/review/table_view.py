@@ -31,7 +31,7 @@ _SEVERITIES: Texts = {
     "info": "good to know",
 }
 
-_ADVICE: Texts = {
+ADVICE: Texts = {
     "never-stopped": "Trim it to the gesture, or exclude it.",
     "too-short": "Exclude it, or record it again.",
     "duration": "Look at its plot; trim or exclude it, or accept the finding.",
@@ -139,8 +139,8 @@ def check_name(words: Words, check: str) -> str:
 
 def advice(words: Words, finding: Finding) -> str:
     """Return what a check advises to do about a finding, in this language."""
-    of_stream = _ADVICE.get(f"{finding.check}-stream") if finding.stream else None
-    return words(of_stream or _ADVICE.get(finding.check, finding.action))
+    of_stream = ADVICE.get(f"{finding.check}-stream") if finding.stream else None
+    return words(of_stream or ADVICE.get(finding.check, finding.action))
 
 
 def finding_button(desk: ReviewController, finding: Finding, recording: str = "") -> ui.button:
