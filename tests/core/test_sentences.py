@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import ast
+import json
+import os
+import pickle
 from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 
 import pytest
 
-from plushsense.core.errors import ConfigError, single_stops
-from plushsense.core.sentences import Sentence, join_names, plural
+from plushsense.core.errors import ConfigError
+from plushsense.core.sentences import Message, join_names, plural, single_stops
 
 PACKAGE = Path(str(resources.files("plushsense")))
 
@@ -42,7 +45,22 @@ def test_a_count_agrees_with_its_noun() -> None:
 def test_a_sentence_in_a_sentence_ends_once(text: str, single: str) -> None:
     assert single_stops(text) == single
     assert str(ConfigError(text)) == single
-    assert Sentence(text) == single
+    assert Message(text) == single
+
+
+def test_a_message_keeps_its_template_and_values() -> None:
+    inner = Message("no {what}", what="row")
+    message = Message("{file}: {note} ({n:row}; {names})", file=Path("a/b.csv"), note=inner, n=2, names=["x", "y"])
+    assert message == "a/b.csv: no row (2 rows; x, y)".replace("/", os.sep)
+    assert pickle.loads(pickle.dumps(message)) == message
+    stored = message.to_json()
+    assert stored["template"] == message.template and stored["values"]["file"] == "b.csv"
+    assert json.loads(json.dumps(stored)) == stored and Message.from_json(stored).values["note"]["values"] == {
+        "what": "row"
+    }
+    assert Message("{braces} of a user") == "{braces} of a user"
+    error = pickle.loads(pickle.dumps(ConfigError("'{name}' is there\u2028.", name="{a}")))
+    assert str(error) == error.message == "'{a}' is there\\u2028." and error.message.values == {"name": "{a}"}
 
 
 # Names of lists that hold at least one name: those of a valid layout, gesture set, network, data set or registry.

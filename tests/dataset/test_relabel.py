@@ -64,7 +64,7 @@ def test_what_cannot_be_is_refused_and_nothing_written(dataset: Dataset) -> None
     wave = next(r for r in dataset.recordings if r.gesture == "Wave")
     with pytest.raises(DatasetError, match="has no gesture 'Wive'.*Did you mean 'Wave'") as refused:
         relabel(dataset, [wave.id], "Wive", "K")
-    assert refused.value.reason == "unknown_gesture" and marks(dataset.path) == []
+    assert "has no gesture" in str(refused.value) and marks(dataset.path) == []
     with pytest.raises(DatasetError, match="no recording"):
         relabel(dataset, [wave.id, "P9/none"], "Rest", "K")
     assert marks(dataset.path) == []

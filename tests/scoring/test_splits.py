@@ -265,7 +265,7 @@ def test_a_split_knows_what_it_splits_and_what_it_needs() -> None:
         make_folds(parse_split("by-recording:5"), subject, label[1:])
     with pytest.raises(BadInput, match=r"by-subject:2 leaves one person to train and validate") as left:
         make_folds(parse_split("by-subject:2"), subject, label)
-    assert left.value.reason == "one_person_left"
+    assert "leaves one person" in str(left.value)
     for text, units in (("by-recording:5", 4), ("windows:4", 3), ("windows:holdout", 2), ("recordings:holdout", 2)):
         needed = int(text[-1]) if text[-1].isdigit() else 3
         split = parse_split(text)

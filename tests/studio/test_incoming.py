@@ -11,8 +11,10 @@ from typing import Any
 
 import pytest
 
-from plushsense.core.sentences import Sentence
+from plushsense.core.sentences import Message
 from plushsense.dataset.backup import backup
+from plushsense.dataset.importing.build import SIMULATED
+from plushsense.dataset.importing.importers import ADOPTED, LAYOUT_GUESSED
 from plushsense.dataset.index import open_dataset
 from plushsense.studio.app.words import Words
 from plushsense.studio.app.workspace import DATASETS
@@ -72,21 +74,21 @@ def test_sources_are_imported_together_and_what_is_refused_is_named(furniture: P
     found = inspect(tmp_path / "D", broken, packed, folder)
     assert found["people"] == {"P01": 3, "P02": 3}
     assert (found["layout"], found["recordings"], found["simulated"]) == ("plush-15", 6, True)
-    reasons = {r["file"]: r["reason"].reason for r in found["rejected"]}
-    assert reasons == {"broken.zip": "zip_damaged", "notes.txt": "file_no_recording"}
-    told = [note.reason for note in found["notes"] if isinstance(note, Sentence)]
-    assert told == ["simulated", "virtual_recordings", "layout_guessed"]
+    reasons = {r["file"]: Words("en").sentence(r["reason"]) for r in found["rejected"]}
+    assert reasons["notes.txt"] == "no recording" and "is no zip, or a damaged one" in reasons["broken.zip"]
+    told = [note.template for note in found["notes"] if isinstance(note, Message)]
+    assert (told[0], len(told), told[2]) == (SIMULATED.template, 3, LAYOUT_GUESSED)
 
 
 def test_what_all_sources_prove_is_adopted_and_told(tmp_path: Path) -> None:
     folders = [analogue(tmp_path / f"R{p}", 330, 68, people=range(p, p + 1)) for p in range(2)]
     found = inspect(tmp_path / "D", *folders)
-    (note,) = (n for n in found["notes"] if isinstance(n, Sentence) and n.reason == "adopted")
+    (note,) = (n for n in found["notes"] if isinstance(n, Message) and n.template == ADOPTED)
     assert "which stands for zero" in note and found["people"] == {"P0": 6, "P1": 6}
     assert [round(c.offset, -1) for c in open_dataset(tmp_path / "D").layout.channels] == [330] * 3
     for language in ("en", "lv"):
         assert "offset: x 3" in Words(language).sentence(note) != note
-    assert [n.reason for n in inspect(tmp_path / "E", folders[0])["notes"]] == ["layout_guessed", "adopted"]
+    assert [n.template for n in inspect(tmp_path / "E", folders[0])["notes"]] == [LAYOUT_GUESSED, ADOPTED]
 
 
 def test_the_person_of_loose_files_and_of_folders_of_gestures_can_be_given(furniture: Path, tmp_path: Path) -> None:
@@ -96,7 +98,7 @@ def test_the_person_of_loose_files_and_of_folders_of_gestures_can_be_given(furni
         shutil.copy(path, loose)
     with pytest.raises(Exception, match="holds no recording") as refused:
         inspect(tmp_path / "D", loose)
-    assert refused.value.reason == "person_unknown"
+    assert refused.value.message.values["needs"] == "person"
     assert inspect(tmp_path / "D", loose, person="S01")["people"] == {"S01": 3}
     for path in list(loose.iterdir()):
         (loose / path.name.split("_")[0]).mkdir(exist_ok=True)

@@ -76,7 +76,7 @@ def test_a_training_has_the_same_figure_everywhere(home: Path, capsys: pytest.Ca
     append_marks(home / "datasets" / "virtual", [Mark(listed[0].recording, "exclude", "tester", "test")])
     with pytest.raises(DatasetError) as changed:
         StoredResults(Workspace(home)).with_predictions(details)
-    assert changed.value.reason == "data_changed"
+    assert "was changed since" in str(changed.value)
 
 
 def test_an_evaluation_has_the_same_figure_everywhere(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,8 +12,8 @@ import pytest
 
 from plushsense.core.errors import ConfigError
 from plushsense.core.layouts import Layout, load_layout
-from plushsense.core.sentences import Sentence
-from plushsense.dataset.importing.importers import import_recordings
+from plushsense.core.sentences import Message
+from plushsense.dataset.importing.importers import ADOPTED, import_recordings
 from plushsense.dataset.importing.proposals import Sensor, find_sensors, readable_layouts
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.quality.checking import check
@@ -35,7 +35,7 @@ def test_the_zero_of_an_analogue_accelerometer_is_found_and_adopted(tmp_path: Pa
     assert [c.offset for c in done.dataset.layout.channels] == [0, 0, 0]
     adopted = import_recordings(source, tmp_path / "ADOPTED", layout="accel-3")
     assert "adopted" in adopted.proposals[0]["advice"] and adopted.proposals[0]["adopted"]
-    (note,) = (n for n in adopted.notes if isinstance(n, Sentence) and n.reason == "adopted")
+    (note,) = (n for n in adopted.notes if isinstance(n, Message) and n.template == ADOPTED)
     assert adopted.proposals[0]["reason"] in note and note.values["settings"][0].startswith("offset: x ")
     for dataset in (adopted.dataset, open_dataset(tmp_path / "ADOPTED")):
         assert [c.offset for c in dataset.layout.channels] == list(offset["value"].values())
@@ -167,7 +167,7 @@ def test_failed_readings_are_outside_the_valid_range_that_is_adopted(tmp_path: P
     left, right = done.dataset.layout.channels
     assert right == FORCE.channels[1]
     assert -15 < left.valid_min < -8 and 18 < left.valid_max < 25
-    (note,) = (n for n in done.notes if isinstance(n, Sentence) and n.reason == "adopted")
+    (note,) = (n for n in done.notes if isinstance(n, Message) and n.template == ADOPTED)
     assert "8 of 2400 readings of left (P0) are far beyond all others" in note
     found = [f for f in check(done.dataset).findings if f.check == "garbage" and f.recording]
     assert len(found) == 8 and all(f.severity == "error" for f in found)

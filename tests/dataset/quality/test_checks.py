@@ -469,7 +469,7 @@ def test_a_planted_fault_is_found_where_it_is(name: str, plant: Callable[[Path],
     assert all(0 <= a < b for f in found for a, b in f.rows)
     for f in result.findings:
         english, latvian = (Words(language).sentence(f.message) for language in ("en", "lv"))
-        assert f.message.reason and english != f.message and latvian not in (english, f.message)
+        assert f.message.template and english != f.message and latvian not in (english, f.message)
         # Numbers have a decimal comma; ids of files may have points.
         assert not re.search(r"(?<![\w./])\d+\.\d", latvian), latvian
 
