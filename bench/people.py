@@ -34,11 +34,12 @@ from plushsense.dataset.store import HEAD, Dataset, RecordingInfo
 from plushsense.evaluation.crossval import EpochProgress, FoldOutput, evaluate
 from plushsense.jobs.journal import Journal
 from plushsense.models.arch import Arch
+from plushsense.scoring.splits import parse_split
 from plushsense.training.fit import fit, predict
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
-from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import classes_for, network_inputs_of, windows_for
+from plushsense.workflow.config import from_settings
+from plushsense.workflow.preparation import prepare
 
 PEOPLE = tuple(f"P{n:02}" for n in range(1, 15))
 SPLIT = "by-subject:5"
@@ -176,24 +177,21 @@ def measured(row: Row, dataset: Dataset, seeds: list[int], args: argparse.Namesp
 
 def evaluated(row: Row, dataset: Dataset, seed: int, args: argparse.Namespace) -> tuple[dict[str, Any], int]:
     settings = {**row.settings, "seed": seed} | ({"epochs": args.epochs} if args.epochs else {})
-    config: RunConfig
     if row.regained:
         dataset = Regained.of(dataset)
     if row.calibrated:
         axes = args.axes.split(",") if args.axes else [axis for vector in dataset.layout.vectors for axis in vector]
         dataset = dataset.with_inputs(replace(dataset.layout, self_calibration=tuple(axes)))
-    read, config = network_inputs_of(dataset, from_settings(**settings))
-    config = replace(config, evaluation=replace(config.evaluation, seed=0))
-    gestures = classes_for(read, config.evaluation.classes, config.windows.context)
-    arch = config.model.build(read.layout, len(gestures), config.windows.window_s, config.padding)
-    windows = windows_for(read, arch, config.windows, gestures)
+    run = prepare(dataset, from_settings(**settings))
+    arch = run.network
+    windows = run.training_windows()
     done = evaluate(
         windows,
         windows,
-        SPLIT,
-        FoldWork(arch, config.training),
+        parse_split(SPLIT),
+        FoldWork(arch, run.training),
         journal=Journal(args.out / "folds"),
-        key={"arch": arch.to_dict(), "training": config.training.key(), "layer": ""},
+        key={"arch": arch.to_dict(), "training": run.training.key(), "layer": ""},
         workers=args.workers,
         validation=False,
     )

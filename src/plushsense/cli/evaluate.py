@@ -10,28 +10,28 @@ from plushsense.cli.output import emit, figure, say, spread, table, warn
 from plushsense.cli.settings import SIMULATION, listed, marks, report_jobs, settings
 from plushsense.core.errors import ConfigError
 from plushsense.core.sentences import plural
-from plushsense.workflow.reporting import name_of
 
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
-    from plushsense.workflow.api import evaluate
+    from plushsense.workflow.api import evaluate_run
+    from plushsense.workflow.preparation import prepare
     from plushsense.workflow.reporting import PAGE, write_report
 
     config = settings(args, split=args.split, train_context=args.train_context, workers=args.workers)
-    dataset = open_dataset(args.dataset)
     if args.save_windows:
         from plushsense.core.sentences import join_names
         from plushsense.workflow.export import save_windows
 
-        saved = save_windows(dataset, args.save_windows, config, overwrite=args.force, warn=warn)
+        saved = save_windows(args.dataset, args.save_windows, config, overwrite=args.force, warn=warn)
         sizes = join_names(f"{n} {name}" for name, n in saved.windows.items())
         emit(args, saved.to_dict(), [f"{saved.path}: windows: {sizes}; {saved.bytes:,} bytes"])
         return 0
-    out = Path(args.out) if args.out else dataset.path / "evaluations" / name_of(config, dataset)
-    result = evaluate(
-        dataset,
-        config,
+    dataset = open_dataset(args.dataset)
+    made = prepare(dataset, config, warn)
+    out = Path(args.out) if args.out else dataset.path / "evaluations" / made.name
+    result = evaluate_run(
+        made,
         out=out,
         overwrite=args.force,
         cluster=args.cluster,
@@ -143,12 +143,13 @@ def _sweep_report(args: argparse.Namespace) -> int:
 def run_baselines(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
     from plushsense.experiments.baselines.run import PAGE, baselines, comparison_id
+    from plushsense.workflow.preparation import prepare
 
     config = settings(args, workers=args.workers)
     dataset = open_dataset(args.dataset)
     choice: dict[str, Any] = {"splits": listed(args.split), "pca": args.pca}
     choice |= {"models": listed(args.models), "features": listed(args.features)}
-    name = f"baselines_{comparison_id(dataset, config, **choice)[:8]}"
+    name = f"baselines_{comparison_id(prepare(dataset, config), **choice)[:8]}"
     out = Path(args.out) if args.out else dataset.path / "evaluations" / name
     result = baselines(
         dataset,

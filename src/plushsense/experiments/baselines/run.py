@@ -41,7 +41,7 @@ from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import ANYWHERE, WindowSet
 from plushsense.windows.features import Scaler
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, windows_for
+from plushsense.workflow.preparation import Run, Warn, prepare
 from plushsense.workflow.reporting import check_results, journal_of, machine
 
 SPLITS = ("leave-one-subject-out", "windows:5")
@@ -154,18 +154,18 @@ def contenders(
     models: Sequence[str],
     features: Sequence[str],
     pca: Sequence[Pca],
-    config: RunConfig,
+    run: Run,
     arch: Arch,
     layout: Layout,
     gestures: GestureSet,
     windows: WindowSet,
     inputs: Sequence[str],
 ) -> list[Contender]:
-    """Return the requested programs for `compare`; all use the seed of ``config.training``.
+    """Return the requested programs for `compare`; all use the seed of ``run.training``.
 
     All read as many samples as our network; only it reads inputs that are not in ``inputs``.
     """
-    spec, samples = config.training, arch.span
+    spec, samples = run.training, arch.span
     made = classical([m for m in models if m in BASELINES], features, pca, samples, spec.seed)
     recurrent_names = [m for m in models if _kind(m) in RECURRENT]
     if NETWORK in models or recurrent_names:
@@ -222,40 +222,40 @@ def baselines(
     """
     dataset = as_dataset(dataset)
     inputs = dataset.layout.inputs
-    dataset, config = network_inputs_of(dataset, config or from_settings(**settings))
-    if config.windows.context == ANYWHERE:
+    given = config or from_settings(**settings)
+    if given.windows.context == ANYWHERE:
         raise ConfigError("Programs are compared on windows of gestures: choose the context stream or loop.")
+    run = prepare(dataset, given, warn)
+    dataset, gestures, network = run.dataset, run.gestures, run.network
     names = chosen(models)
-    identity = comparison_id(dataset, config, splits, models, features, pca)
+    identity = comparison_id(run, splits, models, features, pca)
     asked = [parse_split(text).text for text in splits]
     if out is not None:
         need("matplotlib", extra="reports")
         need("jinja2", extra="reports")
         check_results(Path(out), "A comparison", TABLE, identity, replace=overwrite)
-    gestures = choose_classes(dataset, config.evaluation.classes, warn)
-    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
-    windows = windows_for(dataset, network, config.windows, gestures, warn)
+    windows = run.scored_windows(warn)
     for name, view, reduced in TOO_LONG:
         if name in names and view in features and reduced in PCA[pca]:
             how = "with" if reduced else "without"
             warn(f"left out: {BASELINES[name].title} on {view} windows {how} PCA, which takes too long")
     table = compare(
         windows,
-        contenders(names, features, PCA[pca], config, network, dataset.layout, gestures, windows, inputs),
+        contenders(names, features, PCA[pca], run, network, dataset.layout, gestures, windows, inputs),
         asked,
         journal=journal_of(dataset, "baselines"),
-        workers=config.evaluation.processes,
+        workers=run.evaluation.processes,
         cluster=cluster,
-        seed=config.evaluation.seed,
+        seed=run.evaluation.seed,
         progress=progress,
     )
     table |= {
         "dataset": dataset.head.name,
         "dataset_hash": dataset.hash,
         "simulated": dataset.head.simulated,
-        "preset": config.preset,
-        "training": config.training.to_dict(),
-        "window_s": config.windows.window_s,
+        "preset": run.preset,
+        "training": run.training.to_dict(),
+        "window_s": run.windows.window_s,
         "id": identity,
         "machine": machine("one thread a program", f"Python {platform.python_version()}"),
         "code_version": __version__,
@@ -267,8 +267,7 @@ def baselines(
 
 
 def comparison_id(
-    dataset: Dataset,
-    config: RunConfig,
+    run: Run,
     splits: Sequence[str] = SPLITS,
     models: str | Sequence[str] = "all",
     features: Sequence[str] = DEFAULT_FEATURES,
@@ -281,11 +280,11 @@ def comparison_id(
     """
     if pca not in PCA:
         raise ConfigError(f"Unknown choice '{pca}' for PCA: accepted are {', '.join(PCA)}.{nearest(pca, PCA)}")
-    outcome = {key: value for key, value in config.for_layout(dataset.layout).outcome().items() if key != "evaluation"}
-    outcome |= {"seed": config.evaluation.seed, "classes": config.evaluation.classes}
+    outcome = {key: value for key, value in run.outcome().items() if key != "evaluation"}
+    outcome |= {"seed": run.evaluation.seed, "classes": run.evaluation.classes}
     outcome |= {"splits": [parse_split(text).text for text in splits], "models": chosen(models)}
     outcome |= {"features": list(features), "pca": pca}
-    return job_id({"settings": outcome, "data": dataset.hash})
+    return job_id({"settings": outcome, "data": run.dataset.hash})
 
 
 def save_baselines(table: dict[str, Any], out: Path) -> None:
