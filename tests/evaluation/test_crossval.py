@@ -156,6 +156,7 @@ import sys
 sys.path.insert(0, {here!r})
 from support.fakes import Oracle, study
 from plushsense.evaluation.crossval import evaluate
+from plushsense.scoring.splits import parse_split
 from plushsense.jobs.journal import Journal
 
 if __name__ == "__main__":
