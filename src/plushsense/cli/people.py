@@ -20,11 +20,13 @@ def run_lens(args: argparse.Namespace) -> int:
         split_table,
         trait_table,
     )
+    from plushsense.workflow.preparation import prepare
 
     config = settings(args, workers=args.workers)
     dataset = open_dataset(args.dataset)
     splits = listed(args.splits)
-    out = Path(args.out) if args.out else dataset.path / "evaluations" / f"lens_{lens_id(dataset, config, splits)[:8]}"
+    name = f"lens_{lens_id(prepare(dataset, config), splits)[:8]}"
+    out = Path(args.out) if args.out else dataset.path / "evaluations" / name
     result = lens(
         dataset,
         config,

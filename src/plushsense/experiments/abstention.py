@@ -20,7 +20,7 @@ from plushsense.core.errors import BadInput, ConfigError, DatasetError, python_w
 from plushsense.core.files import write_file
 from plushsense.core.gestures import NOBODY, GestureSet
 from plushsense.core.layouts import Layout
-from plushsense.dataset.index import as_dataset, open_dataset
+from plushsense.dataset.index import open_dataset
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.evaluation.crossval import fold_fingerprint, fold_windows, windows_fingerprint
 from plushsense.jobs.journal import Job, Report, Result, job_id
@@ -46,13 +46,7 @@ from plushsense.tuning.decisions import (
 )
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import (
-    Warn,
-    choose_classes,
-    network_inputs_of,
-    outside_streams,
-    windows_for,
-)
+from plushsense.workflow.preparation import Warn, outside_streams, prepare, windows_for
 from plushsense.workflow.reporting import check_folder, journal_of
 
 if TYPE_CHECKING:
@@ -408,7 +402,8 @@ def abstaining(
             raise ConfigError(f"{name} is {share}: accepted is between 0 and 1, such as 0.9.")
     if out is not None:
         check_folder(Path(out), "An evaluation of abstention")
-    dataset, config = network_inputs_of(as_dataset(dataset), config or from_settings(**settings))
+    run = prepare(dataset, config or from_settings(**settings), warn)
+    dataset, gestures, arch = run.dataset, run.gestures, run.network
     parsed = parse_split(split)
     if not parsed.separates_people:
         raise ConfigError(
@@ -418,12 +413,10 @@ def abstaining(
         raise DatasetError(
             f"No recording of '{dataset.head.name}' lies in a stream: import the recorder's fulldatastream.csv as well."
         )
-    gestures = choose_classes(dataset, config.evaluation.classes, warn)
-    arch = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
-    windows = windows_for(dataset, arch, config.windows, gestures, warn)
+    windows = windows_for(dataset, arch, run.windows, gestures, warn)
     folds = [
         _without_other_people(fold, windows, dataset)
-        for fold in fold_windows(windows, windows, parsed, config.evaluation.seed)
+        for fold in fold_windows(windows, windows, parsed, run.evaluation.seed)
     ]
     from plushsense.training.fit import resolve_device
 
@@ -432,7 +425,7 @@ def abstaining(
         "dataset": dataset.hash,
         "windows": windows_fingerprint(windows),
         "arch": arch.to_dict(),
-        "training": resolve_device(config.training).key(),
+        "training": resolve_device(run.training).key(),
         "shares": [coverage, known_share],
     }
     # Fold by fold, so that a run that is stopped has results for every gesture.
@@ -444,9 +437,9 @@ def abstaining(
     reporter = JobsReporter({job.id: JobInfo(job.task[0].name, 1.0) for job in jobs}, progress=progress)
     results = run_jobs(
         jobs,
-        _AnswerWork(str(dataset.path), arch, config.training, gestures, dataset.layout, coverage, known_share),
+        _AnswerWork(str(dataset.path), arch, run.training, gestures, dataset.layout, coverage, known_share),
         shared=windows,
-        spec=JobsSpec(config.evaluation.processes, journal=journal_of(dataset, "abstaining")),
+        spec=JobsSpec(run.evaluation.processes, journal=journal_of(dataset, "abstaining")),
         callbacks=JobCallbacks(on_done=reporter.on_done),
     )
     answers = [

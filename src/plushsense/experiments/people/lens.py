@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from plushsense.scoring.metrics import class_scores, column_metrics, confusion, 
 from plushsense.scoring.splits import parse_split
 from plushsense.workflow.api import evaluate
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, silent
+from plushsense.workflow.preparation import Run, Warn, prepare, silent
 from plushsense.workflow.reporting import check_results
 
 SPLITS = ("windows:5", "by-recording:5", "by-subject:5", "leave-one-subject-out")
@@ -70,13 +69,15 @@ def lens(
     if not splits:
         raise ConfigError(f"The lens needs at least one split: for example --splits {','.join(SPLITS)}.")
     parsed = [parse_split(text) for text in splits]
-    identity = lens_id(dataset, config, splits)
+    made = prepare(dataset, config)
+    identity = lens_id(made, splits)
     if out is not None:
         check_results(Path(out), "A lens", TABLE, identity, replace=overwrite)
     rows, honest = [], None
     for number, split in enumerate(parsed):
-        run = replace(config, evaluation=replace(config.evaluation, split=split.text))
-        done = evaluate(dataset, run, cluster=cluster, progress=progress, warn=silent if number else warn)
+        done = evaluate(
+            dataset, config, split=split.text, cluster=cluster, progress=progress, warn=silent if number else warn
+        )
         rows.append(_split_row(done))
         honest = done if split.separates_people else honest
     result: dict[str, Any] = {
@@ -95,12 +96,11 @@ def lens(
             "people": people,
             "traits": trait_correlations({p: measured[p] for p in scores if p in measured}, scores),
         }
-    config = config.for_layout(dataset.layout)
     result |= {
         "id": identity,
-        "name": config.model.arch,
-        "model": {"arch": config.model.arch, "filters": config.model.filters, "preset": config.preset},
-        "seed": config.evaluation.seed,
+        "name": made.model.arch,
+        "model": {"arch": made.model.arch, "filters": made.model.filters, "preset": made.preset},
+        "seed": made.evaluation.seed,
         "dataset": dataset.head.name,
         "dataset_hash": dataset.hash,
         "simulated": dataset.head.simulated,
@@ -112,10 +112,10 @@ def lens(
     return result
 
 
-def lens_id(dataset: Dataset, config: RunConfig, splits: Sequence[str]) -> str:
+def lens_id(run: Run, splits: Sequence[str]) -> str:
     """Return an identifier of 20 hexadecimal digits, equal for equal settings and data."""
-    outcome = config.for_layout(dataset.layout).outcome() | {"splits": [parse_split(text).text for text in splits]}
-    return job_id({"lens": outcome, "data": dataset.hash})
+    outcome = run.outcome() | {"splits": [parse_split(text).text for text in splits]}
+    return job_id({"lens": outcome, "data": run.dataset.hash})
 
 
 def _split_row(done: Evaluation) -> dict[str, Any]:
