@@ -18,12 +18,11 @@ from plushsense.core.errors import BadInput, ConfigError
 from plushsense.studio import tasks
 from plushsense.studio.app.guard import path_in, zip_chunks
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
-from plushsense.studio.app.workspace import EXPORTS, Workspace
+from plushsense.studio.app.workspace import EXPORTS, Workspace, folder_digest
 from plushsense.studio.pages.export.exports import (
     BundleFacts,
     ExportFacts,
     exports_of,
-    folder_digest,
     formats,
     newest_job,
     targets,

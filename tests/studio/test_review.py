@@ -14,8 +14,8 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, append_marks, read_marks
 from plushsense.dataset.trimming import row_times_s, suggest_trims
+from plushsense.studio.app.selections import Selections
 from plushsense.studio.app.workspace import Workspace
-from plushsense.studio.pages.review.review import Reviews
 from support.browsing import DESK, PHONE, TABLET, axe, connected, marked
 from support.reviewed import ROW_S, made, marks, raw_hash, streamed
 
@@ -500,7 +500,7 @@ def test_one_recording_has_no_violation_in_any_light(
 def test_links_from_other_pages(waves: Path, studio: Fixture, look: Fixture) -> None:
     started = studio(home=waves.parents[1])
     ids = [r.id for r in open_dataset(waves).recordings if r.gesture == "Wave"]
-    reviews = Reviews(Workspace(waves.parents[1]))
+    reviews = Selections(Workspace(waves.parents[1]))
     browser = look()
     page = browser.open(started.url + reviews.address(waves, ids[3:6], "Wave taken for Rest"))
     page.wait_for_function("() => document.querySelectorAll('[data-test=table] tbody tr').length === 3")

@@ -13,6 +13,7 @@ from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import Mark, MarkState, append_marks, read_marks
 from plushsense.dataset.trimming import decide_trims, suggest_trims
+from plushsense.studio.app.selections import Selections
 from plushsense.studio.app.workspace import Workspace
 from plushsense.studio.pages.review import signals as review_signals
 from plushsense.studio.pages.review.controller import DONE, NO_FINDING, TO_DO, RecordingFilter, filter_and_sort
@@ -255,16 +256,16 @@ def test_an_overlay_names_what_stands_out(review: Review) -> None:
 
 
 def test_links_to_few_and_to_many(workspace: Workspace, review: Review) -> None:
-    reviews = workspace.part(Reviews)
+    reviews = workspace.part(Selections)
     few = reviews.address(review.path, waves(review)[:2], "confused")
     assert few.count("recordings=") == 2 and "selection" not in few
     many = reviews.address(review.path, [f"P1/x_{i}" for i in range(500)], "Wave taken for Rest")
     key = many.split("selection=")[1]
     assert len(many) < 1500
-    assert reviews.selection(key) == ("Wave taken for Rest", [f"P1/x_{i}" for i in range(500)])
+    assert reviews.read(key) == ("Wave taken for Rest", [f"P1/x_{i}" for i in range(500)])
     for bad in ("../x", "0000"):
         with pytest.raises(ConfigError, match="does not exist"):
-            reviews.selection(bad)
+            reviews.read(bad)
 
 
 def test_a_recording_that_came_since_is_there(workspace: Workspace, review: Review) -> None:

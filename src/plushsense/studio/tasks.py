@@ -40,7 +40,7 @@ from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.proof.verify import verify
 from plushsense.jobs.progress import JobProgress
 from plushsense.studio.app.jobs import UNFINISHED
-from plushsense.studio.pages.export.exports import folder_digest
+from plushsense.studio.app.workspace import folder_digest
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import simulate, train, unfinished
 from plushsense.workflow.config import from_settings

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
 import os
 import re
 import shutil
@@ -14,8 +15,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from plushsense.core.errors import ConfigError, PlushSenseError
+from plushsense.dataset.files import sha256_of
 from plushsense.dataset.importing.build import DEVICE_NAME
 from plushsense.dataset.index import change_head
+from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.dataset.store import DatasetHead
 from plushsense.recording.session_files import SESSION_HEAD
 
@@ -348,3 +351,11 @@ class ChangeSignal:
         with self._lock:
             self._subscribers[key] = schedule
         return unsubscribe
+
+
+def folder_digest(folder: Path) -> str:
+    """Return a SHA-256 hash over the names and contents of all files in a folder."""
+    total = hashlib.sha256()
+    for path in list_package_files(folder):
+        total.update(f"{path.relative_to(folder).as_posix()}\0{sha256_of(path)}\n".encode())
+    return total.hexdigest()

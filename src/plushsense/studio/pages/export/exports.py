@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.sentences import Message
-from plushsense.dataset.files import sha256_of
 from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.deploy.convert import CONVERTERS
 from plushsense.deploy.emit import FACTS, TOY_BYTES, read_facts
@@ -18,7 +16,7 @@ from plushsense.deploy.quantize import integer_model
 from plushsense.deploy.targets import TARGETS, missing_tools
 from plushsense.models.bundle import Bundle
 from plushsense.studio.app.jobs import DONE, Jobs, StudioJob
-from plushsense.studio.app.workspace import EXPORTS, Workspace
+from plushsense.studio.app.workspace import EXPORTS, Workspace, folder_digest
 
 _NEEDS = {
     "onnx": ("onnx", ("onnx", "onnxruntime")),
@@ -121,14 +119,6 @@ def exports_of(workspace: Workspace) -> list[Path]:
     """List the export folders of a workspace, newest first."""
     folders = [p.parent for p in (workspace.folder / EXPORTS).glob(f"*/{FACTS}") if not p.parent.name.startswith(".")]
     return sorted(folders, key=lambda p: -(p / FACTS).stat().st_mtime)
-
-
-def folder_digest(folder: Path) -> str:
-    """Return a SHA-256 hash over the names and contents of all files in a folder."""
-    total = hashlib.sha256()
-    for path in list_package_files(folder):
-        total.update(f"{path.relative_to(folder).as_posix()}\0{sha256_of(path)}\n".encode())
-    return total.hexdigest()
 
 
 def newest_job(jobs: Jobs, task: str, place: Path) -> StudioJob | None:

@@ -7,7 +7,7 @@ The query parameters of the address contain the state of the page, for links and
 ``recordings=ID`` (several times), ``title=TEXT``
     show only these recordings, under this title. Unknown ids are left out and reported.
 ``selection=KEY``
-    the same, but stored under a key. `plushsense.studio.pages.review.review.Reviews.address` chooses one of these.
+    the same, but stored under a key. `plushsense.studio.app.selections.Selections.address` chooses one of these.
 ``person, gesture, state, severity, check, text``
     the filters (`plushsense.studio.pages.review.controller.RecordingFilter`).
 ``view=table | one | overlay | durations | stream``, ``recording=ID``, ``stream=ID``
@@ -21,6 +21,7 @@ from pathlib import Path
 
 from nicegui import context, run, ui
 
+from plushsense.studio.app.selections import Selections
 from plushsense.studio.app.shell import Page, add_style, address, query, tag
 from plushsense.studio.pages.review.controller import DURATIONS, ONE, OVERLAY, STREAM, TABLE, ReviewController
 from plushsense.studio.pages.review.gesture_views import DurationsView, GestureOverlayView
@@ -57,7 +58,7 @@ async def show(page: Page) -> None:
             return  # the studio is ending
         title = values.get("title", "")
         if values.get("selection"):
-            selection = await run.io_bound(reviews.selection, values["selection"])
+            selection = await run.io_bound(page.workspace.part(Selections).read, values["selection"])
             if selection is None:
                 return
             title, recordings = selection

@@ -6,8 +6,6 @@ tabs display too and which survives a reload. Every decision is written immediat
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import threading
 from collections import OrderedDict
@@ -16,12 +14,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlencode
 
 import numpy as np
 
 from plushsense.core.errors import ConfigError, DatasetError
-from plushsense.core.files import write_file
 from plushsense.dataset import labelling
 from plushsense.dataset import trimming as trim
 from plushsense.dataset.files import current_stamp
@@ -544,15 +540,13 @@ def _check_reason(why: str) -> str:
 
 
 _MAX_REVIEWS = 3
-_MAX_ADDRESS = 1500
 
 
 class Reviews:
-    """Service that provides the reviews, one per data set, and stores selections of recordings."""
+    """Service that provides the reviews, one per data set."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
-        self._selections = workspace.folder / "selections"
         self._lock = threading.Lock()
         self._opened: OrderedDict[Path, Review] = OrderedDict()
 
@@ -579,28 +573,3 @@ class Reviews:
         """Stop the background threads of all reviews."""
         for review in self._opened.values():
             review.close()
-
-    def address(self, dataset: Path, recordings: Sequence[str], title: str = "") -> str:
-        """Return the address of the review page for a selection of recordings; the page displays ``title``.
-
-        A long list is stored in ``<home>/selections/`` under its hash, so that the address stays short and valid.
-        """
-        query = urlencode([("dataset", str(dataset)), ("title", title), *(("recordings", r) for r in recordings)])
-        if len(query) <= _MAX_ADDRESS:
-            return f"/review?{query}"
-        selection = {"dataset": str(dataset), "recordings": list(recordings), "title": title}
-        text = json.dumps(selection, ensure_ascii=False)
-        key = hashlib.sha256(text.encode()).hexdigest()[:16]
-        self._selections.mkdir(parents=True, exist_ok=True)
-        write_file(self._selections / f"{key}.json", text)
-        return f"/review?{urlencode({'dataset': str(dataset), 'selection': key})}"
-
-    def selection(self, key: str) -> tuple[str, list[str]]:
-        """Return the title and the recording ids of a stored selection; raise ConfigError for an unknown key."""
-        try:
-            if not key.isalnum():
-                raise ValueError
-            selection = json.loads((self._selections / f"{key}.json").read_text(encoding="utf-8"))
-            return str(selection["title"]), [str(r) for r in selection["recordings"]]
-        except (OSError, ValueError, KeyError, TypeError):
-            raise ConfigError("The selection “{key}” does not exist. Follow the link again.", key=key) from None

@@ -10,6 +10,7 @@ from markupsafe import Markup
 from nicegui import run, ui
 
 from plushsense.models.bundle import known_people
+from plushsense.studio.app.selections import Selections
 from plushsense.studio.app.shell import (
     AFFECT_SIGNS,
     Page,
@@ -22,7 +23,6 @@ from plushsense.studio.app.shell import (
     tag,
 )
 from plushsense.studio.app.words import Texts, Words
-from plushsense.studio.pages.review.review import Reviews
 from plushsense.studio.pages.train.results import (
     EVALUATION,
     HELD_BACK,
@@ -248,7 +248,7 @@ class ResultDetailsView:
         """Return the address of the review page for these recordings, or "" if the data set is not in this studio."""
         if not dataset:
             return ""
-        return self._page.workspace.part(Reviews).address(Path(dataset), recordings, title)
+        return self._page.workspace.part(Selections).address(Path(dataset), recordings, title)
 
     def _gestures(self, label: str) -> list[str]:
         """Return the gestures that a label of the displayed matrix includes: one gesture, or all with this affect."""
