@@ -159,7 +159,7 @@ def test_details_with_a_wrong_value_are_a_sentence(home: Path, change: Callable[
     evaluated(home, change)
     stored = StoredResults(Workspace(home))
     (row,) = stored.rows()
-    with pytest.raises(PlushSenseError, match="compute this result again"):
+    with pytest.raises(PlushSenseError, match="Compute it again"):
         stored.details(row)
 
 
@@ -198,7 +198,7 @@ def test_nothing_outside_is_read(home: Path, tmp_path: Path, monkeypatch: pytest
     (row,) = stored.rows()
     for name in ("../../../../../elsewhere/predictions.parquet", str(elsewhere / "predictions.parquet")):
         (inside / "sweep.json").write_text(json.dumps({**SWEPT, "predictions": {"t1": name}}), encoding="utf-8")
-        with pytest.raises(PlushSenseError, match="lies outside the studio's folders"):
+        with pytest.raises(PlushSenseError, match="is not in the studio's folder"):
             stored.misread(row, ["a"], ["b"])
     if sys.platform != "win32":
         (folder_of(home, "linked") / SCORES).symlink_to(elsewhere / SCORES)

@@ -103,7 +103,7 @@ def test_stopped_work_ends_soon_and_can_be_begun_again(workspace: Workspace, job
     job = jobs.start("simulate", spec(workspace, "long", LONG), "Long")
     until(lambda: job.progress)
     assert jobs.resume(job.id) is job
-    with pytest.raises(ConfigError, match="stop it first"):
+    with pytest.raises(ConfigError, match="Stop it first"):
         jobs.drop(job.id)
     jobs.stop(job.id)
     ended(job)
@@ -143,7 +143,7 @@ def test_ids_are_unique_in_order_also_when_the_clock_goes_back(
 
 def test_an_id_that_is_none_is_refused(jobs: Jobs) -> None:
     for call in (jobs.get, jobs.resume, jobs.drop):
-        with pytest.raises(ConfigError, match="no job"):
+        with pytest.raises(ConfigError, match="not in the list any more"):
             call("nothing")
     jobs.stop("nothing")
 
@@ -177,7 +177,7 @@ def test_a_folder_that_cannot_be_written_to(workspace: Workspace) -> None:
     try:
         job = Jobs(workspace).start("check", {"dataset": "x"}, "Check")
         assert job.state == REFUSED
-        assert "cannot begin" in job.message and "Permission" in job.message
+        assert "The computer refused" in job.message and "Permission" in job.message
     finally:
         workspace.folder.chmod(0o700)
 
@@ -293,7 +293,7 @@ def test_names_that_may_not_be_left_anywhere_are_not_left_in_the_work_folder(wor
     again = ended(later.resume(job.id))
     assert (again.state, again.message) == (
         REFUSED,
-        "The words to remove are not stored: enter them again on the publish page.",
+        "The words to remove are not stored. Enter them again on the page Publish.",
     )
 
 

@@ -102,7 +102,7 @@ def test_a_bundle_of_another_layout_says_both(workspace: Workspace) -> None:
 
 def test_it_starts_with_sentences_or_not_at_all(workspace: Workspace) -> None:
     reader = workspace.part(LiveReader)
-    with pytest.raises(ConfigError, match="No bundle"):
+    with pytest.raises(ConfigError, match="No network is chosen"):
         reader.start(LiveChoice(VIRTUAL))
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -67,7 +67,7 @@ def test_rows_are_on_disk_within_a_second_and_are_labelled_to_the_row(workspace:
     assert layout == load_layout("plush-15") and np.array_equal(cut.values, rows.values[500:640])
     assert np.array_equal(cut.device_ms, rows.device_ms[500:640])
     assert (folder / "fulldatastream.csv").read_bytes() == stream, "the stream itself never changes"
-    with pytest.raises(ConfigError, match="cannot be the label of a gesture"):
+    with pytest.raises(ConfigError, match="cannot be the name of a gesture"):
         recording.label(key, [("a/b", 0, 50)])
 
 

@@ -107,7 +107,7 @@ def test_the_virtual_toy_passes(toys: Toys, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_toy_of_another_layout_does_not_fit(toys: Toys, server: Callable[[bytes], str]) -> None:
-    with pytest.raises(DeviceError, match=r"no frames of the layout 'plush-15'.*layout=plush-14"):
+    with pytest.raises(DeviceError, match=r"lines that are not of the layout plush-15"):
         toys.test(server(b"1 2 3\n"))
 
 
@@ -131,7 +131,7 @@ def test_a_silent_toy_and_none_at_all(
     toys: Toys, server: Callable[[bytes], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(room, "_TIMEOUT_S", 0.3)
-    with pytest.raises(DeviceError, match=r"sent nothing within 0\.3 s"):
+    with pytest.raises(DeviceError, match=r"sent nothing for 0\.3 s"):
         toys.test(server(b""))
     with pytest.raises(DeviceError):
         toys.test("tcp://127.0.0.1:9")

@@ -79,8 +79,8 @@ def test_the_command_resolves_to_the_same_settings(home: Path, monkeypatch: pyte
         ({"kind": "search", "max_parameters": "few"}, "max_parameters is 'few'"),
         ({"kind": "search", "share": "half"}, "share is 'half'"),
         ({"kind": "search", "share": "nan"}, "share is 'nan'"),
-        ({"kind": "sweep", "grid": "/etc/passwd"}, "outside the studio's folders"),
-        ({"kind": "train", "name": "n", "dataset": "/tmp"}, "outside the studio's folders"),
+        ({"kind": "sweep", "grid": "/etc/passwd"}, "not in the studio's folder"),
+        ({"kind": "train", "name": "n", "dataset": "/tmp"}, "not in the studio's folder"),
         ({"kind": "train", "name": "n", "dataset": "datasets/gone"}, "does not exist any more"),
         ({"kind": "train", "name": "n", "dataset": ""}, "No data set is chosen"),
         ({"kind": "train", "name": "n", "filters": "8;12"}, "8;12"),
@@ -106,7 +106,7 @@ def test_the_same_work_is_not_begun_twice(home: Path, monkeypatch: pytest.Monkey
     form = {"dataset": str(workspace.datasets()[0]), "kind": "train", "name": "one"}
     first = job_request(workspace, jobs, form)
     jobs.start(first.task, first.spec, first.title)
-    with pytest.raises(ConfigError, match="'one' is being trained now"):
+    with pytest.raises(ConfigError, match="“one” is being trained now"):
         job_request(workspace, jobs, form)
     again = {"dataset": form["dataset"], "kind": "evaluate", "split": "by-subject:5"}
     proof = job_request(workspace, jobs, again)

@@ -41,14 +41,14 @@ def workspace(tmp_path: Path) -> Workspace:
 
 @pytest.mark.parametrize("path", ODD, ids=lambda p: ascii(p)[:30])
 def test_what_lies_outside_is_refused(workspace: Workspace, path: str) -> None:
-    with pytest.raises(ConfigError, match="outside"):
+    with pytest.raises(ConfigError, match="not in the studio's folder"):
         workspace.inside(path)
 
 
 @pytest.mark.parametrize("path", ["C:\\Windows\\win.ini", "\\\\server\\share", "C:/x", "..\\..\\secret", "D:x"])
 def test_windows_paths_lead_nowhere(workspace: Workspace, path: str) -> None:
     if sys.platform == "win32":
-        with pytest.raises(ConfigError, match="outside"):
+        with pytest.raises(ConfigError, match="not in the studio's folder"):
             workspace.inside(path)
     else:
         # Here these are names like any other, of things inside.
@@ -61,9 +61,9 @@ def test_links_that_lead_out_are_refused(workspace: Workspace) -> None:
         (workspace.folder / "round").symlink_to(workspace.folder / "round")
     except OSError:
         pytest.skip("no links here")
-    with pytest.raises(ConfigError, match="outside"):
+    with pytest.raises(ConfigError, match="not in the studio's folder"):
         workspace.inside("way/secret")
-    with pytest.raises(ConfigError, match="outside"):
+    with pytest.raises(ConfigError, match="not in the studio's folder"):
         workspace.inside(workspace.folder / "way")
     with_link = workspace.folder / DATASETS / "linked"
     with_link.symlink_to(workspace.folder.parent)
@@ -176,16 +176,16 @@ def test_what_is_discarded_can_be_restored_or_deleted(tmp_path: Path) -> None:
     again = workspace.discard(made_dataset(workspace, "spring", simulated=True))
     assert sorted(workspace.discarded()) == sorted([discarded, again])
     assert workspace.restore(again) == first and DatasetHead.read(first).simulated
-    with pytest.raises(ConfigError, match="exists again"):
+    with pytest.raises(ConfigError, match="There is another"):
         workspace.restore(discarded)
-    with pytest.raises(ConfigError, match="is not discarded"):
+    with pytest.raises(ConfigError, match="is not among the discarded"):
         workspace.delete(first)
-    with pytest.raises(ConfigError, match="is not discarded"):
+    with pytest.raises(ConfigError, match="is not among the discarded"):
         workspace.restore(tmp_path / "discarded" / "datasets" / ".." / ".." / "datasets" / "spring")
     workspace.delete(discarded)
     assert workspace.discarded() == []
     given = Workspace(tmp_path / "other", given=(first,))
-    with pytest.raises(ConfigError, match="lies outside the studio's folder"):
+    with pytest.raises(ConfigError, match="is not in the studio's folder"):
         given.discard(first)
 
 
@@ -194,7 +194,7 @@ def test_a_data_set_changes_its_name_and_keeps_its_folder(tmp_path: Path) -> Non
     path, other = made_dataset(workspace, "spring"), made_dataset(workspace, "autumn")
     assert workspace.rename(path, "Spring 2026") == path
     assert workspace.title(path) == "Spring 2026"
-    with pytest.raises(ConfigError, match="Another data set is called 'autumn'"):
+    with pytest.raises(ConfigError, match="“autumn” exists already"):
         workspace.rename(path, "autumn")
     for name in ("", "a/b", "..", "x" * 65):
         with pytest.raises(ConfigError, match="cannot be a name"):

@@ -55,4 +55,4 @@ def test_a_pattern_by_hand_that_names_a_counter_is_warned_of(tmp_path: Path) -> 
     said = "'n' is a number of the row: a network would read from it when a recording was made"
     assert said in preview_import(tmp_path / "src", pattern=pattern).warnings[0]
     (note,) = import_recordings(tmp_path / "src", tmp_path / "DS", pattern=pattern).notes
-    assert said in note and note.template.startswith("{channels} ")
+    assert said in note and note.values["channels"]
