@@ -9,7 +9,7 @@ with the merges of each person chosen on all other people.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -25,6 +25,7 @@ from plushsense.core.gestures import AFFECT, NOBODY, Gesture, GestureSet, merge_
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.scores import Predictions, read_predictions
+from plushsense.experiments.analysis.results import Grouping, MergeResult, MergeStep
 from plushsense.scoring.metrics import column_metrics, confusion, summary
 from plushsense.workflow.reporting import PREDICTIONS, load_evaluation
 
@@ -41,7 +42,7 @@ def propose_merges(
     merges: int | None = None,
     groups: str | None = None,
     out: str | os.PathLike[str] | None = None,
-) -> dict[str, Any]:
+) -> MergeResult:
     """Merge the two groups of gestures that people's windows are most confused between, again and again.
 
     Only gestures of one affect are merged, and never one that is recorded without a person or means that nothing
@@ -53,15 +54,6 @@ def propose_merges(
         groups: the merged gestures to write instead: "family", "affect", a built-in merge, or a file, which is scored
             as well (see `GestureSet.merged_by`).
         out: a TOML file to write, for ``--classes`` of `train` and `evaluate`.
-
-    Returns:
-        ``steps``, one for each number of merges from 0: {merges, classes, merged (labels), confusion, people, largest,
-        scores, crossfitted}. ``confusion`` is the mean over people of the share of windows that the two groups of the
-        last merge exchanged, in ``people`` of them; ``largest`` the share of the most frequent class in the windows of
-        people; ``scores`` and ``crossfitted`` hold the summary of each metric over people, with merges chosen on all
-        people and on the others.
-        ``groupings``, one for each merge named beforehand that applies: {name, classes, merged, largest, scores};
-        nothing is chosen, so that nothing needs to be cross-fitted.
 
     Raises:
         BadInput: for an evaluation of other gestures; GestureError: for unknown ``groups``; ConfigError: for a number
@@ -87,26 +79,9 @@ def propose_merges(
     for number, (merged, exchanged, confused) in enumerate(path):
         chosen = [other[min(number, len(other) - 1)][0] for other in others]
         steps.append(
-            {
-                "merges": number,
-                **_scored(predictions, people, merged),
-                "confusion": exchanged,
-                "people": confused,
-                "crossfitted": _scores(predictions, people, lambda i, chosen=chosen: chosen[i]),  # type: ignore[misc]
-            }
+            MergeStep(_grouping(predictions, people, merged), _scores(predictions, people, chosen), exchanged, confused)
         )
     named = _named(gestures, groups)
-    result = {
-        "steps": steps,
-        "groupings": [
-            {"name": name, **_scored(predictions, people, gestures.groups_of(merged))} for name, merged in named.items()
-        ],
-        "split": table["split"],
-        "leaky": table["leaky"],
-        "simulated": table["simulated"],
-        "people": len(people),
-        "gestures": None,
-    }
     if out is not None:
         if groups is not None:
             merged_set = named[groups]
@@ -115,8 +90,15 @@ def propose_merges(
         else:
             raise ConfigError(f"merges is {merges}: accepted are 1 to {len(path) - 1}, the steps that are possible.")
         write_file(Path(out), tomli_w.dumps(_without_defaults(merged_set)))
-        result["gestures"] = str(out)
-    return result
+    return MergeResult(
+        steps=tuple(steps),
+        groupings={n: _grouping(predictions, people, gestures.groups_of(merged)) for n, merged in named.items()},
+        split=table["split"],
+        leaky=table["leaky"],
+        simulated=table["simulated"],
+        people=len(people),
+        gestures=None if out is None else str(out),
+    )
 
 
 def _named(gestures: GestureSet, groups: str | None) -> dict[str, GestureSet]:
@@ -136,16 +118,16 @@ def _named(gestures: GestureSet, groups: str | None) -> dict[str, GestureSet]:
     return found
 
 
-def _scored(predictions: Predictions, people: NDArray[np.str_], groups: Groups) -> dict[str, Any]:
+def _grouping(predictions: Predictions, people: NDArray[np.str_], groups: Groups) -> Grouping:
     # Like the scores, of people only: recordings at rest would often be the largest class.
     truth = predictions.truth[np.isin(predictions.subject, people)]
     sizes = np.array([np.isin(truth, group).sum() for group in groups])
-    return {
-        "classes": len(groups),
-        "merged": [[predictions.labels[k] for k in group] for group in groups if len(group) > 1],
-        "largest": float(sizes.max() / sizes.sum()),
-        "scores": _scores(predictions, people, lambda _: groups),
-    }
+    return Grouping(
+        classes=len(groups),
+        merged=tuple(tuple(predictions.labels[k] for k in group) for group in groups if len(group) > 1),
+        largest=float(sizes.max() / sizes.sum()),
+        scores=_scores(predictions, people, [groups] * len(people)),
+    )
 
 
 def merge_path(counts: NDArray[np.int64], gestures: GestureSet) -> list[tuple[Groups, float | None, int | None]]:
@@ -203,11 +185,13 @@ def _counts(predictions: Predictions, mask: NDArray[np.bool_]) -> NDArray[np.int
     return confusion(predictions.truth[mask], predictions.predicted[mask], len(predictions.labels))
 
 
-def _scores(predictions: Predictions, people: NDArray[np.str_], groups_of: Callable[[int], Groups]) -> dict[str, Any]:
+def _scores(
+    predictions: Predictions, people: NDArray[np.str_], groups_of: Sequence[Groups]
+) -> dict[str, dict[str, Any]]:
     """Return the summary over people of each metric, with the groups of each person."""
     values: dict[str, list[float]] = {key: [] for key in column_metrics()}
-    for i, person in enumerate(people):
-        mine, groups = predictions.subject == person, groups_of(i)
+    for person, groups in zip(people, groups_of, strict=True):
+        mine = predictions.subject == person
         member = np.zeros((len(predictions.labels), len(groups)))
         for g, group in enumerate(groups):
             member[list(group), g] = 1
