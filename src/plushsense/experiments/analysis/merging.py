@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tomli_w
@@ -33,6 +33,14 @@ Groups = tuple[tuple[int, ...], ...]
 """A partition of the classes."""
 
 Floats = NDArray[np.float64]
+
+
+class Merge(NamedTuple):
+    """The groups after a merge, with its confusion, and in how many people it occurs (None before the first)."""
+
+    groups: Groups
+    confusion: float | None
+    people: int | None
 
 
 def propose_merges(
@@ -73,25 +81,17 @@ def propose_merges(
         raise BadInput(f"'{folder}' has one person, but merges are chosen by several: evaluate more people.")
     counts = np.stack([_counts(predictions, predictions.subject == person) for person in people])
     path = merge_path(counts, gestures)
-    # Without a person, another order of merges may follow, of another length.
-    others = [merge_path(np.delete(counts, i, axis=0), gestures) for i in range(len(people))]
-    steps = []
-    for number, (merged, exchanged, confused) in enumerate(path):
-        chosen = [other[min(number, len(other) - 1)][0] for other in others]
-        steps.append(
-            MergeStep(_grouping(predictions, people, merged), _scores(predictions, people, chosen), exchanged, confused)
-        )
     named = _named(gestures, groups)
     if out is not None:
         if groups is not None:
             merged_set = named[groups]
         elif merges is not None and 0 < merges < len(path):
-            merged_set = gestures.merged(path[merges][0])
+            merged_set = gestures.merged(path[merges].groups)
         else:
             raise ConfigError(f"merges is {merges}: accepted are 1 to {len(path) - 1}, the steps that are possible.")
         write_file(Path(out), tomli_w.dumps(_without_defaults(merged_set)))
     return MergeResult(
-        steps=tuple(steps),
+        steps=_steps(predictions, people, counts, path, gestures),
         groupings={n: _grouping(predictions, people, gestures.groups_of(merged)) for n, merged in named.items()},
         split=table["split"],
         leaky=table["leaky"],
@@ -99,6 +99,24 @@ def propose_merges(
         people=len(people),
         gestures=None if out is None else str(out),
     )
+
+
+def _steps(
+    predictions: Predictions,
+    people: NDArray[np.str_],
+    counts: NDArray[np.int64],
+    path: Sequence[Merge],
+    gestures: GestureSet,
+) -> tuple[MergeStep, ...]:
+    """Score the groups of ``path``, with each person's merges chosen on all people, and on all others."""
+    # Without a person, another order of merges may follow, of another length.
+    others = [merge_path(np.delete(counts, i, axis=0), gestures) for i in range(len(people))]
+    steps = []
+    for number, merge in enumerate(path):
+        chosen = [other[min(number, len(other) - 1)].groups for other in others]
+        grouping = _grouping(predictions, people, merge.groups)
+        steps.append(MergeStep(grouping, _scores(predictions, people, chosen), merge.confusion, merge.people))
+    return tuple(steps)
 
 
 def _named(gestures: GestureSet, groups: str | None) -> dict[str, GestureSet]:
@@ -130,17 +148,17 @@ def _grouping(predictions: Predictions, people: NDArray[np.str_], groups: Groups
     )
 
 
-def merge_path(counts: NDArray[np.int64], gestures: GestureSet) -> list[tuple[Groups, float | None, int | None]]:
+def merge_path(counts: NDArray[np.int64], gestures: GestureSet) -> list[Merge]:
     """Merge the most confused pair of groups until two are left, or none that may be merged and is confused.
 
     Args:
         counts: confusion matrices of the people, (people, K, K).
 
     Returns:
-        the groups after 0, 1, 2, … merges, with the confusion of the last merge, and in how many people it occurs.
+        the groups after 0, 1, 2, … merges.
     """
     groups: Groups = tuple((k,) for k in range(len(gestures)))
-    path: list[tuple[Groups, float | None, int | None]] = [(groups, None, None)]
+    path = [Merge(groups, None, None)]
     while len(groups) > 2:
         best: tuple[float, int, int, int] | None = None
         for a, b in combinations(range(len(groups)), 2):
@@ -154,7 +172,7 @@ def merge_path(counts: NDArray[np.int64], gestures: GestureSet) -> list[tuple[Gr
         mean, people, a, b = best
         joined = tuple(sorted((*groups[a], *groups[b])))
         groups = tuple(sorted([g for i, g in enumerate(groups) if i not in (a, b)] + [joined]))
-        path.append((groups, mean, people))
+        path.append(Merge(groups, mean, people))
     return path
 
 
