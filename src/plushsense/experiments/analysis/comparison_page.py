@@ -24,7 +24,7 @@ _GREY = "#999999"
 def comparison_page(result: ComparisonResult) -> str:
     """Return the page of a comparison as HTML."""
     ranked = [(metric.title, data_uri(rank_figure(result, key))) for key, metric in column_metrics().items()]
-    copies = [(m.name, m.evaluation.leakage["pairs"]) for m in result.models if m.evaluation.leakage["pairs"]]
+    copies = [(m.name, m.evaluation.leakage.pairs) for m in result.models if m.evaluation.leakage.pairs]
     return render_page(
         "comparison.html.j2",
         title=f"{len(result.models)} evaluations of {result.dataset}, person by person",

@@ -12,6 +12,7 @@ import numpy as np
 
 from plushsense.core.errors import BadInput
 from plushsense.core.version import __version__
+from plushsense.evaluation.leakage import LeakageResult
 from plushsense.evaluation.scores import Predictions, read_predictions
 from plushsense.scoring.comparison import PairResult
 from plushsense.workflow.reporting import PREDICTIONS, load_evaluation
@@ -19,13 +20,15 @@ from plushsense.workflow.reporting import PREDICTIONS, load_evaluation
 Scores = Mapping[str, Mapping[str, Any]]
 """The metrics of each person by code."""
 
+_AS_SAVED = ("id", "title", "seeds", "simulated", "split", "leaky", "context", "by_recording")
+
 
 @dataclass(frozen=True)
 class SavedEvaluation:
     """What `evaluate` wrote to a folder, as far as a comparison reads it.
 
     ``data`` is the hash of the data set, ``people`` the metrics of each person over windows, ``train_windows`` the mean
-    number of training windows of a fold, ``leakage`` the audit of `plushsense.evaluation.leakage`.
+    number of training windows of a fold.
     """
 
     folder: Path
@@ -43,7 +46,7 @@ class SavedEvaluation:
     people: Scores
     train_windows: int
     by_recording: Mapping[str, Any]
-    leakage: Mapping[str, Any]
+    leakage: LeakageResult
     predictions: Predictions
 
     @classmethod
@@ -65,20 +68,8 @@ class SavedEvaluation:
                 people={row["subject"]: row for row in table["subjects"]},
                 train_windows=round(np.mean([fold["train_windows"] for fold in table["folds"]])),
                 predictions=read_predictions(folder / PREDICTIONS),
-                **{
-                    key: table[key]
-                    for key in (
-                        "id",
-                        "title",
-                        "seeds",
-                        "simulated",
-                        "split",
-                        "leaky",
-                        "context",
-                        "by_recording",
-                        "leakage",
-                    )
-                },
+                leakage=LeakageResult.from_json(table["leakage"]),
+                **{key: table[key] for key in _AS_SAVED},
             )
         except (KeyError, TypeError):
             raise BadInput(f"'{folder}' is an evaluation of an older kind: evaluate again.") from None
@@ -110,7 +101,7 @@ class ComparedModel:
             "leaky": e.leaky,
             "train_windows": e.train_windows,
             "by_recording": e.by_recording,
-            "leakage": e.leakage,
+            "leakage": e.leakage.to_json(),
         }
 
 

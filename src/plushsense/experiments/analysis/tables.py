@@ -53,16 +53,15 @@ def split_table(result: ComparisonResult) -> Table:
     rows = []
     for model in sorted(result.models, key=lambda model: model.name):
         e = model.evaluation
-        windows = e.leakage["windows"]
         rows.append(
             {
                 "name": model.name,
                 "split": e.split + " LEAKY" * e.leaky,
                 "people": len(e.people),
                 "train_windows": e.train_windows,
-                "windows": windows,
+                "windows": e.leakage.windows,
                 "voted": e.by_recording["accuracy"],
-                **{key: e.leakage[key] / max(windows, 1) for key in _AUDIT},
+                **{kind: e.leakage.share(kind) for kind in _AUDIT},
             }
         )
     columns = (
