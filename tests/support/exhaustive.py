@@ -164,7 +164,7 @@ EXHAUSTIVE = {
             "personal",
             "questions",
             "record",
-            "results",
+            "measurements/results",
             "streams",
             "sweep",
             "trim",

@@ -16,7 +16,7 @@ from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import writing_around
 from plushsense.evaluation.scores import Predictions, votes_by_person
 from plushsense.experiments.analysis.comparison_page import comparison_page
-from plushsense.experiments.analysis.results import ComparedModel, ComparisonResult, SavedEvaluation, Scores
+from plushsense.experiments.analysis.results import ComparedModel, PairedComparisonResult, SavedEvaluation, Scores
 from plushsense.jobs.journal import job_id
 from plushsense.scoring.comparison import average_ranks, cliques, compare_pairs
 from plushsense.scoring.metrics import calibration_error, column_metrics, summary
@@ -32,7 +32,7 @@ def compare(
     *,
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
-) -> ComparisonResult:
+) -> PairedComparisonResult:
     """Compare saved evaluations person by person, of several networks, of several splits, or of both.
 
     Args:
@@ -62,7 +62,7 @@ def compare(
     models = _ranked(found, names, values)
     pairs = {key: tuple(compare_pairs(names, table)) for key, table in values.items()}
     ordered = {key: [m.name for m in sorted(models, key=lambda m: m.rank[key])] for key in values}
-    result = ComparisonResult(
+    result = PairedComparisonResult(
         models=tuple(models),
         pairs=pairs,
         cliques={key: cliques(ordered[key], pairs[key]) for key in values},
@@ -104,7 +104,7 @@ def _ranked(
 
 
 def _scores_of_people(evaluations: Sequence[SavedEvaluation]) -> tuple[str, list[Scores]]:
-    """Return what is compared of each person (`ComparisonResult.scored`), and the scores of each evaluation.
+    """Return what is compared of each person (`PairedComparisonResult.scored`), and the scores of each evaluation.
 
     Raises:
         BadInput: if evaluations of one split scored different recordings.

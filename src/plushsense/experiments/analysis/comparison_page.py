@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from plushsense.experiments.analysis.results import ComparisonResult
+from plushsense.experiments.analysis.results import PairedComparisonResult
 from plushsense.experiments.analysis.tables import SCORED, model_table, pair_table, split_table
 from plushsense.reports.figures import data_uri, new_figure
 from plushsense.reports.page import render_page
@@ -21,7 +21,7 @@ _HONEST, _LEAKY = "#0072b2", "#d55e00"
 _GREY = "#999999"
 
 
-def comparison_page(result: ComparisonResult) -> str:
+def comparison_page(result: PairedComparisonResult) -> str:
     """Return the page of a comparison as HTML."""
     ranked = [(metric.title, data_uri(rank_figure(result, key))) for key, metric in column_metrics().items()]
     copies = [(m.name, m.evaluation.leakage.pairs) for m in result.models if m.evaluation.leakage.pairs]
@@ -45,7 +45,7 @@ def comparison_page(result: ComparisonResult) -> str:
     )
 
 
-def score_figure(result: ComparisonResult) -> Figure:
+def score_figure(result: PairedComparisonResult) -> Figure:
     """Draw the mean of each metric of each model with its 95 % interval over people."""
     models = sorted(result.models, key=lambda model: model.name)
     figure = new_figure(7.6, 1.4 + 0.5 * len(models))
@@ -75,7 +75,7 @@ def score_figure(result: ComparisonResult) -> Figure:
     return figure
 
 
-def rank_figure(result: ComparisonResult, key: str) -> Figure:
+def rank_figure(result: PairedComparisonResult, key: str) -> Figure:
     """Draw the mean ranks of the models, with bars below those that do not differ significantly."""
     models = sorted(result.models, key=lambda model: model.rank[key])
     runs = result.cliques[key]
@@ -97,7 +97,7 @@ def rank_figure(result: ComparisonResult, key: str) -> Figure:
     return figure
 
 
-def people_figure(result: ComparisonResult) -> Figure:
+def people_figure(result: PairedComparisonResult) -> Figure:
     """Draw the accuracy of each person under each model."""
     names = [model.name for model in result.models]
     people = sorted(result.people, key=lambda person: result.people[person][names[0]]["accuracy"])

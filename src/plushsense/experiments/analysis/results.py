@@ -106,7 +106,7 @@ class ComparedModel:
 
 
 @dataclass(frozen=True)
-class ComparisonResult:
+class PairedComparisonResult:
     """Evaluations compared person by person.
 
     Attributes:

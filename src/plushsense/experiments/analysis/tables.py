@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from plushsense.experiments.analysis.results import ComparisonResult, MergeResult
+from plushsense.experiments.analysis.results import PairedComparisonResult, MergeResult
 from plushsense.reports.table import Column, Table, interval, mean_sd, number
 from plushsense.scoring.metrics import column_metrics
 
@@ -11,7 +11,7 @@ SCORED = {
     "recordings": "The evaluations scored different windows: recordings are compared, each by the vote of its windows.",
     "own": "The splits score different recordings: each person's score is over those of the split.",
 }
-"""A sentence on what is compared of each person (`ComparisonResult.scored`)."""
+"""A sentence on what is compared of each person (`PairedComparisonResult.scored`)."""
 
 _AUDIT = {
     "same_person": "person",
@@ -21,7 +21,7 @@ _AUDIT = {
 }
 
 
-def model_table(result: ComparisonResult) -> Table:
+def model_table(result: PairedComparisonResult) -> Table:
     """Return one row for each model of a comparison, the best rank first."""
     metrics = column_metrics()
     rows = [
@@ -48,7 +48,7 @@ def model_table(result: ComparisonResult) -> Table:
     return Table("models", "Models, the best first", columns, tuple(rows))
 
 
-def split_table(result: ComparisonResult) -> Table:
+def split_table(result: PairedComparisonResult) -> Table:
     """Return one row for each model with the size of its split and the leakage audit."""
     rows = []
     for model in sorted(result.models, key=lambda model: model.name):
@@ -79,7 +79,7 @@ def split_table(result: ComparisonResult) -> Table:
     return Table("splits", "Splits, and what they leak", columns, tuple(rows))
 
 
-def pair_table(result: ComparisonResult, key: str) -> Table:
+def pair_table(result: PairedComparisonResult, key: str) -> Table:
     """Return one row for each pair of models and one metric."""
     rows = [
         {
