@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from plushsense.experiments.analysis.results import PairedComparisonResult, MergeResult
+from plushsense.experiments.analysis.results import MergeResult, PairedComparisonResult
 from plushsense.reports.table import Column, Table, interval, mean_sd, number
 from plushsense.scoring.metrics import column_metrics
 
