@@ -265,7 +265,7 @@ def evaluate(
     tested = [(fold.name, fold.test) for fold in folds]
     predictions = gather_predictions(score_windows, tested, [outcome["probabilities"] for outcome in outcomes])
     table = compute_scores(predictions, records, score_windows.affects, split.separates_people)
-    table["leakage"] = audit_leakage(train_windows, score_windows, folds, shared_rows)
+    table["leakage"] = audit_leakage(train_windows, score_windows, folds, shared_rows).to_json()
     if score_windows.self_calibration:
         table["self_calibration"] = score_windows.self_calibration
     if all("deployed" in outcome for outcome in outcomes):

@@ -34,7 +34,7 @@ from plushsense.deploy.quantize import (
 )
 from plushsense.evaluation.crossval import EpochProgress, Evaluation, FoldOutput
 from plushsense.evaluation.crossval import evaluate as crossvalidate
-from plushsense.evaluation.leakage import warn_of_copies
+from plushsense.evaluation.leakage import LeakageResult, warn_of_copies
 from plushsense.evaluation.scores import FoldRecord, Predictions, gather_predictions, with_accuracy
 from plushsense.evaluation.scores import compute_scores as score_predictions
 from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possible
@@ -417,7 +417,7 @@ def evaluate_run(
         shared_rows=copied_recordings(run.dataset, score.recording_ids),
         progress=progress,
     )
-    warn_of_copies(result.table["leakage"], warn)
+    warn_of_copies(LeakageResult.from_json(result.table["leakage"]), warn)
     if out is not None:
         with run.dataset.generation.writing():
             save_evaluation(result, run, Path(out))
