@@ -270,7 +270,7 @@ def test_a_worker_that_is_asked_nonsense_refuses(line: str) -> None:
     # It stays open: its end would be the studio's.
     worker.stdin.write(line)
     worker.stdin.flush()
-    refused = json.loads(worker.stdout.readline())["refused"]
+    refused = json.loads(worker.stdout.readline())["refused"]["message"]
     assert "broke off" in refused
     assert worker.wait(60) == 2
     worker.stdin.close()

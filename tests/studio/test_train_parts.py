@@ -65,27 +65,27 @@ def test_the_command_resolves_to_the_same_settings(home: Path, monkeypatch: pyte
 @pytest.mark.parametrize(
     ("form", "said"),
     [
-        ({"kind": "train", "name": "little"}, "'little.plush' exists already"),
+        ({"kind": "train", "name": "little"}, "“little” exists already"),
         ({"kind": "train", "name": "../x"}, "cannot be a name"),
-        ({"kind": "train", "name": "n", "epochs": "many"}, "epochs is 'many': give a whole number"),
-        ({"kind": "train", "name": "n", "epochs": 0}, "epochs is 0"),
-        ({"kind": "train", "name": "n", "arch": "14x"}, "14x"),
+        ({"kind": "train", "name": "n", "epochs": "many"}, "whole number from 1"),
+        ({"kind": "train", "name": "n", "epochs": 0}, "whole number from 1"),
+        ({"kind": "train", "name": "n", "arch": "14x"}, "This is no network"),
         ({"kind": "train", "name": "n", "preset": "pepole"}, "people"),
-        ({"kind": "train", "name": "n", "quantize_aware": -1}, "quantize_aware is -1"),
-        ({"kind": "train", "name": "n", "quantize_aware": "many"}, "quantize_aware is 'many'"),
+        ({"kind": "train", "name": "n", "quantize_aware": -1}, "whole number from 0"),
+        ({"kind": "train", "name": "n", "quantize_aware": "many"}, "whole number from 0"),
         ({"kind": "evaluate", "split": "by-people:5"}, "split"),
-        ({"kind": "sweep", "seeds": "many"}, "seeds is 'many': give a whole number from 1"),
-        ({"kind": "sweep", "seeds": 0}, "seeds is 0"),
-        ({"kind": "search", "max_parameters": "few"}, "max_parameters is 'few'"),
-        ({"kind": "search", "share": "half"}, "share is 'half'"),
-        ({"kind": "search", "share": "nan"}, "share is 'nan'"),
+        ({"kind": "sweep", "seeds": "many"}, "whole number from 1"),
+        ({"kind": "sweep", "seeds": 0}, "whole number from 1"),
+        ({"kind": "search", "max_parameters": "few"}, "whole number from 1"),
+        ({"kind": "search", "share": "half"}, "above 0 and at most 1"),
+        ({"kind": "search", "share": "nan"}, "above 0 and at most 1"),
         ({"kind": "sweep", "grid": "/etc/passwd"}, "not in the studio's folder"),
         ({"kind": "train", "name": "n", "dataset": "/tmp"}, "not in the studio's folder"),
         ({"kind": "train", "name": "n", "dataset": "datasets/gone"}, "does not exist any more"),
         ({"kind": "train", "name": "n", "dataset": ""}, "No data set is chosen"),
-        ({"kind": "train", "name": "n", "filters": "8;12"}, "8;12"),
-        ({"kind": "make", "minutes": "ten"}, "minutes is 'ten'"),
-        ({"kind": "make", "minutes": 0}, "minutes is 0"),
+        ({"kind": "train", "name": "n", "filters": "8;12"}, "separated by commas"),
+        ({"kind": "make", "minutes": "ten"}, "whole number from 1"),
+        ({"kind": "make", "minutes": 0}, "whole number from 1"),
     ],
 )
 def test_what_cannot_be_done_is_a_sentence(home: Path, form: dict[str, Any], said: str) -> None:
@@ -149,7 +149,9 @@ def test_without_torch_the_task_says_what_to_install(home: Path, tmp_path: Path)
         assert worker.stdin is not None and worker.stdout is not None
         worker.stdin.write(json.dumps({"task": "train", "spec": spec}) + "\n")
         worker.stdin.flush()
-        said = next(message["refused"] for line in worker.stdout if "refused" in (message := json.loads(line)))
+        said = next(
+            message["refused"]["message"] for line in worker.stdout if "refused" in (message := json.loads(line))
+        )
     assert "'torch', which is not installed: run  pip install 'plushsense[train]'" in said
 
 
