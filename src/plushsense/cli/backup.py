@@ -1,4 +1,4 @@
-"""Implement ``plushsense backup DATASET FILE.zip``, ``backup --check FILE.zip`` and ``restore FILE.zip DEST``."""
+"""Implement ``plushsense backup DATASET FILE.zip``, ``backup --check FILE.zip``, ``backup --restore FILE.zip DEST``."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.check:
         return _check(args)
+    if args.restore:
+        return _restore(args)
     if not args.file:
         raise ConfigError("Give the data set and the new file:  plushsense backup DATASET FILE.zip")
     done = backup(args.dataset, args.file, progress=ProgressReporter("saving")).to_dict()
@@ -40,24 +42,18 @@ def _check(args: argparse.Namespace) -> int:
     return 0
 
 
-def run_restore(args: argparse.Namespace) -> int:
+def _restore(args: argparse.Namespace) -> int:
     from plushsense.dataset.backup import restore
     from plushsense.dataset.importing.archives import UnpackLimits
 
+    if not args.dataset or args.file:
+        raise ConfigError("Give the backup and one new folder:  plushsense backup --restore FILE.zip DATASET")
     limits = UnpackLimits.of_gigabytes(args.max_gb)
-    dataset = restore(args.file, args.dest, progress=ProgressReporter("restoring"), limits=limits)
-    result = {
-        "dataset": args.dest,
-        "recordings": len(dataset.recordings),
-        "subjects": len(dataset.subjects),
-        "streams": len(dataset.streams),
-        "hash": dataset.hash,
-    }
-    emit(
-        args,
-        result,
-        f"{args.dest}: restored {plural(result['recordings'], 'recording')} of {plural(result['subjects'], 'person')}",
-    )
+    dataset = restore(args.restore, args.dataset, progress=ProgressReporter("restoring"), limits=limits)
+    counts = {"recordings": len(dataset.recordings), "subjects": len(dataset.subjects)}
+    result = {"dataset": args.dataset, **counts, "streams": len(dataset.streams), "hash": dataset.hash}
+    people = plural(counts["subjects"], "person")
+    emit(args, result, f"{args.dataset}: restored {plural(counts['recordings'], 'recording')} of {people}")
     return 0
 
 

@@ -1,4 +1,7 @@
-"""Implement ``plushsense check DATASET [--only CHECK,…] [--report FILE.html] [--accept CHECK:RECORDING --why "…"]``."""
+"""Implement ``plushsense check DATASET [--only CHECK,…] [--report FILE.html] [--accept CHECK:RECORDING --why "…"]``.
+
+With options such as ``--label`` and ``--relabel`` it writes labels instead, see `plushsense.cli.label`.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,8 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
+from plushsense.cli.label import decides_labels
+from plushsense.cli.label import run as run_label
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, say
 from plushsense.cli.settings import listed
@@ -26,6 +31,8 @@ def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.quality.checking import known_checks
     from plushsense.workflow.datasets import decide
 
+    if decides_labels(args):
+        return run_label(args)
     only = listed(args.only)
     known_checks(only)
     if args.report:

@@ -47,7 +47,7 @@ from plushsense.dataset.files import (
 )
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import MARKS, adding_locked, locked
-from plushsense.dataset.privacy.redaction import NamePatterns, is_searchable, texts_in, words_of_rows
+from plushsense.dataset.privacy.searching import NamePatterns, is_searchable, texts_in, words_of_rows
 from plushsense.dataset.store import (
     FORGOTTEN,
     HEAD,
@@ -252,7 +252,7 @@ def _holds(text: str, subject: str) -> bool:
     for that. Codes such as ``7`` also are numbers, so they must be a line, a cell, a quoted text or a folder.
     """
     if is_searchable(subject):
-        found = bool(NamePatterns({subject: ""}).find_in(text)) or subject in text.splitlines()
+        found = bool(NamePatterns([subject]).find_in(text)) or subject in text.splitlines()
         return found or (len(subject) >= _LONG_CODE and subject in text)
     return re.search(_SHORT.format(re.escape(subject)), text, re.MULTILINE) is not None
 
@@ -398,7 +398,7 @@ def _is_about(line: bytes, subject: str) -> bool:
     table = _parsed(line)
     if table is None:
         text = line.decode("utf-8", "replace")
-        return f'"{subject}/' in text or bool(NamePatterns({subject: ""}).find_in(text))
+        return f'"{subject}/' in text or bool(NamePatterns([subject]).find_in(text))
     identity = table.get("recording") if isinstance(table, dict) else None
     return isinstance(identity, str) and (identity == subject or identity.startswith(f"{subject}/"))
 

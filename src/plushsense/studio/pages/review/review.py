@@ -434,7 +434,7 @@ class Review:
         Raises:
             DatasetError: for a gesture that is not in the gesture set.
         """
-        make = partial(labelling.relabel, self.dataset, identities, gesture, who, why)
+        make = partial(labelling.relabel_recordings, self.dataset, identities, gesture, who, why)
         return self._decide(visit, identities, "relabel", make)
 
     def accept_finding(self, visit: str, finding: Finding, who: str, why: str) -> int:
@@ -456,7 +456,7 @@ class Review:
             new = [LabelledStretch(stream, *rows, label)]
             make: Callable[[], object] = partial(labelling.label_stretches, self.dataset, new, who)
         else:
-            make = partial(labelling.unlabel, self.dataset, found, *rows, who)
+            make = partial(labelling.remove_labels, self.dataset, found.id, rows, who)
         return self._decide(visit, [stream], "label" if label else "unlabel", make, rows=rows)
 
     def _mark(self, visit: str, marks: Iterable[Mark]) -> int:
