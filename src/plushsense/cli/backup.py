@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from typing import Any
 
 from plushsense.cli.output import emit, say
@@ -20,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
         return _restore(args)
     if not args.file:
         raise ConfigError("Give the data set and the new file:  plushsense backup DATASET FILE.zip")
-    done = backup(args.dataset, args.file, progress=ProgressReporter("saving")).to_dict()
+    done = asdict(backup(args.dataset, args.file, progress=ProgressReporter("saving")))
     for name in done["left_out"]:
         say(f"left out: {name} is a link, which is not followed")
     emit(args, done, f"{args.file}: {_counts(done)}; written and read back")
@@ -33,7 +34,7 @@ def _check(args: argparse.Namespace) -> int:
     if args.dataset or args.file:
         raise ConfigError("--check reads one backup and writes nothing: give  plushsense backup --check FILE.zip")
     try:
-        found = check_backup(args.check, progress=ProgressReporter("reading")).to_dict()
+        found = asdict(check_backup(args.check, progress=ProgressReporter("reading")))
     except DatasetError as error:
         say(f"plushsense: {error}")
         emit(args, {"file": args.check, "valid": False, "problem": str(error)}, f"{args.check}: not valid")

@@ -19,7 +19,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -252,7 +252,7 @@ def run_simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
 
 def run_backup(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Write the data set ``dataset`` into the new backup ``place``."""
-    return {**backup(spec["dataset"], spec["place"], progress=reporter.count).to_dict(), "dataset": spec["dataset"]}
+    return {**asdict(backup(spec["dataset"], spec["place"], progress=reporter.count)), "dataset": spec["dataset"]}
 
 
 def run_restore(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:

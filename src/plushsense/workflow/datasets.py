@@ -7,7 +7,7 @@ import html
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -301,7 +301,7 @@ class Forgotten:
         return {
             "dataset": self.dataset,
             "done": self.done,
-            **self.plan.to_dict(),
+            **asdict(self.plan),
             "bundles": [vars(b) for b in self.bundles],
             "discarded": self.discarded,
             "elsewhere": self.elsewhere,

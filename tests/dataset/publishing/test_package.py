@@ -24,7 +24,7 @@ from support.toys import KEY, SECRETS, made_of, make
 
 def test_every_validator_agrees(package: PublishResult) -> None:
     assert package.checked.problems == []
-    assert [v["validator"] for v in package.checked.validators] == [
+    assert [v.validator for v in package.checked.validators] == [
         "checksums",
         "data",
         "times",
