@@ -39,7 +39,7 @@ from plushsense.experiments.search.halving import Costs, Rung, Scores, SearchSpe
 from plushsense.experiments.search.run import prepare, search
 from plushsense.experiments.sweep.run import Sweep, sweep
 from plushsense.models.arch import PAPER_ARCHITECTURES
-from plushsense.trials.grid import GridSpec
+from plushsense.experiments.sweep.grid import GridSpec
 
 FILTERS = "4/6/8/8,8/12/16/16"
 # Other settings, replayed where the grid was scored at their rungs: rungs as (first, second), eta, folds.

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plushsense.core.errors import need
+from plushsense.experiments.sweep.grid import CHOSEN, SECOND
 from plushsense.experiments.sweep.results import SweepResults, finite, name_of
 from plushsense.experiments.sweep.tables import (
     COSTS,
@@ -25,7 +26,6 @@ from plushsense.experiments.sweep.tables import (
 from plushsense.reports import figures
 from plushsense.reports.table import Row, count
 from plushsense.reports.wording import describe_runs
-from plushsense.trials.grid import CHOSEN, SECOND
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

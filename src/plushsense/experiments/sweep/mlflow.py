@@ -10,8 +10,8 @@ from typing import Any
 
 from plushsense.core.errors import ConfigError, need
 from plushsense.experiments.sweep.results import SweepResults, finite
+from plushsense.experiments.sweep.trials import TRIAL_COLUMNS
 from plushsense.reports.table import Row
-from plushsense.trials.tables import TRIAL_COLUMNS
 
 TRIAL = "plushsense.trial"
 _PARAMS = ("arch", "filters", "filter_set", "padding", "norm", "epochs", "batch", "batch_asked", "seeds", "folds")

@@ -13,6 +13,8 @@ import numpy as np
 from plushsense.dataset.store import writing_around
 from plushsense.experiments.sweep import figures as draw
 from plushsense.experiments.sweep import tables
+from plushsense.experiments.sweep.folder import SUMMARY
+from plushsense.experiments.sweep.grid import GRID_TRAINING
 from plushsense.experiments.sweep.results import SweepResults, file_name_of, name_of, read_sweep
 from plushsense.reports import wording
 from plushsense.reports.figures import png, svg, svg_uri
@@ -20,8 +22,6 @@ from plushsense.reports.page import check_page_path, earlier_files, render_page,
 from plushsense.reports.table import DASH, Row, Table, count, number, text
 from plushsense.scoring.metrics import grouped
 from plushsense.training.spec import PRESETS
-from plushsense.trials.grid import GRID_TRAINING
-from plushsense.trials.tables import SUMMARY
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

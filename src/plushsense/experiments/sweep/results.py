@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import BadInput, need
+from plushsense.experiments.sweep.folder import CURVES, RUNS, SUMMARY, TRIALS, prediction_files
+from plushsense.experiments.sweep.grid import CHOSEN, SECOND
 from plushsense.reports.table import Row
-from plushsense.trials.grid import CHOSEN, SECOND
-from plushsense.trials.tables import CURVES, RUNS, SUMMARY, TRIALS, prediction_files
 
 _NEEDED = ("trial", "arch", "filters", "filter_set", "epochs", "batch_asked", "parameters", "accuracy", "macro_f1")
 

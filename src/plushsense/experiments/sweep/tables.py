@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from plushsense.experiments.sweep.folder import BEST
 from plushsense.experiments.sweep.results import (
     SweepNetwork,
     SweepResults,
@@ -16,10 +17,10 @@ from plushsense.experiments.sweep.results import (
     schedule,
     spread,
 )
+from plushsense.experiments.sweep.trials import listed_columns
 from plushsense.models.arch import PAPER_FILTERS, TABLE3, TABLE3_MISPRINT, Arch, slashed
 from plushsense.reports.table import Column, Row, Table, count
 from plushsense.scoring.metrics import accuracy_complexity_ratio, column_metrics, pareto_front
-from plushsense.trials.tables import BEST, listed_columns
 
 SHOWN = 20
 """Number of rows of a long table that the page shows; the CSV has all."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -21,7 +21,6 @@ from plushsense.evaluation.crossval import fold_windows, train_on_validation
 from plushsense.models.arch import Arch
 from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import TrainSpec
-from plushsense.trials.plan import PASSES, Plan, Task
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.config import RunConfig
 from plushsense.workflow.preparation import (
@@ -34,31 +33,62 @@ from plushsense.workflow.preparation import (
     windows_for,
 )
 
+# Passes of a training step: forward, and backward to the weights and to the previous layer.
+PASSES = 3
 _BATCHES, _EPOCHS = 3, 3
+
+
+@dataclass(frozen=True)
+class CostEstimate:
+    """What a training or an evaluation would train, and its cost.
+
+    Attributes:
+        epochs: number of epochs of each training, at most.
+        macs: multiply-accumulates of all trainings.
+        window_epoch_s: measured seconds to train on one window for one epoch.
+        seconds: estimated time of all trainings.
+    """
+
+    split: str
+    leaky: bool
+    context: str
+    folds: int
+    dataset: str
+    simulated: bool
+    people: int
+    classes: int
+    windows: int
+    epochs: int
+    parameters: int
+    macs: int
+    window_epoch_s: float
+    seconds: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return asdict(self)
 
 
 def preview_training(
     dataset: Dataset | str | os.PathLike[str], config: RunConfig, *, warn: Warn = silent
-) -> dict[str, Any]:
-    """Return what `api.train` would train on and its cost; see `preview_evaluation` for the keys."""
+) -> CostEstimate:
+    """Return what `api.train` would train on and its cost."""
     made = prepare_training(as_dataset(dataset), config, warn)
     windows, division, config = made.windows, made.division, made.config
-    rate = _seconds_a_mac(windows, made.network, config.training)
-    head = {"split": division.kind, "leaky": division.split.leaky, "context": config.windows.context, "folds": 1}
-    sizes = [len(division.train), *([len(windows)] if division.refit else [])]
-    return head | _describe(made.dataset, made.network, config, windows, sizes, rate, 1)
+    trained = len(division.train) + (len(windows) if division.refit else 0)
+    head: dict[str, Any] = {
+        "split": division.kind,
+        "leaky": division.split.leaky,
+        "context": config.windows.context,
+        "folds": 1,
+    }
+    return _estimate(made.dataset, made.network, config, windows, trained, **head)
 
 
 def preview_evaluation(
     dataset: Dataset | str | os.PathLike[str], config: RunConfig, *, warn: Warn = silent
-) -> dict[str, Any]:
-    """Return what `api.evaluate` would train on and its cost, without the training itself.
-
-    Returns:
-        ``split``, ``leaky``, ``context``, ``simulated``, ``dataset``, ``folds``, ``people``, ``classes``, ``windows``,
-        ``epochs`` (at most), ``parameters``, ``macs`` of all trainings, ``seconds`` (estimated), and
-        ``window_epoch_s``, the measured seconds to train on one window for one epoch.
-    """
+) -> CostEstimate:
+    """Return what `api.evaluate` would train on and its cost, without the training itself."""
     refuse_hard_negatives(config)
     dataset, config = network_inputs_of(as_dataset(dataset), config)
     gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)
@@ -69,47 +99,45 @@ def preview_evaluation(
     split = parse_split(config.evaluation.split)
     folds = fold_windows(fit_on, score, split, config.evaluation.seed)
     folds = folds if config.holds_back else train_on_validation(folds)
-    rate = _seconds_a_mac(fit_on, network, config.training)
+    head: dict[str, Any] = {
+        "split": split.text,
+        "leaky": split.leaky,
+        "context": config.scored_on.context,
+        "folds": len(folds),
+    }
     side_by_side = min(config.evaluation.processes, len(folds))
-    head = {"split": split.text, "leaky": split.leaky, "context": config.scored_on.context, "folds": len(folds)}
-    return head | _describe(dataset, network, config, fit_on, [len(f.train) for f in folds], rate, side_by_side)
+    trained = sum(len(fold.train) for fold in folds)
+    return _estimate(dataset, network, config, fit_on, trained, side_by_side, **head)
 
 
-def plan_seconds(planned: Plan, macs: float, workers: int) -> float:
-    """Estimate the seconds that ``macs`` multiply-accumulates of a plan take, ``workers`` trainings at a time.
-
-    The speed is measured with the training of median cost; that of other networks may differ.
-    """
-    job = sorted(planned.jobs, key=planned.macs)[len(planned.jobs) // 2]
-    task: Task = job.task
-    return macs * _seconds_a_mac(planned.sets[task.span], task.arch, task.spec) / max(1, workers)
-
-
-def _describe(
+def _estimate(
     dataset: Dataset,
     network: Arch,
     config: RunConfig,
     windows: WindowSet,
-    sizes: list[int],
-    rate: float,
-    side_by_side: int,
-) -> dict[str, Any]:
-    macs = PASSES * network.macs_per_window * sum(sizes) * config.training.epochs
-    return {
-        "dataset": dataset.head.name,
-        "simulated": dataset.head.simulated,
-        "people": len(set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}),
-        "classes": len(windows.labels),
-        "windows": len(windows),
-        "epochs": config.training.epochs,
-        "parameters": network.parameters,
-        "macs": macs,
-        "window_epoch_s": rate * PASSES * network.macs_per_window,
-        "seconds": macs * rate / max(1, side_by_side),
-    }
+    trained: int,
+    side_by_side: int = 1,
+    **head: Any,
+) -> CostEstimate:
+    """Estimate the cost of trainings on ``trained`` of the windows in all; ``head`` describes the split."""
+    rate = seconds_a_mac(windows, network, config.training)
+    macs = PASSES * network.macs_per_window * trained * config.training.epochs
+    return CostEstimate(
+        **head,
+        dataset=dataset.head.name,
+        simulated=dataset.head.simulated,
+        people=len(set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}),
+        classes=len(windows.labels),
+        windows=len(windows),
+        epochs=config.training.epochs,
+        parameters=network.parameters,
+        macs=macs,
+        window_epoch_s=rate * PASSES * network.macs_per_window,
+        seconds=macs * rate / max(1, side_by_side),
+    )
 
 
-def _seconds_a_mac(windows: WindowSet, network: Arch, spec: TrainSpec) -> float:
+def seconds_a_mac(windows: WindowSet, network: Arch, spec: TrainSpec) -> float:
     """Measure the seconds of training per multiply-accumulate, in the fastest of a few short epochs."""
     from plushsense.training.fit import fit
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from plushsense.core.layouts import load_layout
-from plushsense.models.arch import PAPER_ARCHITECTURES
-from plushsense.trials.grid import FULL, GRIDS, GridSpec, problems, trainings
+from plushsense.experiments.sweep.grid import FULL, GRIDS, GridSpec, networks, problems
+from plushsense.models.arch import PAPER_ARCHITECTURES, Arch
 
 PLUSH = load_layout("plush-15")
 PAPER = GRIDS["paper"]
@@ -17,33 +19,33 @@ SMALL = replace(PAPER, architectures=("14d1_39d2_41d4",), filters=((4, 6, 8, 8),
 
 def test_the_papers_grid_is_468_trials_in_156_trainings() -> None:
     assert problems(PAPER, PLUSH, past=0, windows=3936) == []
-    found = trainings(PAPER, PLUSH, 18)
-    trials = [trial for training in found for trial in training.trials]
-    assert (len(found), len(trials)) == (156, 468)
-    assert len({(t.arch, t.epochs, t.batch) for t in trials}) == 468
-    assert {training.epochs for training in found} == {(100, 250, 1000)}
-    assert {t.arch.symbol for t in trials} == set(PAPER_ARCHITECTURES)
-    assert {t.arch.padding for t in trials} == {"mirror"}
-    chosen = next(t for t in trials if t.arch.symbol == "14d1_39d2_41d4" and t.filter_set == (8, 12, 16, 16))
-    assert (chosen.arch.parameters, chosen.arch.table3) == (13262, "13.2k")
+    found = networks(PAPER, PLUSH, 18)
+    assert len({arch for arch, _ in found}) == len(found) == 52 and {arch.padding for arch, _ in found} == {"mirror"}
+    assert {arch.symbol for arch, _ in found} == set(PAPER_ARCHITECTURES)
+    assert PAPER.schedules == [(100, 250, 1000)]
+    assert len(found) * len(PAPER.batches) * len(PAPER.schedules) == 156
+    assert len(found) * len(PAPER.batches) * len(PAPER.epochs) == 468
+    (chosen,) = (arch for arch, filters in found if (arch.symbol, filters) == ("14d1_39d2_41d4", (8, 12, 16, 16)))
+    assert (chosen.parameters, chosen.table3) == (13262, "13.2k")
     spec = PAPER.training
     assert (spec.learning_rate, spec.halve_every, spec.patience) == (0.001, None, None)
 
 
 def test_the_scripts_grid_trains_as_the_authors_do() -> None:
     grid = GRIDS["scripts"]
-    assert problems(grid, PLUSH, past=0, windows=3936) == []
-    assert len(trainings(grid, PLUSH, 18)) == 156
+    assert problems(grid, PLUSH, past=0, windows=3936) == [] == problems(GRIDS["people"], PLUSH, windows=3936)
+    assert (grid.schedules, len(networks(grid, PLUSH, 18))) == (PAPER.schedules, 52)
     spec = grid.training
     assert (spec.learning_rate, spec.halve_every, spec.patience) == (0.001, None, None)
     assert (spec.scaling, spec.weight_decay, grid.norm, grid.split) == ("none", 1e-4, "layer", "windows:file-order")
 
 
-def test_only_where_validation_stops_are_trials_trained_apart() -> None:
-    epochs = (2, 4)
-    assert len(trainings(replace(SMALL, epochs=epochs, halve_every=1), PLUSH, 18)) == 1
-    assert [t.epochs for t in trainings(replace(SMALL, epochs=epochs, patience=3), PLUSH, 18)] == [(2,), (4,)]
-    assert [t.epochs for t in trainings(replace(SMALL, epochs=epochs, preset="loso"), PLUSH, 18)] == [(2,), (4,)]
+@pytest.mark.parametrize(
+    ("changes", "apart"),
+    [({"halve_every": 1}, False), ({"patience": 3}, True), ({"preset": "loso"}, True), ({"halving": True}, True)],
+)
+def test_only_where_a_training_may_stop_are_trials_trained_apart(changes: dict[str, Any], apart: bool) -> None:
+    assert replace(SMALL, epochs=(2, 4), **changes).schedules == ([(2,), (4,)] if apart else [(2, 4)])
 
 
 @pytest.mark.parametrize(
@@ -72,6 +74,11 @@ def test_only_where_validation_stops_are_trials_trained_apart() -> None:
         ({"threads": 0}, "threads is 0"),
         ({"name": "../up"}, "cannot be a folder's"),
         ({"window_s": -1.0}, "out of range"),
+        ({"max_parameters": 0}, "max_parameters is 0"),
+        ({"share": 0.5}, "share is for halving only"),
+        ({"halving": True, "share": 1.1}, "The share 1.1"),
+        ({"halving": True, "eta": math.nan}, "eta is nan: accepted is above 1"),
+        ({"halving": True, "preset": "loso"}, "stop early (patience 10, preset loso)"),
         ({"architectures": ("100_300",)}, "receptive field of 399 samples (4 s), longer than the window of 250"),
         ({"architectures": ("100_300",), "padding": "stream"}, "receptive field of 399"),
         ({"architectures": ("100d4",), "padding": "stream", "context": "stream"}, "sees 646 samples"),
@@ -113,3 +120,15 @@ def test_a_receptive_field_that_only_rounds_beyond_the_window_is_the_papers() ->
 
 def test_full_is_a_batch() -> None:
     assert problems(replace(SMALL, batches=(FULL,)), PLUSH, windows=10) == []
+
+
+def test_limits_name_what_exceeds_them() -> None:
+    grid = GridSpec(max_parameters=4000, max_state_bytes=2150, max_macs_per_step=16_000, padding="stream")
+    found = [(arch, grid.exceeded(arch)) for arch, _ in networks(grid, PLUSH, 10)]
+    for arch, over in found:
+        assert len(over) == sum([arch.parameters > 4000, arch.state_bytes_int8 > 2150, arch.macs_per_step > 16_000]), (
+            arch.symbol
+        )
+    assert 0 < sum(not over for _, over in found) < len(found)
+    big = Arch.parse("70_90_91", (8, 12, 16), channels=4, classes=10)
+    assert ", ".join(map(str, grid.exceeded(big))).startswith("28,630 parameters, 24,630 over 4,000, 3,692 bytes of")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import ConfigError
-from plushsense.trials.grid import FULL, GRIDS, GridSpec, load_grid
+from plushsense.experiments.sweep.grid import FULL, GRIDS, GridSpec, load_grid
 
 FILE = """
 [grid]
