@@ -54,7 +54,7 @@ def test_its_scores_are_those_of_trainings_without_a_stop(dataset: Dataset, reco
     assert set(found.trials.filter(done).select("epochs", "arch").iter_rows()) == trained
     assert set(found.trials.filter(~done)["status"]) == {"dropped"} and len(found.trials) == 12
     mine = found.trials.filter(done).drop("seconds")
-    assert_frame_equal(mine, whole.trials.filter(polars.col("trial").is_in(mine["trial"])).drop("seconds"))
+    assert_frame_equal(mine, whole.trials.filter(polars.col("trial").is_in(mine["trial"].to_list())).drop("seconds"))
     curves, all_curves = frame(found.out, "curves"), frame(tmp_path / "o", "curves")
     both = curves.join(all_curves, on=["arch", "seed", "fold", "epoch"], suffix="_whole")
     assert len(both) == len(curves) and both["train_loss"].to_list() == both["train_loss_whole"].to_list()

@@ -80,9 +80,9 @@ class Written:
 
 def write_report(folder: Path, page: Path | None = None) -> Written:
     made = write_sweep_report(folder, page)
-    beside = Path(made["files"])
+    beside = made.files
     files = sorted(path for path in beside.iterdir() if path.name != "README.txt")
-    return Written(Path(made["report"]), beside, files, made["done"], made["trials"])
+    return Written(made.report, beside, files, made.done, made.trials)
 
 
 def test_acr_is_the_papers():

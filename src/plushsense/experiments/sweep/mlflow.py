@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +20,21 @@ _METRICS = tuple(key for key, c in TRIAL_COLUMNS.items() if c.type in (int, floa
 _PAGE = 1000
 
 
-def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class ExportResult:
+    """Where trials were logged, and how many now (``new``) and earlier (``before``)."""
+
+    uri: str
+    experiment: str
+    new: int
+    before: int
+
+
+def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> ExportResult:
     """Log each complete trial as a run, unless an earlier export has logged it.
 
     Args:
         where: a tracking URI (``sqlite:///…``, ``http://…``), or a folder, in which ``mlflow.db`` is created.
-
-    Returns:
-        ``uri``, ``experiment``, and the numbers of trials logged now (``new``) and earlier (``before``).
 
     Raises:
         ConfigError: when MLflow cannot use ``where``; MissingExtraError: when it is not installed.
@@ -58,8 +66,7 @@ def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> dict[st
         raise ConfigError(
             f"MLflow refuses '{where}' ({reason}): give a folder, or a URI such as sqlite:///x.db."
         ) from None
-    before = len(sweep.done) - len(finished)
-    return {"uri": uri, "experiment": title, "new": len(finished), "before": before}
+    return ExportResult(uri, title, len(finished), len(sweep.done) - len(finished))
 
 
 def _place(where: str) -> tuple[str, str | None]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,8 @@ from plushsense.training.spec import PRESETS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from plushsense.experiments.sweep.mlflow import ExportResult
 
 
 @dataclass(frozen=True)
@@ -266,13 +268,44 @@ def is_sweep(folder: str | os.PathLike[str]) -> bool:
     return (Path(folder) / SUMMARY).is_file()
 
 
+@dataclass(frozen=True)
+class ReportResult:
+    """A written report: its page, the folder ``files`` with ``n_files`` tables and figures, and the trials in it."""
+
+    report: Path
+    files: Path
+    n_files: int
+    trials: int
+    done: int
+    mlflow: ExportResult | None = None
+
+    @property
+    def summary(self) -> list[str]:
+        """What was written, in words."""
+        lines = [f"{self.n_files} tables and figures in {self.files}"]
+        if (logged := self.mlflow) is not None:
+            lines.append(f"MLflow: {logged.new} trials logged, {logged.before} were there already ({logged.uri})")
+        return lines
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {
+            "report": str(self.report),
+            "files": str(self.files),
+            "trials": self.trials,
+            "done": self.done,
+            "mlflow": None if self.mlflow is None else asdict(self.mlflow),
+            "said": self.summary,
+        }
+
+
 def write_sweep_report(
     folder: str | os.PathLike[str],
     page: str | os.PathLike[str] | None = None,
     *,
     title: str | None = None,
     mlflow: str | os.PathLike[str] | None = None,
-) -> dict[str, Any]:
+) -> ReportResult:
     """Write the page of a sweep and, in a folder beside it, each table as CSV and each figure as PNG and SVG.
 
     Args:
@@ -280,10 +313,6 @@ def write_sweep_report(
         page: the .html file (default: ``report.html`` in the folder); an older report there is replaced.
         title: heading of the page.
         mlflow: a folder or a tracking URI to which the trials are also logged, see `export_trials`.
-
-    Returns:
-        ``report``, ``files`` (the folder), ``trials``, ``done``, ``mlflow`` ({uri, experiment, new, before} or None),
-        and ``said``, the same in words.
 
     Raises:
         BadInput: where there is no sweep; ConfigError: where the page or its files would replace something else.
@@ -306,23 +335,12 @@ def write_sweep_report(
     with writing():
         write_files(beside, files, before)
         write_page(target, page_text)
-    summary = [f"{len(files)} tables and figures in {beside}"]
     logged = None
     if mlflow is not None:
         from plushsense.experiments.sweep.mlflow import export_trials
 
         logged = export_trials(sweep, mlflow)
-        summary.append(
-            f"MLflow: {logged['new']} trials logged, {logged['before']} were there already ({logged['uri']})"
-        )
-    return {
-        "report": str(target),
-        "files": str(beside),
-        "trials": sweep.total,
-        "done": len(sweep.done),
-        "mlflow": logged,
-        "said": summary,
-    }
+    return ReportResult(target, beside, len(files), sweep.total, len(sweep.done), logged)
 
 
 def render(
@@ -376,7 +394,9 @@ def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
         ("Seeds and folds", wording.describe_runs(sweep.trials)),
         (
             "Trials",
-            f"{len(sweep.done)} of {sweep.total} done" + (f", {waiting} waiting or partial" if waiting else ""),
+            f"{len(sweep.done)} of {sweep.total} done"
+            + (f", {waiting} waiting or partial" if waiting else "")
+            + (f"; {sweep.dropped} more dropped by halving" if sweep.dropped else ""),
         ),
         ("Classes", text(sweep.labels)),
         ("Time", f"{number(seconds, 0)} s" if number(seconds) != DASH else DASH),

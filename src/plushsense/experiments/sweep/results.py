@@ -81,7 +81,13 @@ class SweepResults:
 
     @property
     def total(self) -> int:
-        return max(len(self.trials), int(self.head.get("trials") or 0))
+        """Number of trials, without those that halving dropped."""
+        return len(self.trials) - self.dropped
+
+    @property
+    def dropped(self) -> int:
+        """Number of trials that halving did not train."""
+        return sum(trial.get("status") == "dropped" for trial in self.trials)
 
     @property
     def done(self) -> list[Row]:
