@@ -38,7 +38,7 @@ GROUPS = tuple(
         "experiments/baselines/test_models.py experiments/baselines/test_report.py experiments/baselines/test_score.py"
         " experiments/streams/test_predictions.py",
         "experiments/sweep/test_cluster.py experiments/sweep/test_mlflow.py experiments/sweep/test_report.py"
-        " experiments/sweep/test_halving_run.py experiments/sweep/test_report_files.py experiments/sweep/test_run.py",
+        " experiments/sweep/test_halving_run.py experiments/sweep/test_run.py",
         "jobs/test_cluster.py",
         "studio/test_hostile_results.py studio/test_words.py",
         "studio/test_train_scores.py",

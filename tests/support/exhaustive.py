@@ -59,7 +59,7 @@ EXHAUSTIVE = {
     "experiments/sweep/test_cluster.py::test_a_cluster_that_is_not_there[nowhere.invalid:6379]",
     "experiments/sweep/test_cluster.py::test_a_node_lost_in_a_sweep_changes_nothing",
     "experiments/sweep/test_report.py::test_a_fair_split_of_real_data_bears_no_mark",
-    "experiments/sweep/test_report_files.py::test_a_sweeps_folder_makes_its_page",
+    "experiments/sweep/test_report.py::test_a_sweeps_folder_makes_its_page",
     "experiments/sweep/test_run.py::test_killed_and_gone_on_with[False]",
     "experiments/sweep/test_run.py::test_killed_and_gone_on_with[True]",
     "jobs/test_cluster.py::test_what_a_job_raises_comes_through",

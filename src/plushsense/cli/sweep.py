@@ -47,7 +47,7 @@ def _preview_lines(preview: SweepPreview) -> list[str]:
         f"{plural(plan['trials'], 'trial')} in {plural(plan['trainings'], 'training')} "
         f"({plural(plan['folds'], 'fold')}, {plural(plan['seeds'], 'seed')})",
         f"{plural(plan['held'], 'training')} done before; split {plan['split']}",
-        f"about {plan['macs']:.2e} multiply-accumulates; trial by trial {plan['macs_one_by_one']:.2e}",
+        f"about {plan['macs']:.2e} multiply-accumulates",
         f"memory of each process: windows {plan['windows_mb']:.0f} MB; a step of the largest training "
         + ("as PyTorch takes it" if plan["training_mb"] is None else f"{plan['training_mb']:.0f} MB"),
     ]

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from plushsense.core.errors import ConfigError, DivergedError, TrainingError
-from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.scores import read_predictions
+from plushsense.experiments.sweep.grid import CHOSEN, SECOND
 from plushsense.experiments.sweep.run import sweep
 from plushsense.experiments.sweep.trials import TRIAL_COLUMNS, TrialColumn, TrialResult, networks_to_keep
 from plushsense.jobs.journal import JOURNAL, UNFINISHED
@@ -36,8 +36,6 @@ SMALL: dict[str, Any] = {
     "classes": "shared",
     "workers": 1,
 }
-CHOSEN_ARCH, SECOND_ARCH = ("14d1_39d2_41d4", (8, 12, 16)), ("19d1_19d2_19d4_17d8", (4, 6, 8, 8))
-SCORES = ["accuracy", "macro_f1", "validation_accuracy", "validation_macro_f1", "train_loss", "acr"]
 COMMAND = [sys.executable, "-m", "plushsense", "sweep"]
 
 
@@ -128,28 +126,17 @@ def test_predictions_are_kept_of_the_networks_that_were_asked_for(cli: Any, data
         counts = confusion(stored.truth, stored.predicted, len(stored.labels))
         assert counts.tolist() == kept["confusions"][trial], "the file is of this trial"
     # Nothing is trained again, and what is not kept any more is removed.
-    again = cli(*words, "--keep-predictions", "5d1_5d2:2/2").json
-    assert again["trainings_resumed"] == again["trainings"] and files() <= best | {"predictions-5d1_5d2-2-2.parquet"}
-    assert len(files()) == (2 if again["best"][0]["filters"] != "2/2" else 1)
-    assert cli(*words).status == 0 and files() == best, "the paper's networks are not in this grid"
-    wrong = cli(*words, "--keep-predictions", "5_5d3")
-    assert wrong.status == 2 and "Predictions of '5_5d3' cannot be kept: accepted are chosen, best, all" in wrong.err
-    assert "5d1_5d2" in wrong.err and files() == best
+    again = cli(*words).json
+    assert again["trainings_resumed"] == again["trainings"] and files() == best, "the paper's are not in this grid"
 
 
 def test_the_papers_two_networks_are_kept() -> None:
-    def planned(symbol: str, filters: tuple[int, ...]) -> Any:
-        return SimpleNamespace(network=(symbol, "/".join(map(str, filters))))
-
-    grid: Any = SimpleNamespace(
-        trials=[planned(*CHOSEN_ARCH), planned("14d1_39d2_41d4", (4, 6, 8)), planned(*SECOND_ARCH), planned("9", (4,))]
-    )
-    papers = {("14d1_39d2_41d4", "8/12/16"), ("19d1_19d2_19d4_17d8", "4/6/8/8")}
-    assert networks_to_keep(grid, "chosen") == papers
-    assert networks_to_keep(grid, "best") == frozenset()
-    assert networks_to_keep(grid, "chosen, 9") == papers | {("9", "4")}
-    both = {("14d1_39d2_41d4", "8/12/16"), ("14d1_39d2_41d4", "4/6/8")}
-    assert networks_to_keep(grid, "14_39d2_41d4") == both
+    networks = (CHOSEN, ("14d1_39d2_41d4", "4/6/8"), SECOND, ("9", "4"))
+    grid: Any = SimpleNamespace(trials=[SimpleNamespace(network=network) for network in networks])
+    assert networks_to_keep(grid, "chosen") == {CHOSEN, SECOND}
+    assert (networks_to_keep(grid, "best"), networks_to_keep(grid, "all")) == (set(), set(networks))
+    with pytest.raises(ConfigError, match="'every': accepted are best, chosen, all"):
+        networks_to_keep(grid, "every")
 
 
 def _tested(dataset: Dataset) -> list[Any]:
@@ -371,13 +358,6 @@ def test_a_new_column_is_a_function_and_a_line(
     assert "depth" in (tmp_path / "out" / "trials.csv").read_text().splitlines()[0]
     assert cli("report", tmp_path / "out").status == 0
     assert "Convolutions" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-
-
-def test_scores_of_a_simulation_say_so(cli: Any, recordings: Path, tmp_path: Path) -> None:
-    import_recordings(recordings, tmp_path / "DS", layout="accel-3", simulated=True)
-    words = ("--architectures", "9", "--filters", "2", "--epochs", "1", "--batches", "4", "--classes", "shared")
-    ran = cli("sweep", tmp_path / "DS", *words, "--workers", "1")
-    assert ran.out.startswith("SIMULATION") and "LEAKY" in ran.out
 
 
 def test_a_bad_grid_is_refused_with_all_its_problems(cli: Any, dataset: Dataset, tmp_path: Path) -> None:

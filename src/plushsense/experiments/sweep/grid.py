@@ -310,9 +310,6 @@ def _of_halving(grid: GridSpec) -> list[str]:
         wrong.append(f"The share {grid.share:g} cannot be used: accepted is above 0, up to 1.")
     if not (math.isfinite(grid.eta) and grid.eta > 1.0):
         wrong.append(f"eta is {grid.eta:g}: accepted is above 1.")
-    given = [key for key in ("share", "eta") if getattr(grid, key) != getattr(GridSpec, key)]
-    if given and not grid.halving:
-        wrong.append(f"{join_names(given)} is for halving only: give --halving (in a file: halving = true), too.")
     patience = grid.patience or (PRESETS[grid.preset].patience if grid.preset in PRESETS else None)
     if grid.halving and patience is not None:
         wrong.append(
@@ -424,7 +421,10 @@ def load_grid(
             table, wrong = _read_table(Path(path))
             grid, more = _changed(GridSpec(name=Path(path).stem), table, f"[grid] in '{path}'")
             wrong += more
-    grid, more = _changed(grid, changes or {}, "the grid")
+    changes = changes or {}
+    grid, more = _changed(grid, changes, "the grid")
+    if not grid.halving and any(changes.get(key) is not None for key in ("share", "eta")):
+        more.append("share and eta are for halving only: give --halving (in a file: halving = true), too.")
     return grid, wrong + more
 
 

@@ -21,7 +21,7 @@ _PAGE = 1000
 
 
 @dataclass(frozen=True)
-class ExportResult:
+class MlflowResult:
     """Where trials were logged, and how many now (``new``) and earlier (``before``)."""
 
     uri: str
@@ -30,7 +30,7 @@ class ExportResult:
     before: int
 
 
-def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> ExportResult:
+def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> MlflowResult:
     """Log each complete trial as a run, unless an earlier export has logged it.
 
     Args:
@@ -66,7 +66,7 @@ def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> ExportR
         raise ConfigError(
             f"MLflow refuses '{where}' ({reason}): give a folder, or a URI such as sqlite:///x.db."
         ) from None
-    return ExportResult(uri, title, len(finished), len(sweep.done) - len(finished))
+    return MlflowResult(uri, title, len(finished), len(sweep.done) - len(finished))
 
 
 def _place(where: str) -> tuple[str, str | None]:

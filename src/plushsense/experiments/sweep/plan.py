@@ -99,11 +99,10 @@ class Plan:
         """Number of folds."""
         return len(next(iter(self.folds.values())))
 
-    def macs(self, job: Job, nested: bool = True) -> int:
-        """Estimate the multiply-accumulates of a training; with ``nested`` False, of a separate one for each trial."""
+    def macs(self, job: Job) -> int:
+        """Estimate the multiply-accumulates of a training."""
         task: Task = job.task
-        epochs = task.epochs[-1] if nested else sum(task.epochs)
-        return PASSES * task.arch.macs_per_window * len(self.folds[task.span][task.fold].train) * epochs
+        return PASSES * task.arch.macs_per_window * len(self.folds[task.span][task.fold].train) * task.epochs[-1]
 
 
 def plan(dataset: Dataset, grid: GridSpec, unreadable: Sequence[str] = (), warn: Warn = silent) -> Plan:

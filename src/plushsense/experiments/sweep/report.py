@@ -26,7 +26,7 @@ from plushsense.training.spec import PRESETS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from plushsense.experiments.sweep.mlflow import ExportResult
+    from plushsense.experiments.sweep.mlflow import MlflowResult
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,6 @@ def sections_of(sweep: SweepResults) -> Iterator[Section]:
     yield _parameters(sweep)
     yield _by_filters(sweep)
     yield _top(sweep)
-    yield Section("acr", "ACR ranking", (tables.acr_ranking(sweep),), (_acr(sweep),))
     yield _effect(sweep)
     trials = _looked_at(sweep, best)
     yield _confusions(sweep, trials)
@@ -81,7 +80,7 @@ def _parameters(sweep: SweepResults) -> Section:
 
 
 def _overview(sweep: SweepResults) -> Section:
-    rows = sorted(tables.architectures(sweep), key=lambda r: -(r["highest"] or 0.0))
+    rows = sorted(tables.architectures(sweep), key=lambda r: -(r.highest or 0.0))
     alt = (
         f"Bars: highest and mean accuracy of {len(rows)} architectures. The first: {_bar_words(rows[:3])}. "
         f"Diamonds: parameters. {draw.LIKE.format(7)}."
@@ -102,7 +101,7 @@ def _by_filters(sweep: SweepResults) -> Section:
         return Section("figure-8", title, dropped=("There is one filter set only: it would be Figure 7 again.",))
     best = []
     for filter_set in sweep.filter_sets[::-1]:
-        rows = sorted(tables.architectures(sweep, filter_set), key=lambda r: -(r["highest"] or 0.0))
+        rows = sorted(tables.architectures(sweep, filter_set), key=lambda r: -(r.highest or 0.0))
         best.append(f"{filter_set}: {_bar_words(rows[:1])}")
     alt = f"A panel of bars a filter set: highest and mean accuracy of each architecture. The best: {'; '.join(best)}."
     alt += f" {draw.LIKE.format(8)}."
@@ -116,11 +115,11 @@ def _only_best(architectures: int) -> tuple[str, ...]:
     return (f"Drawn are the best {draw.BARS} of {architectures} architectures; the CSV has all.",)
 
 
-def _bar_words(rows: Sequence[Row]) -> str:
+def _bar_words(rows: Sequence[tables.ArchitectureScores]) -> str:
     return ", ".join(
-        f"{r['arch']} {100 * r['highest']:.1f} % (mean {100 * r['mean']:.1f} %)"
-        if r["highest"] is not None
-        else f"{r['arch']} not done"
+        f"{r.arch} not done"
+        if r.highest is None or r.mean is None
+        else f"{r.arch} {100 * r.highest:.1f} % (mean {100 * r.mean:.1f} %)"
         for r in rows
     )
 
@@ -140,13 +139,6 @@ def _top(sweep: SweepResults) -> Section:
         f"parameters. {draw.LIKE.format(9)}."
     )
     return Section("table-4", title, (table,), (Drawing("figure-9-size", draw.size_and_accuracy(sweep), alt),))
-
-
-def _acr(sweep: SweepResults) -> Drawing:
-    first = tables.acr_ranking(sweep).rows[0]
-    name = f"{first['arch']} {first['filters']}"
-    alt = f"Bars: the networks with the highest ACR. The first: {name}, {100 * (first['acr'] or 0):.1f} %."
-    return Drawing("acr", draw.acr_bars(sweep), alt)
 
 
 def _effect(sweep: SweepResults) -> Section:
@@ -169,7 +161,7 @@ def _effect(sweep: SweepResults) -> Section:
 
 def _looked_at(sweep: SweepResults, best: Row) -> list[Row]:
     """Return the trials to show with confusions and curves: the paper's two networks if in the grid, and the best."""
-    candidates = [sweep.chosen, sweep.second, best]
+    candidates = [*(sweep.best_of(*network) for network in draw.PAPER_CONFUSIONS), best]
     return list({t["trial"]: t for t in candidates if t}.values())
 
 
@@ -247,13 +239,13 @@ def _fronts(sweep: SweepResults) -> Section:
     drawings, dropped = [], []
     for cost, label in tables.COSTS.items():
         points = tables.pareto_points(sweep, cost)
-        values = {p["value"] for p in points}
+        values = {p.value for p in points}
         if len(values) < 2:
             same = f": {count(next(iter(values)))} for all" if values else ""
             dropped.append(f"No front of macro-F1 against “{label.lower()}”, which does not differ{same}.")
             continue
-        edge = [p for p in points if p["front"]]
-        members = "; ".join(f"{p['arch']} {p['filters']} ({count(p['value'])}, {p['macro_f1']:.3f})" for p in edge)
+        edge = [p for p in points if p.front]
+        members = "; ".join(f"{p.arch} {p.filters} ({count(p.value)}, {p.macro_f1:.3f})" for p in edge)
         alt = f"Points: macro-F1 against {label.lower()} of {len(points)} networks, log scale. On the front: {members}."
         drawings.append(Drawing(f"pareto-{cost.replace('_', '-')}", draw.pareto(sweep, cost), alt))
     return Section("pareto", "Pareto fronts", (tables.pareto(sweep),), tuple(drawings), tuple(dropped))
@@ -277,7 +269,7 @@ class ReportResult:
     n_files: int
     trials: int
     done: int
-    mlflow: ExportResult | None = None
+    mlflow: MlflowResult | None = None
 
     @property
     def summary(self) -> list[str]:

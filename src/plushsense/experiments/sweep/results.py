@@ -13,7 +13,6 @@ from typing import Any
 
 from plushsense.core.errors import BadInput, need
 from plushsense.experiments.sweep.folder import CURVES, RUNS, SUMMARY, TRIALS, prediction_files
-from plushsense.experiments.sweep.grid import CHOSEN, SECOND
 from plushsense.reports.table import Row
 
 _NEEDED = ("trial", "arch", "filters", "filter_set", "epochs", "batch_asked", "parameters", "accuracy", "macro_f1")
@@ -139,19 +138,10 @@ class SweepResults:
             by_run.setdefault((row["run"], row.get("seed"), row.get("fold")), []).append(row)
         return list(by_run.values())
 
-    @property
-    def chosen(self) -> Row | None:
-        """The trial with the highest accuracy of the network that the paper chose; None if it has no score."""
-        return self.best_of(*CHOSEN)
-
     def best_of(self, arch: str, filters: str) -> Row | None:
+        """Return the trial of a network with the highest accuracy; None if it has no score."""
         mine = [t for t in self.done if (t["arch"], t["filters"]) == (arch, filters)]
         return max(mine, key=lambda t: float(t["accuracy"])) if mine else None
-
-    @property
-    def second(self) -> Row | None:
-        """The trial with the highest accuracy of the other network that the paper shows; None if it has no score."""
-        return self.best_of(*SECOND)
 
     @property
     def kept(self) -> list[Row]:

@@ -294,7 +294,7 @@ class SweepPreview:
     Attributes:
         grid: its settings; with them and ``planned`` is None if there are ``problems``.
         held: number of trainings that the journal has.
-        macs: multiply-accumulates of all trainings; ``macs_one_by_one`` with one for each trial.
+        macs: multiply-accumulates of all trainings.
         windows_mb, training_mb: memory of a process for windows, and for a step of the largest training, which is None
             where PyTorch's own layers decide.
         cost: share of each architecture in the cost, the largest first.
@@ -308,7 +308,6 @@ class SweepPreview:
     planned: Plan | None = None
     held: int = 0
     macs: int = 0
-    macs_one_by_one: int = 0
     windows_mb: float = 0.0
     training_mb: float | None = None
     cost: Mapping[str, float] | None = None
@@ -336,7 +335,6 @@ class SweepPreview:
             "seeds": len(grid.seeds),
             "held": self.held,
             "macs": self.macs,
-            "macs_one_by_one": self.macs_one_by_one,
             "windows_mb": self.windows_mb,
             "training_mb": self.training_mb,
             "cost": self.cost,
@@ -397,7 +395,6 @@ def preview(
         planned=planned,
         held=sum(journal.has(job.id) for job in planned.jobs),
         macs=total,
-        macs_one_by_one=sum(planned.macs(job, nested=False) for job in planned.jobs),
         windows_mb=sum(windows.integers.nbytes for windows in planned.sets.values()) / 1e6,
         training_mb=max((n for n in steps if n is not None), default=0) / 1e6 if None not in steps else None,
         cost=dict(sorted(shares.items(), key=lambda item: -item[1])),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from plushsense.experiments.sweep.folder import BEST
@@ -114,23 +114,30 @@ def _metric_columns(*, without: str) -> list[Column]:
     ]
 
 
-def architectures(sweep: SweepResults, filter_set: str | None = None) -> list[dict[str, Any]]:
-    """Return highest and mean accuracy of each architecture, over one or all filter sets (Figures 7 and 8)."""
+@dataclass(frozen=True)
+class ArchitectureScores:
+    """Accuracy of an architecture over its trials with one filter set, or with "all" (Figures 7 and 8)."""
+
+    arch: str
+    filter_set: str
+    highest: float | None
+    mean: float | None
+    sd: float | None
+    trials: int
+    parameters: int
+
+
+def architectures(sweep: SweepResults, filter_set: str | None = None) -> list[ArchitectureScores]:
+    """Return the accuracy of each architecture, over one or all filter sets."""
     rows = []
     for label in dict.fromkeys(n.label for n in sweep.networks):
         mine = [n for n in sweep.networks if n.label == label and filter_set in (None, n.filter_set)]
         scores = [float(t["accuracy"]) for n in mine for t in n.done]
         if mine:
+            mean, highest = statistics.fmean(scores) if scores else None, max(scores, default=None)
+            largest = max(n.parameters for n in mine)
             rows.append(
-                {
-                    "arch": label,
-                    "filter_set": filter_set or "all",
-                    "highest": max(scores, default=None),
-                    "mean": statistics.fmean(scores) if scores else None,
-                    "sd": spread(scores),
-                    "trials": len(scores),
-                    "parameters": max(n.parameters for n in mine),
-                }
+                ArchitectureScores(label, filter_set or "all", highest, mean, spread(scores), len(scores), largest)
             )
     return rows
 
@@ -147,42 +154,10 @@ def architecture_table(sweep: SweepResults) -> Table:
         Column("trials", "Trials", "count"),
         Column("parameters", "Parameters (of the largest)", "count"),
     )
-    rows = tuple(row for part in parts for row in architectures(sweep, part))
+    rows = tuple(asdict(row) for part in parts for row in architectures(sweep, part))
     limit = len(architectures(sweep))
     name = "figure-7-and-8-architectures"
     return Table(name, "Each architecture over all its trials", columns, rows, (), limit)
-
-
-def acr_ranking(sweep: SweepResults) -> Table:
-    """Rank all networks by the accuracy–complexity ratio of their best trial."""
-    rows: list[dict[str, Any]] = [
-        {
-            "arch": n.label,
-            "filters": n.filters,
-            "parameters": n.parameters,
-            **{key: b.get(key) for key in column_metrics()},
-        }
-        | {"acr": accuracy_complexity_ratio(b["accuracy"], n.parameters)}
-        for n in sweep.networks
-        if (b := n.best())
-    ]
-    rows.sort(key=lambda r: -(r["acr"] or 0.0))
-    for rank, row in enumerate(rows, start=1):
-        row["rank"] = rank
-    columns = (
-        Column("rank", "Rank", "count"),
-        Column("arch", "Architecture"),
-        Column("filters", "Filters"),
-        Column("parameters", "Parameters", "count"),
-        Column("acr", "ACR", "percent", score=True),
-        Column("accuracy", "Highest accuracy", "percent", score=True),
-        *_metric_columns(without="accuracy"),
-    )
-    words = [
-        "ACR = accuracy / log10(parameters), in percent (paper, 3.6.3). It favours the small: ten times the parameters "
-        "must buy much accuracy to rank higher."
-    ]
-    return Table("acr", "Accuracy–complexity ratio", columns, tuple(rows), tuple(words), SHOWN)
 
 
 def batches(sweep: SweepResults) -> list[str]:
@@ -253,30 +228,36 @@ def effect(sweep: SweepResults) -> Table:
     )
 
 
-def pareto_points(sweep: SweepResults, cost: str) -> list[dict[str, Any]]:
-    """Return each network with its cost, its best macro-F1, and whether it is on the Pareto front."""
-    rows = [
-        {
-            "cost": cost,
-            "value": int(t[cost]),
-            "macro_f1": float(t["macro_f1"]),
-            "arch": n.label,
-            "filters": n.filters,
-            "filter_set": n.filter_set,
-            "schedule": schedule(t),
-            "trial": t["trial"],
-        }
-        for n in sweep.networks
-        if (t := n.best("macro_f1")) and finite(t.get(cost)) and t[cost] > 0
+@dataclass(frozen=True)
+class ParetoPoint:
+    """A network with its best macro-F1 and a cost; ``front``: no other network beats it in both."""
+
+    value: int
+    macro_f1: float
+    arch: str
+    filters: str
+    filter_set: str
+    schedule: str
+    trial: str
+    front: bool
+
+
+def pareto_points(sweep: SweepResults, cost: str) -> list[ParetoPoint]:
+    """Return the networks that have a score, by ascending cost (a key of `COSTS`)."""
+    best = [(n, t) for n in sweep.networks if (t := n.best("macro_f1")) and finite(t.get(cost)) and t[cost] > 0]
+    front = pareto_front([(float(t["macro_f1"]), t[cost]) for _, t in best])
+    points = [
+        ParetoPoint(
+            int(t[cost]), float(t["macro_f1"]), n.label, n.filters, n.filter_set, schedule(t), str(t["trial"]), on
+        )
+        for (n, t), on in zip(best, front, strict=True)
     ]
-    for row, on in zip(rows, pareto_front([(r["macro_f1"], r["value"]) for r in rows]), strict=True):
-        row["front"] = on
-    return sorted(rows, key=lambda r: (r["value"], -r["macro_f1"]))
+    return sorted(points, key=lambda point: (point.value, -point.macro_f1))
 
 
 def pareto(sweep: SweepResults) -> Table:
     """Return the networks on the Pareto fronts of macro-F1 and each of `COSTS`."""
-    rows = [{**r, "cost": COSTS[cost]} for cost in COSTS for r in pareto_points(sweep, cost) if r["front"]]
+    rows = [{**asdict(p), "cost": name} for cost, name in COSTS.items() for p in pareto_points(sweep, cost) if p.front]
     columns = (
         Column("cost", "Front of macro-F1 against"),
         Column("value", "Cost", "count"),
@@ -307,51 +288,35 @@ def best_trials(sweep: SweepResults) -> Table:
 
 def table3(sweep: SweepResults) -> Table:
     """Return the numbers of parameters by architecture and filter set, beside those of the paper's Table 3."""
-    sets = sweep.filter_sets[::-1]
-    cells: dict[tuple[str, str], SweepNetwork] = {(n.label, n.filter_set): n for n in sweep.networks}
-    rows, met, near, off, seen = [], 0, 0, [], False
-    other = any(
-        printed_parameters(n.arch, n.filters) and count_parameters(n.arch, n.filters) != n.parameters
-        for n in sweep.networks
-    )
-    for label in dict.fromkeys(n.label for n in sweep.networks):
-        row: dict[str, Any] = {"arch": label}
-        for filter_set in sets:
-            network = cells.get((label, filter_set))
-            if network is None:
-                continue
-            printed = printed_parameters(network.arch, network.filters)
-            row[f"{filter_set} ours"] = network.parameters
-            row[f"{filter_set} paper"] = printed
-            if printed is None:
-                continue
-            seen = True
-            ours = row[f"{filter_set} at the paper's size"] = count_parameters(network.arch, network.filters)
-            if is_misprint(network.arch, network.filters):
-                row[f"{filter_set} paper"] = f"{printed} (misprint?)"
-                off.append(f"{label} at {network.filters}: we count {count(ours)}, the paper prints {printed}")
-            elif agrees(printed, ours):
-                met += 1
-            elif abs(ours / parse_count(printed) - 1) <= 0.04:
-                near += 1
-            else:
-                off.append(f"{label} at {network.filters}: we count {count(ours)}, the paper prints {printed}")
-        rows.append(row)
+    rows: dict[str, dict[str, Any]] = {}
+    met, near, off, other = 0, 0, list[str](), False
+    for n in sweep.networks:
+        row = rows.setdefault(n.label, {"arch": n.label})
+        row[f"{n.filter_set} ours"] = n.parameters
+        printed = printed_parameters(n.arch, n.filters)
+        if printed is None:
+            continue
+        ours = row[f"{n.filter_set} at the paper's size"] = count_parameters(n.arch, n.filters)
+        other |= ours != n.parameters
+        misprint = is_misprint(n.arch, n.filters)
+        row[f"{n.filter_set} paper"] = printed + " (misprint?)" * misprint
+        if not misprint and agrees(printed, ours):
+            met += 1
+        elif not misprint and abs(ours / parse_count(printed) - 1) <= 0.04:
+            near += 1
+        else:
+            off.append(f"{n.label} at {n.filters}: we count {count(ours)}, the paper prints {printed}")
     columns = [Column("arch", "Architecture")]
-    for filter_set in sets:
+    for filter_set in sweep.filter_sets[::-1]:
         columns.append(Column(f"{filter_set} ours", f"[{filter_set.replace('/', ' ')}] ours", "count"))
-        if seen and other:
+        if other:
             head = f"at {PAPER_CHANNELS} channels, {PAPER_CLASSES} classes"
             columns.append(Column(f"{filter_set} at the paper's size", head, "count"))
-        if seen:
+        if met + near + len(off):
             columns.append(Column(f"{filter_set} paper", "paper"))
-    return Table(
-        "table-3",
-        "Learnable parameters (the paper's Table 3)",
-        tuple(columns),
-        tuple(rows),
-        tuple(_table3_words(met, near, off, other)),
-    )
+    notes = tuple(_table3_words(met, near, off, other))
+    title = "Learnable parameters (the paper's Table 3)"
+    return Table("table-3", title, tuple(columns), tuple(rows.values()), notes)
 
 
 def _table3_words(met: int, near: int, off: Sequence[str], other: bool) -> list[str]:

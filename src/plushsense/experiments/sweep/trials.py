@@ -14,13 +14,13 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from plushsense.core.errors import ArchError, ConfigError, nearest, need
+from plushsense.core.errors import ConfigError, check_known, need
 from plushsense.core.version import __version__
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.sweep.grid import CHOSEN, SECOND, GridSpec
 from plushsense.experiments.sweep.plan import Plan, Trial
 from plushsense.experiments.sweep.trainings import RunScores, TrainingResult
-from plushsense.models.arch import parse_symbol, slashed
+from plushsense.models.arch import slashed
 from plushsense.reports.table import Column, Kind
 from plushsense.scoring.metrics import Counts, accuracy_complexity_ratio, column_metrics
 from plushsense.workflow.reporting import machine
@@ -240,42 +240,16 @@ def listed_columns(*, terminal: bool = False) -> list[Column]:
 
 Network = tuple[str, str]
 """Symbol and filters of a network, as in the table of trials."""
-PAPER_CHOICE, BEST_ONLY, EVERY = "chosen", "best", "all"
+PAPER_CHOICE = "chosen"
+KEPT: dict[str, Callable[[set[Network]], set[Network]]] = {
+    "best": lambda networks: set(),
+    PAPER_CHOICE: lambda networks: networks & {CHOSEN, SECOND},
+    "all": lambda networks: networks,
+}
+"""The networks of a sweep whose predictions are kept besides those of the best trial."""
 
 
-def networks_to_keep(plan: Plan, choice: str) -> frozenset[Network]:
-    """Return the networks of a plan whose predictions and confusions are kept; those of the best trial always are.
-
-    Args:
-        choice: words joined by commas. "chosen": the two networks that the paper shows (Figures 10 and 11), where the
-            plan has them; "best": none besides the best trial; "all"; or the symbol of a network, with one of its
-            filter sets (``14d1_39d2_41d4:8/12/16``) or without, for all of them.
-
-    Raises:
-        ConfigError: for any other word, or a network that is not in the plan.
-    """
-    networks = {trial.network: None for trial in plan.trials}
-    kept: set[Network] = set()
-    for word in filter(None, map(str.strip, choice.split(","))):
-        symbol, _, filters = word.partition(":")
-        if word in (PAPER_CHOICE, BEST_ONLY, EVERY):
-            chosen = {PAPER_CHOICE: {CHOSEN, SECOND}, BEST_ONLY: set[Network](), EVERY: set(networks)}[word]
-            kept |= chosen & set(networks)
-            continue
-        mine = {n for n in networks if _same_symbol(symbol, n[0]) and filters in ("", n[1])}
-        if not mine:
-            known = list(dict.fromkeys(name for name, _ in networks))
-            raise ConfigError(
-                f"Predictions of '{word}' cannot be kept: accepted are {PAPER_CHOICE}, {BEST_ONLY}, {EVERY}, and the "
-                f"networks of the grid, such as {known[0]} or {':'.join(next(iter(networks)))}."
-                f"{nearest(symbol, (PAPER_CHOICE, BEST_ONLY, EVERY, *known))}"
-            )
-        kept |= mine
-    return frozenset(kept)
-
-
-def _same_symbol(text: str, symbol: str) -> bool:
-    try:
-        return parse_symbol(text) == parse_symbol(symbol)
-    except ArchError:
-        return False
+def networks_to_keep(plan: Plan, choice: str) -> set[Network]:
+    """Return the networks of a plan that a key of `KEPT` chooses."""
+    check_known(choice, tuple(KEPT), "choice of predictions to keep", ConfigError)
+    return KEPT[choice]({trial.network for trial in plan.trials})
