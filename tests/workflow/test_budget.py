@@ -49,7 +49,8 @@ def test_a_training_as_long_as_estimated_cuts_no_folds(
     done.save = lambda path: path
     monkeypatch.setattr(budget, "train", lambda *_, **__: done)
     nothing = lambda _: None  # noqa: E731
-    _, training_s = budget._train(dataset, from_settings(), tmp_path / "n", 1.0, True, nothing, nothing)
+    making = budget._Making(dataset, tmp_path / "n", 600, from_settings(), nothing, nothing)
+    _, training_s = making._train(plan)
     left_s = plan_s(cost, plan) - cost.training_s(2)
     assert budget._adjusted(plan, cost, training_s, left_s + 1e-9) == plan
 
