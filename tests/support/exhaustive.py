@@ -166,7 +166,7 @@ EXHAUSTIVE = {
             "personal",
             "questions",
             "record",
-            "results",
+            "measurements/results",
             "streams",
             "sweep",
             "trim",

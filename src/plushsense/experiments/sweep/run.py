@@ -29,7 +29,7 @@ from plushsense.experiments.sweep.plan import GridProblems, Plan, Trial, plan
 from plushsense.experiments.sweep.trainings import Task, TrainAndScore, processes
 from plushsense.experiments.sweep.trials import PAPER_CHOICE, SweepHead, networks_to_keep
 from plushsense.jobs.journal import JOURNAL, UNFINISHED, Result, job_id
-from plushsense.jobs.pool import Job, run_jobs
+from plushsense.jobs.pool import Job, JobCallbacks, JobsSpec, run_jobs
 from plushsense.jobs.progress import BestScore, JobInfo, JobProgress, JobsReporter, JobStep
 from plushsense.models.arch import slashed
 from plushsense.workflow.estimate import seconds_a_mac
@@ -203,15 +203,14 @@ class _Work:
                 # Nodes of a cluster may not share a disk, so they do not save unfinished states.
                 TrainAndScore(unfinished if self._cluster is None else None),
                 shared=(self._plan.sets, self._plan.folds),
-                workers=self._workers,
-                threads=self._plan.grid.threads,
-                journal=journal_of(self._dataset, JOURNAL),
-                cluster=self._cluster,
-                gpus=1.0 if self._cluster is not None and self._plan.grid.device == "cuda" else 0.0,
-                on_start=reporter.on_start,
-                on_report=reporter.on_report,
-                on_done=done,
-                on_failed=failed,
+                spec=JobsSpec(
+                    self._workers,
+                    self._plan.grid.threads,
+                    journal_of(self._dataset, JOURNAL),
+                    self._cluster,
+                    1.0 if self._cluster is not None and self._plan.grid.device == "cuda" else 0.0,
+                ),
+                callbacks=JobCallbacks(reporter.on_start, reporter.on_report, done, failed),
             )
         self._best = reporter.state.best
 
