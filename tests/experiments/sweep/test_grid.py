@@ -100,16 +100,6 @@ def test_at_another_rate_kernels_that_fit_the_window_are_named() -> None:
     assert problems(replace(grid, architectures=(symbol,)), replace(PLUSH, rate_hz=20.0), windows=300) == []
 
 
-def test_all_problems_come_at_once() -> None:
-    bad = GridSpec(
-        name="b", architectures=("14x", "100_300"), filters=((4,),), epochs=(5, 2), batches=(64, 999), split="by-me"
-    )
-    found = problems(bad, PLUSH, past=600, windows=300)
-    assert len(found) == 6
-    for words in ("14x", "receptive field", "only 1", "ascend", "999", "Unknown split"):
-        assert sum(words in line for line in found) == 1, words
-
-
 def test_a_receptive_field_that_only_rounds_beyond_the_window_is_the_papers() -> None:
     for symbol in PAPER_ARCHITECTURES:
         for padding in ("mirror", "causal", "stream"):
@@ -117,10 +107,6 @@ def test_a_receptive_field_that_only_rounds_beyond_the_window_is_the_papers() ->
     assert problems(replace(SMALL, architectures=("251",), filters=((4,),)), PLUSH) != []
     real = replace(SMALL, architectures=("100d4",), padding="stream", context="stream")
     assert problems(real, PLUSH, past=646) == []
-
-
-def test_full_is_a_batch() -> None:
-    assert problems(replace(SMALL, batches=(FULL,)), PLUSH, windows=10) == []
 
 
 def test_limits_name_what_exceeds_them() -> None:

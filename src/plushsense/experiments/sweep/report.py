@@ -80,31 +80,25 @@ def _parameters(sweep: SweepResults) -> Section:
 
 
 def _overview(sweep: SweepResults) -> Section:
-    rows = sorted(tables.architectures(sweep), key=lambda r: -(r.highest or 0.0))
+    rows = tables.architectures(sweep)
+    best = max(rows, key=lambda row: row.highest or 0.0)
     alt = (
-        f"Bars: highest and mean accuracy of {len(rows)} architectures. The first: {_bar_words(rows[:3])}. "
-        f"Diamonds: parameters. {draw.LIKE.format(7)}."
+        f"Bars: highest and mean accuracy of {len(rows)} architectures, the highest of {best.arch}. Diamonds: "
+        f"parameters. {draw.LIKE.format(7)}; the table has the numbers."
     )
-    dropped = _only_best(len(rows))
-    return Section(
-        "figure-7",
-        "Accuracy of each architecture (the paper's Figure 7)",
-        (tables.architecture_table(sweep),),
-        (Drawing("figure-7-architectures", draw.by_architecture(sweep), alt),),
-        dropped,
-    )
+    drawing = Drawing("figure-7-architectures", draw.by_architecture(sweep), alt)
+    title = "Accuracy of each architecture (the paper's Figure 7)"
+    return Section("figure-7", title, (tables.architecture_table(sweep),), (drawing,), _only_best(len(rows)))
 
 
 def _by_filters(sweep: SweepResults) -> Section:
     title = "Accuracy by filter set (the paper's Figure 8)"
     if len(sweep.filter_sets) < 2:
         return Section("figure-8", title, dropped=("There is one filter set only: it would be Figure 7 again.",))
-    best = []
-    for filter_set in sweep.filter_sets[::-1]:
-        rows = sorted(tables.architectures(sweep, filter_set), key=lambda r: -(r.highest or 0.0))
-        best.append(f"{filter_set}: {_bar_words(rows[:1])}")
-    alt = f"A panel of bars a filter set: highest and mean accuracy of each architecture. The best: {'; '.join(best)}."
-    alt += f" {draw.LIKE.format(8)}."
+    alt = (
+        "A panel of bars a filter set: highest and mean accuracy of each architecture. "
+        f"{draw.LIKE.format(8)}; the table above has the numbers."
+    )
     drawing = Drawing("figure-8-filter-sets", draw.by_filters(sweep), alt)
     return Section("figure-8", title, drawings=(drawing,), dropped=_only_best(len(sweep.archs)))
 
@@ -115,47 +109,26 @@ def _only_best(architectures: int) -> tuple[str, ...]:
     return (f"Drawn are the best {draw.BARS} of {architectures} architectures; the CSV has all.",)
 
 
-def _bar_words(rows: Sequence[tables.ArchitectureScores]) -> str:
-    return ", ".join(
-        f"{r.arch} not done"
-        if r.highest is None or r.mean is None
-        else f"{r.arch} {100 * r.highest:.1f} % (mean {100 * r.mean:.1f} %)"
-        for r in rows
-    )
-
-
 def _top(sweep: SweepResults) -> Section:
     table = tables.table4(sweep)
     title = "The best of each size class (the paper's Table 4 and Figure 9)"
     if len(table.rows) < 2:
-        return Section(
-            "table-4", title, (table,), dropped=("One network only is scored: Figure 9 would be one point.",)
-        )
-    first = ", ".join(
-        f"{r['arch']} {r['filters']} {100 * r['accuracy']:.1f} % at {count(r['parameters'])}" for r in table.rows[:3]
-    )
-    alt = (
-        f"Points: accuracy against parameters of {len(tables.top_rows(table))} networks. The most accurate: {first} "
-        f"parameters. {draw.LIKE.format(9)}."
-    )
+        dropped = ("One network only is scored: Figure 9 would be one point.",)
+        return Section("table-4", title, (table,), dropped=dropped)
+    points = len(tables.top_rows(table))
+    alt = f"Points: accuracy against parameters of {points} networks. {draw.LIKE.format(9)}; the table has the numbers."
     return Section("table-4", title, (table,), (Drawing("figure-9-size", draw.size_and_accuracy(sweep), alt),))
 
 
 def _effect(sweep: SweepResults) -> Section:
-    title = "Effect of epochs and batch"
+    title, table = "Effect of epochs and batch", tables.effect(sweep)
     if len(tables.epochs(sweep)) * len(tables.batches(sweep)) < 2:
-        return Section(
-            "effect", title, dropped=("All trials have the same epochs and batch: there is nothing to compare.",)
-        )
-    table = tables.effect(sweep)
+        dropped = ("All trials have the same epochs and batch: there is nothing to compare.",)
+        return Section("effect", title, dropped=dropped)
     if len(table.rows) < 2:
-        return Section(
-            "effect", title, (table,), dropped=("One schedule only is scored yet: there is nothing to compare.",)
-        )
-    means = ", ".join(
-        f"{r['epochs']} epochs, batch {r['batch_asked']}: {100 * r['accuracy']:.1f} %" for r in table.rows
-    )
-    alt = f"Lines: mean accuracy and macro-F1 over the networks. {means}."
+        dropped = ("One schedule only is scored yet: there is nothing to compare.",)
+        return Section("effect", title, (table,), dropped=dropped)
+    alt = "Lines: mean accuracy and macro-F1 over the networks by epochs and batch; the table has the numbers."
     return Section("effect", title, (table,), (Drawing("effect", draw.schedules(sweep), alt),))
 
 

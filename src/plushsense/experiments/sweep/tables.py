@@ -342,15 +342,15 @@ def _table3_words(met: int, near: int, off: Sequence[str], other: bool) -> list[
     return words
 
 
-def table4(sweep: SweepResults, *, threshold: float = PAPER_THRESHOLD, top: int = TOP) -> Table:
+def table4(sweep: SweepResults) -> Table:
     """Return the best networks of each size class and all that the paper prints in Table 4, beside its figures."""
     rows = []
     for filter_set in sweep.filter_sets:
         mine = sorted((n for n in sweep.networks if n.filter_set == filter_set and n.done), key=_rank)
-        rows += [_table4_row(n, i, threshold) for i, n in enumerate(mine, 1) if i <= top or _printed(n)]
+        rows += [_table4_row(n, i) for i, n in enumerate(mine, 1) if i <= TOP or _printed(n)]
     rows.sort(key=lambda r: (-r["accuracy"], r["parameters"]))
     beside = any(row["paper_accuracy"] is not None for row in rows)
-    over = [n for n in sweep.networks if (b := n.best()) and float(b["accuracy"]) > threshold]
+    over = [n for n in sweep.networks if (b := n.best()) and float(b["accuracy"]) > PAPER_THRESHOLD]
     columns = [
         Column("arch", "Architecture"),
         Column("filters", "Filters"),
@@ -362,7 +362,7 @@ def table4(sweep: SweepResults, *, threshold: float = PAPER_THRESHOLD, top: int 
         Column("paper_mean", "Paper: mean", "percent"),
         Column("acr", "ACR", "percent", score=True),
         Column("paper_acr", "Paper: ACR", "percent"),
-        Column("above", f"above {100 * threshold:g} %"),
+        Column("above", f"above {100 * PAPER_THRESHOLD:g} %"),
         *_metric_columns(without="accuracy"),
         Column("validated_accuracy", "Accuracy, chosen by validation", "percent", score=True),
         Column("schedule", "by (epochs, batch)"),
@@ -374,16 +374,16 @@ def table4(sweep: SweepResults, *, threshold: float = PAPER_THRESHOLD, top: int 
         columns = [c for c in columns if not c.key.startswith("paper_")]
     scored = sum(bool(n.done) for n in sweep.networks)
     words = [
-        f"The best {top} of each size class (a filter set), by their highest accuracy over epochs and batch; the mean "
+        f"The best {TOP} of each size class (a filter set), by their highest accuracy over epochs and batch; the mean "
         "is over the same trials. The highest is picked on the test part, as the paper did, and so is optimistic: "
         "beside it, the test accuracy of the trial that validation would have picked.",
         f"The paper heads its Table 4 with accuracy above {100 * PAPER_THRESHOLD:g} %, and prints two rows below "
-        f"that; here {len(over)} of {scored} scored networks are above {100 * threshold:g} %, and rows below stay, "
+        f"that; here {len(over)} of {scored} scored networks are above it, and rows below stay, "
         "marked. ACR = accuracy / log10(parameters).",
     ]
     if beside:
         words += [
-            f"Networks that the paper prints stay in the table if they are not among the best {top}; for one that it "
+            f"Networks that the paper prints stay in the table if they are not among the best {TOP}; for one that it "
             "does not print, its columns have a dash (in the CSV, nothing).",
             PAPERS_SPLIT + (" This sweep has that split." if sweep.head.get("split") == AUTHORS_SPLIT else ""),
             "The paper's figures are of its own recordings: of other data than these, unless the data set above is "
@@ -394,9 +394,9 @@ def table4(sweep: SweepResults, *, threshold: float = PAPER_THRESHOLD, top: int 
     )
 
 
-def top_rows(table: Table, top: int = TOP) -> list[Row]:
-    """Return the rows of Table 4 that are among the best ``top`` of their size class."""
-    return [row for row in table.rows if row["rank"] <= top]
+def top_rows(table: Table) -> list[Row]:
+    """Return the rows of Table 4 that are among the best `TOP` of their size class."""
+    return [row for row in table.rows if row["rank"] <= TOP]
 
 
 def _rank(network: SweepNetwork) -> tuple[float, int]:
@@ -408,7 +408,7 @@ def _printed(network: SweepNetwork) -> Table4Row | None:
     return TABLE4.get((network.arch, network.filters))
 
 
-def _table4_row(network: SweepNetwork, rank: int, threshold: float) -> dict[str, Any]:
+def _table4_row(network: SweepNetwork, rank: int) -> dict[str, Any]:
     best, validated = network.best(), network.best("validation_accuracy")
     assert best is not None
     printed = _printed(network)
@@ -425,7 +425,7 @@ def _table4_row(network: SweepNetwork, rank: int, threshold: float) -> dict[str,
         "acr": accuracy_complexity_ratio(best["accuracy"], network.parameters),
         **{key: best.get(key) for key in column_metrics() if key != "accuracy"},
         "validated_accuracy": validated["accuracy"] if validated else None,
-        "above": "yes" if float(best["accuracy"]) > threshold else "no",
+        "above": "yes" if float(best["accuracy"]) > PAPER_THRESHOLD else "no",
         "paper_parameters": printed.parameters if printed else None,
         "paper_accuracy": printed.highest if printed else None,
         "paper_mean": printed.mean if printed else None,
