@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -36,13 +36,8 @@ BEST = 10
 _EVERY_S = 5.0
 
 _RUN_COLUMNS: dict[str, type[Any]] = {
-    "trial": str,
-    "run": str,
-    "arch": str,
-    "filters": str,
-    "epochs": int,
-    "batch": int,
-    "seed": int,
+    **dict.fromkeys(("trial", "run", "arch", "filters"), str),
+    **dict.fromkeys(("epochs", "batch", "seed"), int),
     "fold": str,
     "test_windows": int,
     **dict.fromkeys(column_metrics(), float),
@@ -51,9 +46,7 @@ _RUN_COLUMNS: dict[str, type[Any]] = {
     "seconds": float,
 }
 _CURVE_COLUMNS: dict[str, type[Any]] = {
-    "run": str,
-    "arch": str,
-    "filters": str,
+    **dict.fromkeys(("run", "arch", "filters"), str),
     "batch": int,
     "seed": int,
     "fold": str,
@@ -372,12 +365,11 @@ class SweepFolder:
             training = _training_columns(*self._of[job][0])
             parts.append(
                 part.with_columns(
-                    epoch=polars.int_range(1, len(curve) + 1, eager=True, dtype=polars.Int64),
-                    **{
-                        name: polars.lit(value, dtype=_kind(polars, _CURVE_COLUMNS[name]))
-                        for name, value in training.items()
-                    },
-                ).select(list(_CURVE_COLUMNS))
+                    epoch=polars.int_range(1, len(curve) + 1, eager=True),
+                    **{name: polars.lit(value) for name, value in training.items()},
+                )
+                .select(list(_CURVE_COLUMNS))
+                .cast(_CURVE_COLUMNS)
             )
         return polars.concat(parts) if parts else _frame(polars, [], _CURVE_COLUMNS)
 
@@ -393,11 +385,5 @@ def _training_columns(trial: Trial, run: TrialRun) -> dict[str, Any]:
     }
 
 
-def _kind(polars: Any, kind: type[Any]) -> Any:
-    return {str: polars.String, int: polars.Int64, float: polars.Float64, bool: polars.Boolean}[kind]
-
-
 def _frame(polars: Any, rows: Iterable[Mapping[str, Any]], columns: Mapping[str, type[Any]]) -> Any:
-    schema = {name: _kind(polars, kind) for name, kind in columns.items()}
-    values: Sequence[Sequence[Any]] = [[row[name] for name in columns] for row in rows]
-    return polars.DataFrame(values, schema=schema, orient="row")
+    return polars.DataFrame([[row[name] for name in columns] for row in rows], schema=dict(columns), orient="row")

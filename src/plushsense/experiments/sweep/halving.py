@@ -120,6 +120,18 @@ class HalvingCosts:
                 f"{_round_up(self.least):g}, or begin with fewer epochs."
             )
 
+    def to_json(self) -> dict[str, Any]:
+        """Return the bound, and what it is compared with, as plain values."""
+        return {
+            "networks": len(self._until),
+            "rungs": list(self.rungs),
+            "bound_macs": self.bound,
+            "bound_share": self.share,
+            "first_share": float(self.step(0).sum()) / self.whole,
+            "least_share": self.least,
+            "grid_macs": self.whole,
+        }
+
 
 def halve(costs: HalvingCosts, train: Callable[[Rung], Scores]) -> HalvingResult:
     """Run the rungs. ``train`` returns the scores (entered, seeds × folds) of one: higher is better, NaN is failed.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import ConfigError, need
-from plushsense.experiments.sweep.results import SweepResults, finite
+from plushsense.experiments.sweep.results import StoredSweep, finite
 from plushsense.experiments.sweep.trials import TRIAL_COLUMNS
 from plushsense.reports.table import Row
 
@@ -30,7 +30,7 @@ class MlflowResult:
     before: int
 
 
-def export_trials(sweep: SweepResults, where: str | os.PathLike[str]) -> MlflowResult:
+def export_trials(sweep: StoredSweep, where: str | os.PathLike[str]) -> MlflowResult:
     """Log each complete trial as a run, unless an earlier export has logged it.
 
     Args:
@@ -98,7 +98,7 @@ def _there(client: Any, experiment: str) -> dict[str, tuple[str, str]]:
             return runs
 
 
-def _log(mlflow: Any, client: Any, experiment: str, run: str, sweep: SweepResults, trial: Row) -> None:
+def _log(mlflow: Any, client: Any, experiment: str, run: str, sweep: StoredSweep, trial: Row) -> None:
     """Log a trial as one run; ``run`` is the id of an unfinished run of an earlier export to complete, or ""."""
     entities, head = mlflow.entities, sweep.head
     marks = " [leaky]" * sweep.leaky + " [simulation]" * sweep.simulated

@@ -15,7 +15,7 @@ from plushsense.experiments.sweep import figures as draw
 from plushsense.experiments.sweep import tables
 from plushsense.experiments.sweep.folder import SUMMARY
 from plushsense.experiments.sweep.grid import GRID_TRAINING
-from plushsense.experiments.sweep.results import SweepResults, file_name_of, name_of, read_sweep
+from plushsense.experiments.sweep.results import StoredSweep, file_name_of, name_of, read_sweep
 from plushsense.reports import wording
 from plushsense.reports.figures import png, svg, svg_uri
 from plushsense.reports.page import check_page_path, earlier_files, render_page, write_files, write_page
@@ -55,7 +55,7 @@ class Section:
     more_drawings: tuple[Drawing, ...] = ()
 
 
-def sections_of(sweep: SweepResults) -> Iterator[Section]:
+def sections_of(sweep: StoredSweep) -> Iterator[Section]:
     """Yield the sections of the report in the paper's order; without any finished trial, only those without scores."""
     if not sweep.done:
         yield Section("best", "The best trials", dropped=("No trial is done yet: there is no score to show.",))
@@ -75,11 +75,11 @@ def sections_of(sweep: SweepResults) -> Iterator[Section]:
     yield _fronts(sweep)
 
 
-def _parameters(sweep: SweepResults) -> Section:
+def _parameters(sweep: StoredSweep) -> Section:
     return Section("table-3", "Parameters (the paper's Table 3)", (tables.table3(sweep),), scores=False)
 
 
-def _overview(sweep: SweepResults) -> Section:
+def _overview(sweep: StoredSweep) -> Section:
     rows = tables.architectures(sweep)
     best = max(rows, key=lambda row: row.highest or 0.0)
     alt = (
@@ -91,7 +91,7 @@ def _overview(sweep: SweepResults) -> Section:
     return Section("figure-7", title, (tables.architecture_table(sweep),), (drawing,), _only_best(len(rows)))
 
 
-def _by_filters(sweep: SweepResults) -> Section:
+def _by_filters(sweep: StoredSweep) -> Section:
     title = "Accuracy by filter set (the paper's Figure 8)"
     if len(sweep.filter_sets) < 2:
         return Section("figure-8", title, dropped=("There is one filter set only: it would be Figure 7 again.",))
@@ -109,7 +109,7 @@ def _only_best(architectures: int) -> tuple[str, ...]:
     return (f"Drawn are the best {draw.BARS} of {architectures} architectures; the CSV has all.",)
 
 
-def _top(sweep: SweepResults) -> Section:
+def _top(sweep: StoredSweep) -> Section:
     table = tables.table4(sweep)
     title = "The best of each size class (the paper's Table 4 and Figure 9)"
     if len(table.rows) < 2:
@@ -120,7 +120,7 @@ def _top(sweep: SweepResults) -> Section:
     return Section("table-4", title, (table,), (Drawing("figure-9-size", draw.size_and_accuracy(sweep), alt),))
 
 
-def _effect(sweep: SweepResults) -> Section:
+def _effect(sweep: StoredSweep) -> Section:
     title, table = "Effect of epochs and batch", tables.effect(sweep)
     if len(tables.epochs(sweep)) * len(tables.batches(sweep)) < 2:
         dropped = ("All trials have the same epochs and batch: there is nothing to compare.",)
@@ -132,7 +132,7 @@ def _effect(sweep: SweepResults) -> Section:
     return Section("effect", title, (table,), (Drawing("effect", draw.schedules(sweep), alt),))
 
 
-def _looked_at(sweep: SweepResults, best: Row) -> list[Row]:
+def _looked_at(sweep: StoredSweep, best: Row) -> list[Row]:
     """Return the trials to show with confusions and curves: the paper's two networks if in the grid, and the best."""
     candidates = [*(sweep.best_of(*network) for network in draw.PAPER_CONFUSIONS), best]
     return list({t["trial"]: t for t in candidates if t}.values())
@@ -142,7 +142,7 @@ _MATRICES = 12
 """Largest number of confusion matrices on the page; all are files."""
 
 
-def _confusions(sweep: SweepResults, trials: Sequence[Row]) -> Section:
+def _confusions(sweep: StoredSweep, trials: Sequence[Row]) -> Section:
     title = "Confusions (the paper's Figures 10 and 11)"
     if len(sweep.labels) < 2:
         return Section("confusion", title, dropped=("The sweep names no classes: there is nothing to confuse.",))
@@ -175,7 +175,7 @@ def _confusions(sweep: SweepResults, trials: Sequence[Row]) -> Section:
     )
 
 
-def confusion_words(sweep: SweepResults, trial: Row) -> str:
+def confusion_words(sweep: StoredSweep, trial: Row) -> str:
     """Describe a confusion matrix in words: shares that are right, wrong within an affect, and wrong across affects."""
     counts = np.asarray(sweep.confusion(str(trial["trial"])), dtype=np.int64)
     total, right = int(counts.sum()), int(np.trace(counts))
@@ -196,7 +196,7 @@ def confusion_words(sweep: SweepResults, trial: Row) -> str:
     return description + (f". {draw.LIKE.format(number)}." if number else ".")
 
 
-def _curves(sweep: SweepResults, trials: Sequence[Row]) -> Section:
+def _curves(sweep: StoredSweep, trials: Sequence[Row]) -> Section:
     drawings, dropped = [], []
     for trial in trials:
         figure = draw.curves(sweep, trial)
@@ -208,7 +208,7 @@ def _curves(sweep: SweepResults, trials: Sequence[Row]) -> Section:
     return Section("curves", "Learning curves", drawings=tuple(drawings), dropped=tuple(dropped))
 
 
-def _fronts(sweep: SweepResults) -> Section:
+def _fronts(sweep: StoredSweep) -> Section:
     drawings, dropped = [], []
     for cost, label in tables.COSTS.items():
         points = tables.pareto_points(sweep, cost)
@@ -309,7 +309,7 @@ def write_sweep_report(
 
 
 def render(
-    sweep: SweepResults,
+    sweep: StoredSweep,
     sections: Sequence[Section],
     pictures: Mapping[str, bytes],
     *,
@@ -331,7 +331,7 @@ def render(
     )
 
 
-def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
+def about_rows(sweep: StoredSweep) -> list[tuple[str, str]]:
     """Return grid, data and split as (name, value) pairs."""
     head = sweep.head
     how, who = wording.describe_split(str(head.get("split")))
@@ -370,7 +370,7 @@ def about_rows(sweep: SweepResults) -> list[tuple[str, str]]:
     ]
 
 
-def training_settings(sweep: SweepResults) -> list[tuple[str, str]]:
+def training_settings(sweep: StoredSweep) -> list[tuple[str, str]]:
     """Return the settings of the networks and their training, with those of the preset filled in."""
     grid = sweep.head.get("grid") or {}
     preset = PRESETS.get(str(sweep.head.get("preset")))
@@ -391,7 +391,7 @@ def training_settings(sweep: SweepResults) -> list[tuple[str, str]]:
     ]
 
 
-def _template_values(sweep: SweepResults, section: Section, pictures: Mapping[str, bytes]) -> dict[str, Any]:
+def _template_values(sweep: StoredSweep, section: Section, pictures: Mapping[str, bytes]) -> dict[str, Any]:
     return {
         "key": section.key,
         "title": section.title,
@@ -411,7 +411,7 @@ def _template_values(sweep: SweepResults, section: Section, pictures: Mapping[st
 
 
 def _contents(
-    sweep: SweepResults, sections: Sequence[Section], pictures: Mapping[str, bytes]
+    sweep: StoredSweep, sections: Sequence[Section], pictures: Mapping[str, bytes]
 ) -> Iterator[tuple[str, bytes]]:
     """Yield the name and content of each file; every table includes the data and split of its scores."""
     source = {"dataset": sweep.head.get("dataset"), "split": sweep.head.get("split")}

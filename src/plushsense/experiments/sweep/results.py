@@ -54,7 +54,7 @@ class SweepNetwork:
 
 
 @dataclass(frozen=True)
-class SweepResults:
+class StoredSweep:
     """The content of a sweep's results folder: ``head`` is sweep.json; the tables are rows."""
 
     folder: Path
@@ -155,7 +155,7 @@ class SweepResults:
         return max(self.done, key=lambda t: (float(t["accuracy"]), -int(t["parameters"])), default=None)
 
 
-def read_sweep(folder: str | os.PathLike[str]) -> SweepResults:
+def read_sweep(folder: str | os.PathLike[str]) -> StoredSweep:
     """Read the results folder of a sweep.
 
     Raises:
@@ -176,7 +176,7 @@ def read_sweep(folder: str | os.PathLike[str]) -> SweepResults:
     if not isinstance(head, dict):
         raise BadInput(f"'{place / SUMMARY}' is not a sweep (no object): run the sweep again to rebuild it.")
     trials = _table(place / TRIALS, needed=_NEEDED)
-    return SweepResults(place, head, trials, _table(place / RUNS, missing=True))
+    return StoredSweep(place, head, trials, _table(place / RUNS, missing=True))
 
 
 def _table(path: Path, needed: Sequence[str] = (), *, missing: bool = False) -> tuple[Row, ...]:

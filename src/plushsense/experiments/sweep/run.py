@@ -288,15 +288,11 @@ def _name(task: Task) -> str:
 
 @dataclass(frozen=True)
 class SweepPreview:
-    """What a sweep would train, and its cost.
+    """What a sweep would train.
 
     Attributes:
-        grid: its settings; with them and ``planned`` is None if there are ``problems``.
+        grid: its settings; ``planned`` is None if it has ``problems``.
         held: number of trainings that the journal has.
-        macs: multiply-accumulates of all trainings.
-        windows_mb, training_mb: memory of a process for windows, and for a step of the largest training, which is None
-            where PyTorch's own layers decide.
-        cost: share of each architecture in the cost, the largest first.
         seconds: estimated time of the missing trainings on this machine; None if it was not measured.
         halving: costs of halving, or None.
     """
@@ -306,18 +302,25 @@ class SweepPreview:
     simulated: bool = False
     planned: Plan | None = None
     held: int = 0
-    macs: int = 0
-    windows_mb: float = 0.0
-    training_mb: float | None = None
-    cost: Mapping[str, float] | None = None
     seconds: float | None = None
     halving: HalvingCosts | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain values, with the settings of the trainings as ``training``."""
+        """Return plain values: counts, cost in multiply-accumulates, memory of each process, settings, problems.
+
+        ``training_mb`` (a step of the largest training) is None where PyTorch's own layers decide.
+        """
         grid, planned = self.grid, self.planned
         if planned is None:
             return {"name": grid.name, "trials": 0, "problems": list(self.problems), "grid": grid.to_json()}
+        # Imported here, because PyTorch is needed for training only.
+        from plushsense.training.engine import step_bytes
+
+        cost: dict[str, float] = {}
+        for job in planned.jobs:
+            cost[job.task.arch.symbol] = cost.get(job.task.arch.symbol, 0.0) + planned.macs(job)
+        macs = sum(cost.values())
+        steps = [step_bytes(job.task.arch, job.task.spec) for job in planned.jobs]
         left_out = [
             {"arch": a.symbol, "filters": slashed(a.filters), "why": ", ".join(map(str, grid.exceeded(a)))}
             for a in planned.left_out
@@ -333,27 +336,16 @@ class SweepPreview:
             "folds": planned.n_folds,
             "seeds": len(grid.seeds),
             "held": self.held,
-            "macs": self.macs,
-            "windows_mb": self.windows_mb,
-            "training_mb": self.training_mb,
-            "cost": self.cost,
+            "macs": macs,
+            "windows_mb": sum(windows.integers.nbytes for windows in planned.sets.values()) / 1e6,
+            "training_mb": None if None in steps else max(filter(None, steps), default=0) / 1e6,
+            "cost": {arch: own / macs for arch, own in sorted(cost.items(), key=lambda item: -item[1])},
             "left_out": left_out,
             "problems": [],
             "grid": grid.to_json(),
             "training": {k: v for k, v in asdict(grid.training).items() if k not in ("epochs", "batch", "seed")},
             **({} if self.seconds is None else {"seconds": self.seconds}),
-            **({} if self.halving is None else {"halving": self._halving(self.halving)}),
-        }
-
-    def _halving(self, costs: HalvingCosts) -> dict[str, Any]:
-        return {
-            "networks": len(costs.step(0)),
-            "rungs": list(costs.rungs),
-            "bound_macs": costs.bound,
-            "bound_share": costs.share,
-            "first_share": float(costs.step(0).sum()) / costs.whole,
-            "least_share": costs.least,
-            "grid_macs": costs.whole,
+            **({} if self.halving is None else {"halving": self.halving.to_json()}),
         }
 
 
@@ -379,27 +371,12 @@ def preview(
     networks_to_keep(planned, keep_predictions)
     costs = halving_costs(planned, warn) if spec.halving else None
     journal = journal_of(dataset, JOURNAL)
-    macs = {job.id: planned.macs(job) for job in planned.jobs}
-    total = sum(macs.values())
-    shares: dict[str, float] = {}
-    for job in planned.jobs:
-        shares[job.task.arch.symbol] = shares.get(job.task.arch.symbol, 0.0) + macs[job.id] / total
-    from plushsense.training.engine import step_bytes
-
-    steps = [step_bytes(job.task.arch, job.task.spec) for job in planned.jobs]
-    left = sum(macs[job.id] for job in planned.jobs if not journal.has(job.id))
-    return SweepPreview(
-        spec,
-        simulated=dataset.head.simulated,
-        planned=planned,
-        held=sum(journal.has(job.id) for job in planned.jobs),
-        macs=total,
-        windows_mb=sum(windows.integers.nbytes for windows in planned.sets.values()) / 1e6,
-        training_mb=max((n for n in steps if n is not None), default=0) / 1e6 if None not in steps else None,
-        cost=dict(sorted(shares.items(), key=lambda item: -item[1])),
-        seconds=_seconds(planned, left if costs is None else costs.bound) if measure else None,
-        halving=costs,
-    )
+    left = [job for job in planned.jobs if not journal.has(job.id)]
+    seconds = None
+    if measure:
+        seconds = _seconds(planned, sum(map(planned.macs, left)) if costs is None else costs.bound)
+    held = len(planned.jobs) - len(left)
+    return SweepPreview(spec, (), dataset.head.simulated, planned, held, seconds, costs)
 
 
 def _seconds(planned: Plan, macs: float) -> float:
