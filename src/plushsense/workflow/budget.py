@@ -28,18 +28,20 @@ from plushsense.jobs.progress import JobProgress
 from plushsense.models.bundle import Bundle
 from plushsense.scoring.metrics import summary
 from plushsense.windows.cut import ANYWHERE
-from plushsense.workflow.api import evaluate, train, unfinished
+from plushsense.workflow.api import evaluate_run, train, unfinished
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.estimate import preview_evaluation
 from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import (
+    Run,
     Warn,
     count_people,
+    prepare,
     refits,
     refuse_hard_negatives,
     silent,
 )
-from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, evaluation_id, journal_of, name_of, write_report
+from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, journal_of, write_report
 
 TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
 MORE_PEOPLE = 2
@@ -262,7 +264,6 @@ def make_network(
     if config is None:
         streams = any(recording.stream_row >= 0 for recording in dataset.used)
         config = from_settings(context=ANYWHERE) if streams else from_settings()
-    refuse_hard_negatives(config)
     return _Making(dataset, out, budget_s, config, progress, warn).run()
 
 
@@ -275,11 +276,13 @@ class _Making:
         self._began = time.monotonic()
         self._dataset, self._out, self._config = dataset, out, config
         self._budget_s, self._progress, self._warn = budget_s, progress, warn
+        run = prepare(dataset, config)
+        refuse_hard_negatives(run)
         self._again = refits(config, count_people(dataset))
         self._networks = 1 + self._again
         # A resumed run must not choose other folds because the computer is faster or slower than before.
         self._journal = journal_of(dataset, "budgets")
-        self._key = job_id({"evaluation": evaluation_id(config, dataset), "out": out.name, "seconds": budget_s})
+        self._key = job_id({"evaluation": run.id, "out": out.name, "seconds": budget_s})
 
     @property
     def _seconds(self) -> float:
@@ -293,9 +296,9 @@ class _Making:
             plan = BudgetPlan(**{**stored["plan"], "sizes": tuple(stored["plan"]["sizes"])})
             bundle = _saved_bundle(self._out.parent, stored["bundle"]) or self._train(plan)[0]
             self._store(plan, bundle.name)
-        config = _planned(self._config, plan)
-        folder = self._dataset.path / "evaluations" / name_of(config, self._dataset)
-        learning = self._evaluate(plan, config, folder, bundle, resumed=stored is not None)
+        run = prepare(self._dataset, _planned(self._config, plan), self._warn)
+        folder = self._dataset.path / "evaluations" / run.name
+        learning = self._evaluate(plan, run, folder, bundle, resumed=stored is not None)
         if learning is not None:
             with self._dataset.generation.writing():
                 write_file(folder / LEARNING, json.dumps(learning.to_json()))
@@ -335,9 +338,7 @@ class _Making:
         done = train(dataset, config, journal=unfinished(dataset), progress=epoch_done, warn=self._warn)
         return done.save(free_path(self._out, done.bundle.to_bytes())), done.seconds / (1 + again)
 
-    def _evaluate(
-        self, plan: BudgetPlan, config: RunConfig, out: Path, bundle: Path, resumed: bool
-    ) -> LearningCurve | None:
+    def _evaluate(self, plan: BudgetPlan, run: Run, out: Path, bundle: Path, resumed: bool) -> LearningCurve | None:
         """Evaluate on all people, then on fewer while the time allows."""
         before, whole = float(self._networks), sum(_work(plan, self._networks))
 
@@ -352,7 +353,7 @@ class _Making:
             return fold_done
 
         started = time.monotonic()
-        result = evaluate(self._dataset, config, out=out, progress=reported(EVALUATING, 1.0), warn=self._warn)
+        result = evaluate_run(run, out=out, progress=reported(EVALUATING, 1.0), warn=self._warn)
         evaluation_s = time.monotonic() - started
         before += plan.folds - 1
         points = {plan.trained_people: _accuracies(result.table)}
@@ -361,7 +362,7 @@ class _Making:
             if not resumed and share * evaluation_s > self._budget_s - self._seconds:
                 break
             progress = reported(LEARNING_CURVE, share)
-            smaller = evaluate(self._dataset, config, training_people=size, progress=progress, warn=silent)
+            smaller = evaluate_run(run, training_people=size, progress=progress, warn=silent)
             points[size] = _accuracies(smaller.table)
             before += (plan.folds - 1) * share
         return learning_curve(points)

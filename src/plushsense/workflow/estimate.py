@@ -15,23 +15,13 @@ from typing import Any
 import numpy as np
 
 from plushsense.core.gestures import NOBODY
-from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.evaluation.crossval import fold_windows, train_on_validation
 from plushsense.models.arch import Arch
-from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.config import RunConfig
-from plushsense.workflow.preparation import (
-    Warn,
-    classes_for,
-    network_inputs_of,
-    prepare_training,
-    refuse_hard_negatives,
-    silent,
-    windows_for,
-)
+from plushsense.workflow.preparation import Run, Warn, prepare, prepare_training, refuse_hard_negatives, silent
 
 # Passes of a training step: forward, and backward to the weights and to the previous layer.
 PASSES = 3
@@ -73,66 +63,45 @@ def preview_training(
     dataset: Dataset | str | os.PathLike[str], config: RunConfig, *, warn: Warn = silent
 ) -> CostEstimate:
     """Return what `api.train` would train on and its cost."""
-    made = prepare_training(as_dataset(dataset), config, warn)
-    windows, division, config = made.windows, made.division, made.config
+    made = prepare_training(dataset, config, warn)
+    run, windows, division = made.run, made.windows, made.division
     trained = len(division.train) + (len(windows) if division.refit else 0)
-    head: dict[str, Any] = {
-        "split": division.kind,
-        "leaky": division.split.leaky,
-        "context": config.windows.context,
-        "folds": 1,
-    }
-    return _estimate(made.dataset, made.network, config, windows, trained, **head)
+    return _estimate(run, windows, trained, (division.kind, division.split.leaky, run.windows.context, 1))
 
 
 def preview_evaluation(
     dataset: Dataset | str | os.PathLike[str], config: RunConfig, *, warn: Warn = silent
 ) -> CostEstimate:
     """Return what `api.evaluate` would train on and its cost, without the training itself."""
-    refuse_hard_negatives(config)
-    dataset, config = network_inputs_of(as_dataset(dataset), config)
-    gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)
-    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
-    score = fit_on = windows_for(dataset, network, config.scored_on, gestures, warn)
-    if config.trained_on != config.scored_on:
-        fit_on = windows_for(dataset, network, config.trained_on, gestures, anywhere=config.anywhere)
-    split = parse_split(config.evaluation.split)
-    folds = fold_windows(fit_on, score, split, config.evaluation.seed)
-    folds = folds if config.holds_back else train_on_validation(folds)
-    head: dict[str, Any] = {
-        "split": split.text,
-        "leaky": split.leaky,
-        "context": config.scored_on.context,
-        "folds": len(folds),
-    }
-    side_by_side = min(config.evaluation.processes, len(folds))
+    run = prepare(dataset, config, warn)
+    refuse_hard_negatives(run)
+    score = fit_on = run.scored_windows(warn)
+    if run.trained_on != run.scored_on:
+        fit_on = run.training_windows()
+    folds = fold_windows(fit_on, score, run.split, run.evaluation.seed)
+    folds = folds if run.holds_back else train_on_validation(folds)
     trained = sum(len(fold.train) for fold in folds)
-    return _estimate(dataset, network, config, fit_on, trained, side_by_side, **head)
+    split = (run.split.text, run.split.leaky, run.scored_on.context, len(folds))
+    return _estimate(run, fit_on, trained, split, min(run.evaluation.processes, len(folds)))
 
 
 def _estimate(
-    dataset: Dataset,
-    network: Arch,
-    config: RunConfig,
-    windows: WindowSet,
-    trained: int,
-    side_by_side: int = 1,
-    **head: Any,
+    run: Run, windows: WindowSet, trained: int, split: tuple[str, bool, str, int], side_by_side: int = 1
 ) -> CostEstimate:
-    """Estimate the cost of trainings on ``trained`` of the windows in all; ``head`` describes the split."""
-    rate = seconds_a_mac(windows, network, config.training)
-    macs = PASSES * network.macs_per_window * trained * config.training.epochs
+    """Estimate the cost of trainings on ``trained`` windows in all; ``split``: name, leaky, context, folds."""
+    rate = seconds_a_mac(windows, run.network, run.training)
+    macs = PASSES * run.network.macs_per_window * trained * run.training.epochs
     return CostEstimate(
-        **head,
-        dataset=dataset.head.name,
-        simulated=dataset.head.simulated,
+        *split,
+        dataset=run.dataset.head.name,
+        simulated=run.dataset.head.simulated,
         people=len(set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}),
         classes=len(windows.labels),
         windows=len(windows),
-        epochs=config.training.epochs,
-        parameters=network.parameters,
+        epochs=run.training.epochs,
+        parameters=run.network.parameters,
         macs=macs,
-        window_epoch_s=rate * PASSES * network.macs_per_window,
+        window_epoch_s=rate * PASSES * run.network.macs_per_window,
         seconds=macs * rate / max(1, side_by_side),
     )
 
