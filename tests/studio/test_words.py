@@ -68,7 +68,11 @@ def source() -> Source:
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 found.constants.add(node.value)
                 found.values.setdefault(node.value, set()).update(keywords)
-            elif isinstance(node, ast.AnnAssign) and ast.unparse(node.annotation) == "Texts":
+            elif (
+                isinstance(node, ast.AnnAssign)
+                and place.startswith("studio/")
+                and ast.unparse(node.annotation) == "Texts"
+            ):
                 assert isinstance(node.value, ast.Dict), f"{place}:{node.lineno}: a table of texts is no literal"
                 found.texts.update(dict.fromkeys((t for v in node.value.values for t in texts_of(v)), place))
             elif isinstance(node, ast.Call):

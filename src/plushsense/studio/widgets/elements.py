@@ -58,7 +58,6 @@ _TITLES = {
     "verify": "Verify “{name}”",
     "publish": "Package “{name}”",
     "validate": "Check of “{name}”",
-    "pseudonymise": "Copy with pseudonyms “{name}”",
 }
 
 

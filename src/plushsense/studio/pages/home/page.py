@@ -123,7 +123,6 @@ CHANGING = (
     "backup",
     "restore",
     "forget",
-    "pseudonymise",
     "check",
     "train",
     "sweep",

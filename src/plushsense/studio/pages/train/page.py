@@ -17,6 +17,7 @@ from plushsense.studio.app.shell import Page, add_style, button, focus, html, on
 from plushsense.studio.app.words import Texts, Words
 from plushsense.studio.pages.train.jobs import JobsSection, warning_texts
 from plushsense.studio.pages.train.requests import (
+    BUILT_IN,
     EVALUATE,
     KINDS,
     MAKE,
@@ -154,8 +155,8 @@ class TrainingForm:
         self._dataset = query_path(page.workspace, "dataset", self._datasets)
         self._values[TRAIN] |= {"context": ANYWHERE, "preset": "people", "fit_decisions": True}
         self._values[EVALUATE] |= {"split": SPLITS[0], "preset": "people"}
-        self._values[SWEEP] |= {"grid": PAPER}
-        self._values[SEARCH] |= {"grid": PAPER}
+        for kind, grid in BUILT_IN.items():
+            self._values[kind] |= {"grid": grid}
         # The job that computes an estimate, the request it is for, and the key of the displayed estimate.
         self._estimate_job: StudioJob | None = None
         self._estimate_request: JobRequest | None = None
@@ -287,7 +288,7 @@ class TrainingForm:
     def _of_grid(self) -> None:
         w = self._words
         options = {
-            PAPER: w(
+            BUILT_IN[self._kind]: w(
                 "of the paper: 13 networks × 4 sizes × 3 epochs × 3 batches = 468 trials"
                 if self._kind == SWEEP
                 else "of the paper: 52 networks"
@@ -518,12 +519,12 @@ class TrainingForm:
             text = w(
                 "{candidates} networks compared after {rungs} epochs, {left_out} beyond the limits; split {split}; "
                 "at most {share} % of the whole list’s cost, {macs} multiply-accumulates.",
-                candidates=plan["candidates"],
-                rungs=", ".join(map(str, plan["rungs"])),
+                candidates=plan["halving"]["networks"],
+                rungs=", ".join(map(str, plan["halving"]["rungs"])),
                 left_out=len(plan["left_out"]),
                 split=plan["split"],
-                share=round(100 * plan["bound_share"]),
-                macs=_power(w, plan["bound_macs"]),
+                share=round(100 * plan["halving"]["bound_share"]),
+                macs=_power(w, plan["halving"]["bound_macs"]),
             )
         tag(ui.label(text), "plan-text")
         tag(
