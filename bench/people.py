@@ -32,6 +32,7 @@ from plushsense.core import layouts
 from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.store import HEAD, Dataset, RecordingInfo
 from plushsense.evaluation.crossval import EpochProgress, FoldOutput, evaluate
+from plushsense.evaluation.scores import Scores
 from plushsense.jobs.journal import Journal
 from plushsense.models.arch import Arch
 from plushsense.scoring.splits import parse_split
@@ -165,17 +166,17 @@ def measured(row: Row, dataset: Dataset, seeds: list[int], args: argparse.Namesp
     runs = [evaluated(row, dataset, seed, args) for seed in seeds]
     scores: dict[str, Any] = {"parameters": runs[0][1], "seeds": seeds}
     for key in ("accuracy", "macro_f1"):
-        means = [table[key]["mean"] for table, _ in runs]
+        means = [found.mean(key) for found, _ in runs]
         scores[key] = {"mean": fmean(means), "sd": stdev(means) if len(means) > 1 else None, "runs": means}
-    by_recording = [table["by_recording"]["accuracy"] for table, _ in runs]
-    people: dict[str, list[float]] = {one["subject"]: [] for one in runs[0][0]["subjects"]}
-    for table, _ in runs:
-        for one in table["subjects"]:
-            people[one["subject"]].append(one["accuracy"])
+    by_recording = [found.by_recording.metrics["accuracy"] for found, _ in runs]
+    people: dict[str, list[float]] = {one.subject: [] for one in runs[0][0].subjects}
+    for found, _ in runs:
+        for one in found.subjects:
+            people[one.subject].append(one.metrics["accuracy"])
     return scores | {"by_recording": fmean(by_recording), "people": people}
 
 
-def evaluated(row: Row, dataset: Dataset, seed: int, args: argparse.Namespace) -> tuple[dict[str, Any], int]:
+def evaluated(row: Row, dataset: Dataset, seed: int, args: argparse.Namespace) -> tuple[Scores, int]:
     settings = {**row.settings, "seed": seed} | ({"epochs": args.epochs} if args.epochs else {})
     if row.regained:
         dataset = Regained.of(dataset)
@@ -195,7 +196,7 @@ def evaluated(row: Row, dataset: Dataset, seed: int, args: argparse.Namespace) -
         workers=args.workers,
         validation=False,
     )
-    return done.table, arch.parameters
+    return done.scores, arch.parameters
 
 
 def line(row: Row, scores: dict[str, Any]) -> str:

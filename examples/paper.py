@@ -252,7 +252,7 @@ class Paper:
             progress=lambda p: say(f"  fold {p.done} of {p.total} done") if p.epoch == 0 else None,
             **more,
         )
-        return result.to_dict()
+        return result.to_json()
 
 
 def say(text: str) -> None:

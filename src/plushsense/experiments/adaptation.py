@@ -208,10 +208,10 @@ def _summary(people: list[dict[str, Any]]) -> dict[str, Any]:
             np.array([row[f"{score}_{when}"] for row in people]) for when in ("before", "after", "first")
         )
         out[score] = {
-            "before": metrics.summary(before),
-            "after": metrics.summary(after),
-            "gain": metrics.summary(after - before),
-            "first": metrics.summary(first),
+            "before": metrics.summary(before).to_json(),
+            "after": metrics.summary(after).to_json(),
+            "gain": metrics.summary(after - before).to_json(),
+            "first": metrics.summary(first).to_json(),
         }
     changes = [row["right_change"] for row in people]
     out["right"] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plushsense.core.errors import BadInput
-from plushsense.scoring.metrics import summary
+from plushsense.scoring.metrics import Summary, summary
 
 # Up to this number of pairs, all assignments of signs are counted; above it, this many are drawn.
 EXACT_PAIRS = 16
@@ -71,12 +72,30 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return [float(p) for p in adjusted]
 
 
-def compare_pairs(names: Sequence[str], scores: ArrayLike) -> list[dict[str, Any]]:
-    """Compare all pairs of models on scores (people, models), person by person.
+@dataclass(frozen=True)
+class PairResult:
+    """The comparison of two models on the same people.
 
-    Returns:
-        for each pair {first, second, difference {mean, sd, ci95}, better, worse, p, p_holm, effect}; differences are
-        first minus second, ``better`` and ``worse`` count people, ``effect`` is the rank-biserial correlation.
+    ``difference`` is first minus second; ``better`` and ``worse`` count people; ``p_holm`` is ``p`` corrected for all
+    pairs; ``effect`` is the rank-biserial correlation.
+    """
+
+    first: str
+    second: str
+    difference: Summary
+    better: int
+    worse: int
+    p: float
+    effect: float | None
+    p_holm: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {**vars(self), "difference": self.difference.to_json()}
+
+
+def compare_pairs(names: Sequence[str], scores: ArrayLike) -> list[PairResult]:
+    """Compare all pairs of models on scores (people, models), person by person.
 
     Raises:
         BadInput: for fewer than two models or people.
@@ -84,28 +103,17 @@ def compare_pairs(names: Sequence[str], scores: ArrayLike) -> list[dict[str, Any
     table = np.asarray(scores, dtype=np.float64)
     if table.ndim != 2 or min(table.shape) < 2 or table.shape[1] != len(names):
         raise BadInput(f"A comparison needs the scores of at least 2 models on 2 people; got {table.shape}.")
-    rows: list[dict[str, Any]] = []
-    for i, j in combinations(range(len(names)), 2):
-        d = table[:, i] - table[:, j]
-        rows.append(
-            {
-                "first": names[i],
-                "second": names[j],
-                "difference": summary(d),
-                "better": int((d > 0).sum()),
-                "worse": int((d < 0).sum()),
-                "p": paired_permutation_test(d),
-                "effect": rank_biserial(d),
-            }
-        )
-    for row, p in zip(rows, holm([float(row["p"]) for row in rows]), strict=True):
-        row["p_holm"] = p
-    return rows
+    pairs = [(names[i], names[j], table[:, i] - table[:, j]) for i, j in combinations(range(len(names)), 2)]
+    p_values = [paired_permutation_test(d) for _, _, d in pairs]
+    return [
+        PairResult(first, second, summary(d), int((d > 0).sum()), int((d < 0).sum()), p, rank_biserial(d), corrected)
+        for (first, second, d), p, corrected in zip(pairs, p_values, holm(p_values), strict=True)
+    ]
 
 
-def cliques(names: Sequence[str], pairs: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
+def cliques(names: Sequence[str], pairs: Sequence[PairResult]) -> list[tuple[str, ...]]:
     """Return the longest runs of neighbours in ``names`` (ordered by rank) in which no two differ significantly."""
-    differ = {frozenset((row["first"], row["second"])) for row in pairs if row["p_holm"] < LEVEL}
+    differ = {frozenset((pair.first, pair.second)) for pair in pairs if pair.p_holm < LEVEL}
     runs: list[tuple[str, ...]] = []
     for start in range(len(names)):
         end = start + 1

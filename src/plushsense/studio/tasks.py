@@ -358,7 +358,7 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     bundle = done.save(free_path(out, done.bundle.to_bytes()))
     return {
         "bundle": str(bundle),
-        "scores": done.scores,
+        "scores": done.scores.to_json(),
         "seconds": round(done.seconds, 1),
         "parameters": done.bundle.arch.parameters,
         "title": done.bundle.arch.title,

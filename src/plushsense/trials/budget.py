@@ -23,6 +23,7 @@ from plushsense.core.errors import PlushSenseError, python_warning
 from plushsense.core.files import free_path, write_file
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
+from plushsense.evaluation.scores import Scores
 from plushsense.jobs.journal import job_id
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.bundle import Bundle
@@ -172,8 +173,8 @@ def learning_curve(points: Mapping[int, Mapping[str, float | None]], more: int =
     return {
         "points": [{"people": m, "accuracy": float(table[:, k].mean())} for k, m in enumerate(sizes)],
         "more": more,
-        "gain": gain["mean"],
-        "ci95": gain["ci95"],
+        "gain": gain.mean,
+        "ci95": None if gain.ci95 is None else list(gain.ci95),
     }
 
 
@@ -262,7 +263,7 @@ def make_network(
     )
     evaluation_s = time.monotonic() - started
     before += plan.folds - 1
-    points = {plan.trained_people: _accuracies(result.table)}
+    points = {plan.trained_people: _accuracies(result.scores)}
     for size in plan.sizes:
         share = size / plan.trained_people
         left_s = budget_s - (time.monotonic() - began)
@@ -270,7 +271,7 @@ def make_network(
             break
         reported = _folds(LEARNING_CURVE, before, plan, share, whole, bundle, progress)
         smaller = evaluate_run(run, training_people=size, progress=reported, warn=silent)
-        points[size] = _accuracies(smaller.table)
+        points[size] = _accuracies(smaller.scores)
         before += (plan.folds - 1) * share
     learning = learning_curve(points)
     if learning is not None:
@@ -365,8 +366,8 @@ def _folds(
     return fold_done
 
 
-def _accuracies(table: Mapping[str, Any]) -> dict[str, float | None]:
-    return {row["subject"]: row["accuracy"] for row in table["subjects"]}
+def _accuracies(scores: Scores) -> dict[str, float | None]:
+    return {row.subject: row.metrics["accuracy"] for row in scores.subjects}
 
 
 def _cut(plan: BudgetPlan, learning: object, seconds: float, budget_s: float) -> list[dict[str, Any]]:

@@ -27,7 +27,7 @@ from plushsense.evaluation.scores import gather_predictions, write_predictions
 from plushsense.jobs.journal import Result
 from plushsense.models.arch import parse_symbol, slashed
 from plushsense.reports.table import Column, Kind
-from plushsense.scoring.metrics import Counts, accuracy_complexity_ratio, class_rows, column_metrics
+from plushsense.scoring.metrics import Counts, accuracy_complexity_ratio, class_results, column_metrics
 from plushsense.trials.grid import CHOSEN, SECOND
 from plushsense.trials.plan import CURVE, Plan, PlannedRun, PlannedTrial, Scored, TrainingOutcome, outcome
 from plushsense.workflow.reporting import PREDICTIONS, machine
@@ -343,7 +343,10 @@ class Tables:
             "best_on_validation": chosen,
             "predictions": self.predictions,
             "confusions": {p.id: self._counts(p).tolist() for p in detailed},
-            "per_class": {p.id: class_rows(self._counts(p), self.plan.gestures.labels) for p in detailed},
+            "per_class": {
+                p.id: [row._asdict() for row in class_results(self._counts(p), self.plan.gestures.labels)]
+                for p in detailed
+            },
         }
 
     def write(self, results: Mapping[str, Result] | None = None) -> dict[str, Any]:

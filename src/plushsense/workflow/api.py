@@ -9,7 +9,7 @@ from contextlib import nullcontext
 from dataclasses import asdict, dataclass, fields, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -32,10 +32,10 @@ from plushsense.deploy.quantize import (
     quantize,
     refuse_undeployable,
 )
-from plushsense.evaluation.crossval import EpochProgress, Evaluation, FoldOutput
+from plushsense.evaluation.crossval import EpochProgress, EvaluationResult, FoldOutput
 from plushsense.evaluation.crossval import evaluate as crossvalidate
 from plushsense.evaluation.leakage import warn_of_copies
-from plushsense.evaluation.scores import FoldRecord, Predictions, gather_predictions, with_accuracy
+from plushsense.evaluation.scores import FoldRecord, PartResult, Predictions, Scores, gather_predictions, with_accuracy
 from plushsense.evaluation.scores import compute_scores as score_predictions
 from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possible
 from plushsense.jobs.progress import JobProgress
@@ -115,6 +115,53 @@ class TrainAndPredict:
         return FoldOutput(probabilities, fitted.history, fitted.seconds, fitted.best_epoch, deployed)
 
 
+class DeployedScores(NamedTuple):
+    """Scores of a network in 8 bits; ``agreement`` is the share of the windows with the answer of the float network."""
+
+    accuracy: float | None
+    macro_f1: float | None
+    agreement: float
+
+
+@dataclass(frozen=True)
+class TrainingScores:
+    """The scores of a training on what was held back.
+
+    Attributes:
+        split: how it was divided; description: what was held back, as a sentence.
+        windows: number of scored windows.
+        nobody: the accuracy on recordings of nobody, which do not count otherwise; None without them.
+        simulated: whether the data are those of a virtual toy.
+        int8: the scores in 8 bits; None where the network cannot be deployed.
+    """
+
+    split: str
+    leaky: bool
+    description: str
+    windows: int
+    accuracy: float | None
+    macro_f1: float | None
+    nobody: PartResult | None
+    best_epoch: int
+    simulated: bool
+    int8: DeployedScores | None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values for JSON, as bundles store them; the description has the key ``said``."""
+        return {
+            "split": self.split,
+            "leaky": self.leaky,
+            "said": self.description,
+            "windows": self.windows,
+            "accuracy": self.accuracy,
+            "macro_f1": self.macro_f1,
+            "nobody": None if self.nobody is None else self.nobody._asdict(),
+            "best_epoch": self.best_epoch,
+            "simulated": self.simulated,
+            "int8": None if self.int8 is None else self.int8._asdict(),
+        }
+
+
 @dataclass(frozen=True)
 class Trained:
     """A trained network: its ``bundle``, the ``history`` of its epochs, and its validation ``scores``.
@@ -125,7 +172,7 @@ class Trained:
 
     bundle: Bundle
     history: list[dict[str, Any]]
-    scores: dict[str, Any]
+    scores: TrainingScores
     seconds: float = 0.0
     generation: Generation | None = None
 
@@ -141,7 +188,7 @@ class Trained:
         return training_curves([self.history], title=self.bundle.arch.symbol)
 
     def __repr__(self) -> str:
-        return f"Trained({self.bundle!r}; {self.scores['said']})"
+        return f"Trained({self.bundle!r}; {self.scores.description})"
 
 
 def train(
@@ -196,47 +243,53 @@ def train(
     final = checked
     if division.refit:
         final = trainer.train(np.arange(len(made.windows)), scored.take(division.validation[:0]), what=REFIT)
-    fitted = checked.fitted
     predictions, scores = _validated(made, checked, warn)
-    bundle = Bundle(
-        arch=run.network,
-        weights=final.weights,
-        layout=dataset.layout,
-        scaler=final.fitted.scaler,
-        gestures=run.gestures,
-        windowing=_windowing(run),
-        decision=run.live.to_dict(),
-        provenance={
-            "dataset": dataset.head.name,
-            "dataset_hash": dataset.hash,
-            "simulated": dataset.head.simulated,
-            "subjects": sorted({str(s) for s in made.windows.subject[final.at]}),
-            "validation_subjects": sorted({str(s) for s in scored.subject[division.validation]}),
-            "split": division.kind,
-            "refit": division.refit,
-            "context": dict(sorted(Counter(made.windows.context.tolist()).items())),
-            "preset": run.preset,
-            "training": run.training.to_dict(),
-            "quantize_aware": quantize_aware,
-            "scores": scores,
-            "code_version": __version__,
-        },
-        calibration=final.ranges,
-    )
+    bundle = _bundle(made, final, scores, quantize_aware)
     if fit_decisions:
-        reader = replace(bundle, weights=checked.weights, scaler=fitted.scaler)
+        reader = replace(bundle, weights=checked.weights, scaler=checked.fitted.scaler)
         bundle = replace(bundle, decision=_decisions(reader, dataset, run.live, warn))
     if division.refit:
         _keep_predictions(bundle, dataset, predictions)
     trainer.discard()
     # `forget` cannot find an unsaved bundle: raise an error if a person was removed during the training.
     dataset.generation.check()
-    history = with_accuracy(fitted.history, division.split.separates_people)
+    history = with_accuracy(checked.fitted.history, division.split.separates_people)
     seconds = checked.seconds + (final.seconds if division.refit else 0.0)
     return Trained(bundle, history, scores, seconds, dataset.generation)
 
 
-def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> tuple[Predictions, dict[str, Any]]:
+def _bundle(made: PreparedTraining, final: TrainedNetwork, scores: TrainingScores, quantize_aware: int) -> Bundle:
+    """Return the bundle of a trained network, with the decision settings that were given."""
+    run, division = made.run, made.division
+    anywhere = {"anywhere": asdict(run.anywhere)} if run.windows.context == ANYWHERE else {}
+    return Bundle(
+        arch=run.network,
+        weights=final.weights,
+        layout=run.dataset.layout,
+        scaler=final.fitted.scaler,
+        gestures=run.gestures,
+        windowing={**asdict(run.windows), **anywhere},
+        decision=run.live.to_dict(),
+        provenance={
+            "dataset": run.dataset.head.name,
+            "dataset_hash": run.dataset.hash,
+            "simulated": run.dataset.head.simulated,
+            "subjects": sorted({str(s) for s in made.windows.subject[final.at]}),
+            "validation_subjects": sorted({str(s) for s in made.scored.subject[division.validation]}),
+            "split": division.kind,
+            "refit": division.refit,
+            "context": dict(sorted(Counter(made.windows.context.tolist()).items())),
+            "preset": run.preset,
+            "training": run.training.to_dict(),
+            "quantize_aware": quantize_aware,
+            "scores": scores.to_json(),
+            "code_version": __version__,
+        },
+        calibration=final.ranges,
+    )
+
+
+def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> tuple[Predictions, TrainingScores]:
     """Return the predictions for the validation windows, and their scores; also those in 8 bits if there are ranges.
 
     ``warn`` gets a sentence if 8-bit arithmetic changes many predictions.
@@ -248,35 +301,35 @@ def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> t
     sizes = (len(trained.at), len(division.validation), len(test))
     record = FoldRecord(division.fold.name, division.fold.subjects, sizes, len(fitted.history), fitted.seconds)
 
-    def score(probabilities: NDArray[np.float32]) -> tuple[Predictions, dict[str, Any], dict[str, Any]]:
+    def score(probabilities: NDArray[np.float32]) -> tuple[Predictions, Scores]:
         predictions = gather_predictions(made.scored, [(division.fold.name, division.fold.test)], [probabilities])
-        found = score_predictions(predictions, [record], made.scored.affects, division.split.separates_people)
-        return predictions, {name: found[name]["mean"] for name in ("accuracy", "macro_f1")}, found["nobody"]
+        apart = division.split.separates_people
+        return predictions, score_predictions(predictions, [record], made.scored.affects, apart)
 
-    answers = predict(run.network, trained.weights, fitted.scaler, test, run.training.device)
-    predictions, means, nobody = score(answers)
-    scores: dict[str, Any] = {
-        "split": division.kind,
-        "leaky": division.split.leaky,
-        "said": division.description,
-        "windows": len(test),
-        **means,
-        "nobody": nobody,
-        "best_epoch": fitted.best_epoch,
-        "simulated": run.dataset.head.simulated,
-        "int8": None,
-    }
+    predictions, found = score(predict(run.network, trained.weights, fitted.scaler, test, run.training.device))
+    int8 = None
     if trained.ranges:
         integer = quantize(run.network, trained.weights, fitted.scaler, Ranges.from_dict(trained.ranges))
-        deployed, means, _ = score(integer_probabilities(integer, test.integers))
+        deployed, after = score(integer_probabilities(integer, test.integers))
         agreement = float((deployed.predicted == predictions.predicted).mean())
-        scores["int8"] = {**means, "agreement": agreement}
+        int8 = DeployedScores(after.mean("accuracy"), after.mean("macro_f1"), agreement)
         if agreement < _AGREEMENT:
             advice = "more epochs of --quantize-aware" if trained.tuned else "--quantize-aware 10"
             changed = 100 * (1 - agreement)
             sentence = f"8 bits change {changed:.1f} % of the answers on the validation windows: try {advice}"
             warn(Sentence(sentence, "bits_change", percent=changed))
-    return predictions, scores
+    return predictions, TrainingScores(
+        split=division.kind,
+        leaky=division.split.leaky,
+        description=division.description,
+        windows=len(test),
+        accuracy=found.mean("accuracy"),
+        macro_f1=found.mean("macro_f1"),
+        nobody=found.nobody,
+        best_epoch=fitted.best_epoch,
+        simulated=run.dataset.head.simulated,
+        int8=int8,
+    )
 
 
 def _reporting(progress: EpochProgress | None, apart: bool) -> EpochProgress:
@@ -318,12 +371,6 @@ def _keep_predictions(bundle: Bundle, dataset: Dataset, predictions: Predictions
     keep_if_possible(journal, _predictions_id(bundle), {**vars(predictions)})
 
 
-def _windowing(run: Run) -> dict[str, Any]:
-    """Return the window settings as a bundle stores them."""
-    anywhere = {"anywhere": asdict(run.anywhere)} if run.windows.context == ANYWHERE else {}
-    return {**asdict(run.windows), **anywhere}
-
-
 def evaluate(
     dataset: Dataset | str | os.PathLike[str],
     config: RunConfig | None = None,
@@ -339,7 +386,7 @@ def evaluate(
     progress: Callable[[JobProgress], None] | None = None,
     warn: Warn = python_warning,
     **settings: Any,
-) -> Evaluation:
+) -> EvaluationResult:
     """Train and score one network for each fold of ``split``.
 
     Finished folds are stored in the data set's ``cache`` folder, so that an interrupted evaluation can be resumed.
@@ -378,7 +425,7 @@ def evaluate_run(
     training_people: int | None = None,
     progress: Callable[[JobProgress], None] | None = None,
     warn: Warn = python_warning,
-) -> Evaluation:
+) -> EvaluationResult:
     """Train and score one network for each fold of a prepared run; the arguments are those of `evaluate`."""
     refuse_hard_negatives(run)
     if out is not None:
@@ -413,7 +460,7 @@ def evaluate_run(
         shared_rows=copied_recordings(run.dataset, score.recording_ids),
         progress=progress,
     )
-    warn_of_copies(result.table["leakage"], warn)
+    warn_of_copies(result.leakage, warn)
     if out is not None:
         with run.dataset.generation.writing():
             save_evaluation(result, run, Path(out))

@@ -16,7 +16,7 @@ from plushsense.core.version import __version__
 from plushsense.dataset.files import CACHE
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
-from plushsense.evaluation.crossval import Evaluation
+from plushsense.evaluation.crossval import EvaluationResult
 from plushsense.jobs.journal import Journal
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
@@ -124,14 +124,14 @@ def check_place(out: Path, run: Run, *, replace: bool = False) -> None:
     )
 
 
-def save_evaluation(result: Evaluation, run: Run, out: Path) -> Path:
+def save_evaluation(result: EvaluationResult, run: Run, out: Path) -> Path:
     """Write ``predictions.parquet`` and ``evaluation.json`` (scores, data set, network, settings) to a folder."""
     out.mkdir(parents=True, exist_ok=True)
     # `forget` finds the people in the scores, so that new predictions must never lie beside scores of other people.
     (out / SCORES).unlink(missing_ok=True)
     result.write_predictions(out / PREDICTIONS)
     content = {
-        **result.to_dict(),
+        **result.to_json(),
         "predictions": PREDICTIONS,
         "id": run.id,
         "simulated": run.dataset.head.simulated,
@@ -147,7 +147,7 @@ def save_evaluation(result: Evaluation, run: Run, out: Path) -> Path:
     return path
 
 
-def evaluation_title(result: Evaluation, run: Run) -> str:
+def evaluation_title(result: EvaluationResult, run: Run) -> str:
     """Return a title with network, split, contexts, preset, seed, and the settings that differ from the preset's."""
     context = f"{result.context} context"
     if result.train_context != result.context:
@@ -183,7 +183,7 @@ def card(arch: Arch, **more: Any) -> dict[str, Any]:
 def write_report(
     path: str | os.PathLike[str],
     dataset: Dataset | str | os.PathLike[str],
-    evaluations: Sequence[Evaluation | Mapping[str, Any] | str | os.PathLike[str]] = (),
+    evaluations: Sequence[EvaluationResult | Mapping[str, Any] | str | os.PathLike[str]] = (),
     models: Sequence[Bundle | str | os.PathLike[str]] = (),
     title: str | None = None,
     *,
@@ -273,9 +273,9 @@ def _learning(path: Path) -> dict[str, Any] | None:
     return table if isinstance(table, dict) else None
 
 
-def _evaluation_table(source: Evaluation | Mapping[str, Any] | str | os.PathLike[str]) -> dict[str, Any]:
-    if isinstance(source, Evaluation):
-        return source.to_dict()
+def _evaluation_table(source: EvaluationResult | Mapping[str, Any] | str | os.PathLike[str]) -> dict[str, Any]:
+    if isinstance(source, EvaluationResult):
+        return source.to_json()
     table = dict(source) if isinstance(source, Mapping) else load_evaluation(source)
     # The title names the network, and the model card shows its numbers.
     table.pop("model", None)

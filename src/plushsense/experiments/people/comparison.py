@@ -63,7 +63,7 @@ def compare(
         of = [{row["subject"]: row for row in table["subjects"]} for table in tables]
     else:
         _require_same_recordings(folders, predictions)
-        of = [votes_by_person(each) for each in predictions]
+        of = [{p: vote.metrics for p, vote in votes_by_person(each).items()} for each in predictions]
     people = sorted(set.intersection(*(set(rows) for rows in of)))
     if len(people) < 2:
         raise BadInput("The evaluations have fewer than two people in common, so nothing can be paired.")
@@ -80,7 +80,7 @@ def compare(
             "parameters": table["model"]["parameters"],
             "folder": str(folder),
             "seeds": table["seeds"],
-            **{key: summary(scores[key][:, i]) for key in keys},
+            **{key: summary(scores[key][:, i]).to_json() for key in keys},
             "rank": {key: float(ranks[key][i]) for key in keys},
             "calibration": calibration_of(predictions[i]),
         }
@@ -91,7 +91,7 @@ def compare(
     ordered = {key: [m["name"] for m in sorted(models, key=lambda m: m["rank"][key])] for key in keys}
     result = {
         "models": models,
-        "pairs": pairs,
+        "pairs": {key: [pair.to_json() for pair in found] for key, found in pairs.items()},
         "cliques": {key: cliques(ordered[key], pairs[key]) for key in keys},
         "people": [
             {"subject": p, **{n: {key: float(scores[key][i, j]) for key in keys} for j, n in enumerate(names)}}

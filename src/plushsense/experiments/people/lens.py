@@ -20,7 +20,7 @@ from plushsense.core.gestures import NOBODY
 from plushsense.core.version import __version__
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset, read_people
-from plushsense.evaluation.crossval import Evaluation
+from plushsense.evaluation.crossval import EvaluationResult
 from plushsense.evaluation.scores import Predictions
 from plushsense.experiments.people.traits import measure_people, trait_correlations, unusual_traits
 from plushsense.jobs.journal import job_id
@@ -118,21 +118,23 @@ def lens_id(run: Run, splits: Sequence[str]) -> str:
     return job_id({"lens": outcome, "data": run.dataset.hash})
 
 
-def _split_row(done: Evaluation) -> dict[str, Any]:
+def _split_row(done: EvaluationResult) -> dict[str, Any]:
     """Return the scores of an evaluation with means over its people, whatever the split."""
-    table = done.table
-    people = table["subjects"]
+    scores, people = done.scores, done.scores.subjects
     return {
         "split": done.split.text,
         "leaky": done.split.leaky,
         "apart": done.split.separates_people,
-        "folds": len(table["folds"]),
-        "train_windows": round(np.mean([f["train_windows"] for f in table["folds"]])),
+        "folds": len(scores.folds),
+        "train_windows": round(np.mean([fold.record.windows[0] for fold in scores.folds])),
         "people": len(people),
-        **{key: summary([row[key] for row in people if row[key] is not None]) for key in column_metrics()},
-        "by_recording": table["by_recording"],
-        "pooled": table["pooled"],
-        "leakage": table["leakage"],
+        **{
+            key: summary([at for row in people if (at := row.metrics[key]) is not None]).to_json()
+            for key in column_metrics()
+        },
+        "by_recording": scores.by_recording.to_json(),
+        "pooled": scores.pooled,
+        "leakage": done.leakage,
     }
 
 
@@ -155,7 +157,7 @@ def calibration_of(predictions: Predictions) -> dict[str, Any]:
 
 
 def people_of(
-    done: Evaluation, measured: Mapping[str, Mapping[str, float | None]], dataset: Dataset
+    done: EvaluationResult, measured: Mapping[str, Mapping[str, float | None]], dataset: Dataset
 ) -> list[dict[str, Any]]:
     """Describe each person of an evaluation, the worst read first.
 
@@ -168,8 +170,8 @@ def people_of(
     files = read_people(dataset.path)
     unusual = unusual_traits(measured)
     rows = []
-    for row in done.table["subjects"]:
-        name = row["subject"]
+    for row in done.scores.subjects:
+        name = row.subject
         mine = predictions.subject == name
         counts = confusion(predictions.truth[mine], predictions.predicted[mine], len(labels))
         recall, made = class_scores(counts).recall, counts.sum(axis=1)
@@ -186,7 +188,7 @@ def people_of(
             known = {"age_group": person.age_group, "gender": person.gender, **person.more}
         rows.append(
             {
-                **row,
+                **row.to_json(),
                 "known": {key: value for key, value in known.items() if value},
                 "traits": dict(measured.get(name, {})),
                 "unusual": unusual.get(name, []),

@@ -365,8 +365,8 @@ def _outcome(folds: Folds, name: str, how: str) -> dict[str, Any]:
             level: [round(float(q), 3) for q in np.quantile(values, LATENCY_SHARES)] if values else []
             for level, values in latencies.items()
         },
-        "f1_people": summary([p["f1"] for p in people if p["f1"] is not None]),
-        "recall_people": summary([p["recall"] for p in people if p["recall"] is not None]),
+        "f1_people": summary([p["f1"] for p in people if p["f1"] is not None]).to_json(),
+        "recall_people": summary([p["recall"] for p in people if p["recall"] is not None]).to_json(),
         "people": sorted(people, key=lambda p: p["subject"]),
     }
 
