@@ -31,13 +31,13 @@ import plushsense as ps
 from plushsense.core import layouts
 from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.store import HEAD, Dataset, RecordingInfo
-from plushsense.evaluation.crossval import EpochProgress, FoldOutput, evaluate
+from plushsense.evaluation.crossval import FoldOutput, evaluate
 from plushsense.evaluation.scores import Scores
 from plushsense.jobs.journal import Journal
 from plushsense.models.arch import Arch
 from plushsense.scoring.splits import parse_split
 from plushsense.training.fit import fit, predict
-from plushsense.training.spec import TrainSpec
+from plushsense.training.spec import EpochProgress, TrainSpec
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.config import from_settings
 from plushsense.workflow.preparation import prepare

@@ -35,6 +35,7 @@ from plushsense.jobs.study import StudyPart, run_study
 from plushsense.scoring import metrics
 from plushsense.scoring.metrics import Summary
 from plushsense.scoring.splits import Fold, Index, Split, make_folds, purge
+from plushsense.training.spec import EpochProgress, EpochRow
 from plushsense.windows.cut import WindowSet
 
 # Part of every job's id: raise it when the meaning of a stored fold changes.
@@ -142,13 +143,10 @@ class FoldOutput:
     """
 
     probabilities: NDArray[np.float32]
-    history: list[dict[str, Any]] = field(default_factory=list)
+    history: list[EpochRow] = field(default_factory=list)
     seconds: float = 0.0
     best_epoch: int = 0
     deployed: NDArray[np.float32] | None = None
-
-
-EpochProgress = Callable[[int, int, dict[str, Any]], None]
 
 
 class FitPredict(Protocol):
@@ -177,7 +175,7 @@ class EvaluationResult:
     leakage: dict[str, Any]
     self_calibration: str
     int8: DeployedResult | None
-    histories: list[list[dict[str, Any]]]
+    histories: list[list[EpochRow]]
     predictions: Predictions
     predictions_path: Path | None = None
 
@@ -259,6 +257,19 @@ def evaluate(
         spec=JobsSpec(workers, journal=journal, cluster=cluster),
         progress=progress,
     )
+    return _result(outcomes, folds, train_windows, score_windows, split, seed, shared_rows)
+
+
+def _result(
+    outcomes: Sequence[Result],
+    folds: Sequence[Fold],
+    train_windows: WindowSet,
+    score_windows: WindowSet,
+    split: Split,
+    seed: int,
+    shared_rows: Collection[tuple[str, str]],
+) -> EvaluationResult:
+    """Score the outcomes of all folds."""
     records = [
         FoldRecord(
             fold.name,
@@ -301,7 +312,7 @@ class _FoldWork:
         train, score = shared
         score = train if score is None else score
 
-        def progress(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+        def progress(epoch: int, epochs: int, row: EpochRow) -> None:
             report((epoch, epochs, row))
 
         out = self.fit_predict(train.take(task.train), train.take(task.validation), score.take(task.test), progress)

@@ -7,7 +7,7 @@ Every figure of a result is one of these two, and is called *mean* or *pooled*.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +21,7 @@ from plushsense.core.gestures import NOBODY
 from plushsense.scoring import metrics
 from plushsense.scoring.metrics import ClassResult, Counts, Summary
 from plushsense.scoring.splits import Index
+from plushsense.training.spec import EpochRow
 from plushsense.windows.cut import WindowSet
 
 _P = "p_"
@@ -132,10 +133,12 @@ def read_predictions(path: str | Path) -> Predictions:
         raise BadInput(f"'{path}' holds no predictions of an evaluation ({cause}): evaluate again.") from None
 
 
-def with_accuracy(history: Iterable[Mapping[str, Any]], apart: bool) -> list[dict[str, Any]]:
+def with_accuracy(history: Iterable[EpochRow], apart: bool) -> list[EpochRow]:
     """Return the epochs of a training with ``accuracy``, that of validation as `compute_scores` counts it."""
-    key = "validation_accuracy_people" if apart else "validation_accuracy"
-    return [{**row, "accuracy": row.get(key)} for row in history]
+    return [
+        {**row, "accuracy": row.get("validation_accuracy_people") if apart else row.get("validation_accuracy")}
+        for row in history
+    ]
 
 
 def votes_by_person(predictions: Predictions) -> dict[str, VoteResult]:

@@ -41,6 +41,7 @@ from plushsense.deploy.proof.verify import verify
 from plushsense.jobs.progress import JobProgress
 from plushsense.studio.app.jobs import UNFINISHED
 from plushsense.studio.pages.export.exports import folder_digest
+from plushsense.training.spec import EpochRow
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import simulate, train, unfinished
 from plushsense.workflow.config import from_settings
@@ -335,7 +336,7 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     first = epochs if config.windows.context == ANYWHERE and config.anywhere.hard_share > 0 else 0
     each, again = first + epochs + tuning, refits(config, count_people(open_dataset(spec["dataset"])))
 
-    def epoch(at: int, of: int, row: dict[str, Any]) -> None:
+    def epoch(at: int, of: int, row: EpochRow) -> None:
         what = str(row.get("what", ""))
         second, part = what.startswith(REFIT), what.removeprefix(REFIT).lstrip(", ")
         past = {"": first, FIRST_NETWORK: 0}.get(part, first + epochs)

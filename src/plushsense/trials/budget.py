@@ -28,6 +28,7 @@ from plushsense.jobs.journal import job_id
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.bundle import Bundle
 from plushsense.scoring.metrics import summary
+from plushsense.training.spec import EpochRow
 from plushsense.trials.estimate import preview_evaluation
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import evaluate_run, train, unfinished
@@ -345,10 +346,10 @@ def _train(
 ) -> tuple[Path, float]:
     """Train the network and save it; return its path, and the seconds that one training on everybody took."""
 
-    def epoch_done(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+    def epoch_done(epoch: int, epochs: int, row: EpochRow) -> None:
         second = str(row.get("what", "")).startswith(REFIT)
         done = epoch / epochs + second
-        progress(BudgetProgress(TRAINING, done / whole, row | {"epoch": epoch, "epochs": epochs}))
+        progress(BudgetProgress(TRAINING, done / whole, {**row, "epoch": epoch, "epochs": epochs}))
         if epoch == epochs and second == again:
             progress(BudgetProgress(DECIDING, done / whole, {}))
 

@@ -367,7 +367,8 @@ class TrainAndScore:
             read = predict(task.arch, weights, fitted.scaler, validation, task.spec.device).argmax(axis=1)
             counts = metrics.confusion(validation.y, read.astype(np.int64), len(validation.labels))
             watched.append((metrics.accuracy(counts), metrics.macro_f1(counts)))
-        history = [] if fitted is None else fitted.history
+        rows: list[dict[str, Any]] = [] if fitted is None else [dict(row) for row in fitted.history]
+        curve = [[row[name] for name in CURVE] for row in rows]
         result: Result = {
             "epochs": list(epochs_left),
             "at": list(epochs_left) if task.nested or fitted is None else [fitted.best_epoch],
@@ -375,7 +376,7 @@ class TrainAndScore:
                 len(epochs_left), len(test), len(windows.labels)
             ),
             "validation": np.array(watched, dtype=np.float64).reshape(-1, 2),
-            "curve": np.array([[row[name] for name in CURVE] for row in history], np.float64).reshape(-1, len(CURVE)),
+            "curve": np.array(curve, np.float64).reshape(-1, len(CURVE)),
             "seconds": 0 if fitted is None else task.spent_s + fitted.seconds,
             "failed": failed,
         }

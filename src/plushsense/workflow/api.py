@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, fields, replace
 from hashlib import sha256
@@ -32,7 +32,7 @@ from plushsense.deploy.quantize import (
     quantize,
     refuse_undeployable,
 )
-from plushsense.evaluation.crossval import EpochProgress, EvaluationResult, FoldOutput
+from plushsense.evaluation.crossval import EvaluationResult, FoldOutput
 from plushsense.evaluation.crossval import evaluate as crossvalidate
 from plushsense.evaluation.leakage import warn_of_copies
 from plushsense.evaluation.scores import FoldRecord, PartResult, Predictions, Scores, gather_predictions, with_accuracy
@@ -43,7 +43,7 @@ from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle, is_training_content, known_people
 from plushsense.models.reference import softmax
 from plushsense.runtime.decisions import DecideSpec
-from plushsense.training.spec import TrainSpec
+from plushsense.training.spec import EpochProgress, EpochRow, TrainSpec
 from plushsense.tuning.decisions import fit_decisions as fit_on_people
 from plushsense.windows.cut import ANYWHERE, WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
@@ -171,7 +171,7 @@ class Trained:
     """
 
     bundle: Bundle
-    history: list[dict[str, Any]]
+    history: list[EpochRow]
     scores: TrainingScores
     seconds: float = 0.0
     generation: Generation | None = None
@@ -195,8 +195,6 @@ def train(
     dataset: Dataset | str | os.PathLike[str],
     config: RunConfig | None = None,
     *,
-    arch: str | None = None,
-    filters: Sequence[int] | str | None = None,
     quantize_aware: int = 0,
     fit_decisions: bool = True,
     journal: Journal | None = None,
@@ -215,8 +213,8 @@ def train(
     those of whole gestures with the real signal before them.
 
     Args:
-        config: resolved settings; alternatively give ``arch``, ``filters`` and settings such as ``preset="loso"``,
-            ``context="loop"``, ``epochs=20``, ``seed=1``, ``classes="all"``, ``padding``, ``norm``.
+        config: settings; alternatively give them by name (see `from_settings`): ``arch``, ``filters``,
+            ``preset="loso"``, ``context="loop"``, ``epochs=20``, ``seed=1``, ``classes="all"``, ``padding``, ``norm``.
         quantize_aware: epochs of fine-tuning for 8 bits after the training (see `training.quantized`).
         fit_decisions: also fit the decision settings on the validation people (see `tuning.decisions`). Settings in
             ``config.live`` that differ from the defaults are kept.
@@ -229,20 +227,17 @@ def train(
         warn: called with a sentence for everything that is left out, and if 8-bit arithmetic changes many predictions;
             by default, they are Python warnings (`PlushSenseWarning`).
     """
-    given = config or from_settings(arch=arch, filters=filters, **settings)
     if quantize_aware < 0:
         raise ConfigError(f"quantize_aware is {quantize_aware}: accepted are 0 (off) and more epochs.")
-    made = prepare_training(dataset, given, warn, deployable=quantize_aware > 0)
-    run, scored, division = made.run, made.scored, made.division
-    dataset = run.dataset
+    made = prepare_training(dataset, config or from_settings(**settings), warn, deployable=quantize_aware > 0)
+    run, scored, division, dataset = made.run, made.scored, made.division, made.run.dataset
     trainer = NetworkTrainer(
         run, made.windows, division.kind == WHOLE_PEOPLE, quantize_aware, journal,
         _reporting(progress, division.split.separates_people),
     )  # fmt: skip
     checked = trainer.train(division.train, scored.take(division.validation), division.fold.subjects)
-    final = checked
-    if division.refit:
-        final = trainer.train(np.arange(len(made.windows)), scored.take(division.validation[:0]), what=REFIT)
+    nothing, everything = scored.take(division.validation[:0]), np.arange(len(made.windows))
+    final = trainer.train(everything, nothing, what=REFIT) if division.refit else checked
     predictions, scores = _validated(made, checked, warn)
     bundle = _bundle(made, final, scores, quantize_aware)
     if fit_decisions:
@@ -335,7 +330,7 @@ def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> t
 def _reporting(progress: EpochProgress | None, apart: bool) -> EpochProgress:
     """Return a callback for the epochs of a training, which adds ``accuracy`` to their rows."""
 
-    def report(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+    def report(epoch: int, epochs: int, row: EpochRow) -> None:
         if progress is not None:
             progress(epoch, epochs, with_accuracy([row], apart)[0])
 
@@ -376,8 +371,6 @@ def evaluate(
     config: RunConfig | None = None,
     *,
     split: str | None = None,
-    arch: str | None = None,
-    filters: Sequence[int] | str | None = None,
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     cluster: str | None = None,
@@ -392,7 +385,7 @@ def evaluate(
     Finished folds are stored in the data set's ``cache`` folder, so that an interrupted evaluation can be resumed.
 
     Args:
-        config, arch, filters, settings, warn: as for `train`; also ``train_context`` and ``workers``.
+        config, settings, warn: as for `train`; also ``train_context`` and ``workers``.
         split: "leave-one-subject-out" (default), "by-subject:5", "by-recording:5", "windows:5" (leaky).
         out: a folder for ``evaluation.json`` and ``predictions.parquet``. A folder with an evaluation of other settings
             or data is refused unless ``overwrite``.
@@ -401,7 +394,7 @@ def evaluate(
             stored without it are trained again.
         training_people: train each fold on so many of its people only, for a learning curve; not with ``out``.
     """
-    given = config or from_settings(arch=arch, filters=filters, **settings)
+    given = config or from_settings(**settings)
     run = prepare(dataset, given if split is None else given.for_split(split), warn)
     return evaluate_run(
         run,

@@ -189,12 +189,7 @@ def publish_dataset(
     check_output_folder(dataset, folder, repeatable=key is not None)
     secret = secrets.token_bytes(_KEY_BYTES) if key is None else _read_key(Path(key), dataset.path, folder)
     options = PublishOptions(streams, excluded, columns, secret)
-    tested = None
-    if reidentification:
-        steps = (lambda done, total: progress("recognising people", done, total)) if progress else None
-        result = reidentify(dataset, seed=seed, progress=steps).under(public_codes(dataset), public_labels(dataset))
-        command = f"plushsense publish DATASET OUT --seed {seed}"
-        tested = Reidentification(report(result, command), verdict(result), result.to_dict())
+    tested = _reidentified(dataset, seed, progress) if reidentification else None
     done = publish(
         dataset,
         folder,
@@ -206,16 +201,26 @@ def publish_dataset(
         progress=progress,
     )
     if save:
-        try:
-            change_head(
-                dataset.path, lambda now: replace(now, licence=head.licence, consent=head.consent, about=head.about)
-            )
-        except DatasetError as cause:
-            # The package is complete: this is only a warning.
-            why = cause.values.get("why", str(cause))
-            message = f"licence, contact and consent could not be written into '{dataset.path}': {why}"
-            done.warnings.append(Sentence(message, "statements_not_kept", why=why))
+        _keep_statements(dataset.path, head, done)
     return done
+
+
+def _reidentified(dataset: Dataset, seed: int, progress: StageProgress | None) -> Reidentification:
+    """Test whether the people of a data set can be recognised, under their published codes."""
+    steps = (lambda done, total: progress("recognising people", done, total)) if progress else None
+    result = reidentify(dataset, seed=seed, progress=steps).under(public_codes(dataset), public_labels(dataset))
+    command = f"plushsense publish DATASET OUT --seed {seed}"
+    return Reidentification(report(result, command), verdict(result), result.to_dict())
+
+
+def _keep_statements(folder: Path, head: DatasetHead, done: PublishResult) -> None:
+    """Write licence, contact and consent into the data set; add a warning to ``done`` if that fails."""
+    try:
+        change_head(folder, lambda now: replace(now, licence=head.licence, consent=head.consent, about=head.about))
+    except DatasetError as cause:
+        why = cause.values.get("why", str(cause))
+        message = f"licence, contact and consent could not be written into '{folder}': {why}"
+        done.warnings.append(Sentence(message, "statements_not_kept", why=why))
 
 
 def _read_key(path: Path, *beside: Path) -> bytes:

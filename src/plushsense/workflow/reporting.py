@@ -207,19 +207,31 @@ def write_report(
     dataset = as_dataset(dataset)
     summary = dataset.summary()
     bundles = [b if isinstance(b, Bundle) else Bundle.load(Path(b)) for b in models]
-    cards = [
-        card(
-            b.arch,
-            rate_hz=b.layout.rate_hz,
-            name=str(b.provenance.get("name", f"{b.arch.symbol} trained on {b.provenance.get('dataset', '?')}"))
-            + (f", adapted to {b.adapted_to}" if b.personal else ""),
-            provenance=dict(b.provenance),
+    pictures = describe_recordings(dataset, recording) if recordings else None
+    with dataset.generation.writing():
+        return write_evaluation_report(
+            Path(path),
+            title=title or f"PlushSense: {summary['name']}",
+            dataset=_properties(summary, dataset.layout.title),
+            evaluations=[_evaluation_table(e) for e in evaluations],
+            models=[_bundle_card(b) for b in bundles],
+            simulated=bool(summary["simulated"]),
+            recordings=pictures,
         )
-        for b in bundles
-    ]
-    properties = {
+
+
+def _bundle_card(bundle: Bundle) -> dict[str, Any]:
+    provenance = dict(bundle.provenance)
+    name = str(provenance.get("name", f"{bundle.arch.symbol} trained on {provenance.get('dataset', '?')}"))
+    adapted = f", adapted to {bundle.adapted_to}" if bundle.personal else ""
+    return card(bundle.arch, rate_hz=bundle.layout.rate_hz, name=name + adapted, provenance=provenance)
+
+
+def _properties(summary: Mapping[str, Any], layout: str) -> dict[str, Any]:
+    """Return the facts of a data set that a report lists."""
+    return {
         "name": summary["name"],
-        "layout": dataset.layout.title,
+        "layout": layout,
         "subjects": summary["subjects"],
         "recordings": summary["recordings"],
         "gestures": [f"{g['label']} ({g['recordings']})" for g in summary["gestures"]],
@@ -230,17 +242,6 @@ def write_report(
         "licence": summary["licence"],
         "hash": summary["hash"],
     }
-    pictures = describe_recordings(dataset, recording) if recordings else None
-    with dataset.generation.writing():
-        return write_evaluation_report(
-            Path(path),
-            title=title or f"PlushSense: {summary['name']}",
-            dataset=properties,
-            evaluations=[_evaluation_table(e) for e in evaluations],
-            models=cards,
-            simulated=bool(summary["simulated"]),
-            recordings=pictures,
-        )
 
 
 def load_evaluation(source: str | os.PathLike[str]) -> dict[str, Any]:

@@ -43,7 +43,6 @@ from plushsense.experiments.streams.replay import (
     truth_of,
 )
 from plushsense.experiments.streams.score import (
-    EpochReport,
     Fitted,
     PeopleFold,
     Settings,
@@ -60,7 +59,7 @@ from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle, known_people, trained_people
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.events import LATE_S
-from plushsense.training.spec import TrainSpec
+from plushsense.training.spec import EpochProgress, TrainSpec
 from plushsense.tuning.gate import GateSpec, fit_gate
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
@@ -109,14 +108,14 @@ class TrainStreams:
     gate: bool
     folder: Path
 
-    def __call__(self, dataset: Dataset, fold: PeopleFold, progress: EpochReport, /) -> Fitted:
+    def __call__(self, dataset: Dataset, fold: PeopleFold, progress: EpochProgress, /) -> Fitted:
         networks = {name: self._network(recipe, dataset, fold, progress) for name, recipe in self.recipes.items()}
         if not self.gate:
             return Fitted(networks)
         fitted = fit_gate(dataset, next(iter(networks.values())).gestures, fold.train)
         return Fitted(networks, fitted.settings, {"gate": fitted.report, "plan": asdict(fitted.settings)})
 
-    def _network(self, recipe: Recipe, dataset: Dataset, fold: PeopleFold, progress: EpochReport) -> Bundle:
+    def _network(self, recipe: Recipe, dataset: Dataset, fold: PeopleFold, progress: EpochProgress) -> Bundle:
         path = self.folder / f"{job_id({**recipe.key(), 'data': dataset.hash, 'fold': vars(fold)})}.plush"
         if path.is_file():
             return Bundle.load(path)

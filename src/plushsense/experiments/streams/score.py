@@ -51,6 +51,7 @@ from plushsense.runtime.gate import GateSettings
 from plushsense.scoring.events import LATE_S, ErrorCosts, at_recall
 from plushsense.scoring.metrics import BOOTSTRAP_SEED, summary
 from plushsense.scoring.splits import make_folds, parse_split
+from plushsense.training.spec import EpochProgress, EpochRow
 
 # Part of every job's id: increase it when the meaning of a stored fold changes.
 _VERSION = 5
@@ -80,8 +81,7 @@ class Fitted:
     report: Mapping[str, Any] = field(default_factory=dict)
 
 
-EpochReport = Callable[[int, int, dict[str, Any]], None]
-FitStreams = Callable[[Dataset, PeopleFold, EpochReport], Fitted]
+FitStreams = Callable[[Dataset, PeopleFold, EpochProgress], Fitted]
 """A function that fits networks and gate to the training people of a fold; the validation people may stop it early.
 
 It must be picklable and deterministic, must not use the test people, and calls its last argument with (epoch, maximum
@@ -189,7 +189,7 @@ class _FoldWork:
     def __call__(self, shared: Any, task: PeopleFold, report: Report, /) -> Result:
         began = time.perf_counter()
 
-        def progress(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+        def progress(epoch: int, epochs: int, row: EpochRow) -> None:
             report((epoch, epochs))
 
         fitted = self.fit(shared, task, progress)
