@@ -207,7 +207,6 @@ BAD = [
     (["merge", "{ds}", "{ds}", "--out", "{tmp}/set.toml"], "give --merges or --groups"),
     (["train", "{ds}", "--seed", "4294967296"], "accepted are whole numbers from 0 to 4294967295"),
     (["sweep", "{ds}", "--seeds", "1001", "--dry-run"], "accepted are 1 to 1000"),
-    (["abstain", "{ds}", "--coverage", "nan"], "accepted is between 0 and 1"),
     (["trian"], "Did you mean 'train'?"),
     (["import", "{recordings}", "{tmp}/x", "--layout", "plush-15"], "has 5 columns, but a file of layout 'plush-15'"),
     (["import", "{recordings}", "{tmp}/x", "--layout", "accel3"], "Did you mean 'accel-3'?"),
@@ -264,7 +263,7 @@ def test_bad_input_is_one_sentence_and_status_2(
         ),
         (
             ["merge", "DS", "DS", "--merges", "1", "--out", "FILE"],
-            "experiments.people.merging.load_evaluation",
+            "experiments.analysis.merging.load_evaluation",
             "is not a gesture set",
         ),
         (["toy", "--tcp", "0", "--truth", "FILE"], "devices.virtual.server.ToyServer", "is not a file of truth"),

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.core.gestures import NOBODY
-from plushsense.evaluation.leakage import audit_leakage
+from plushsense.evaluation.leakage import LeakageResult, audit_leakage
 from plushsense.evaluation.scores import (
     FoldRecord,
     Metrics,
@@ -172,7 +172,7 @@ class EvaluationResult:
     train_context: str
     seeds: list[int]
     scores: Scores
-    leakage: dict[str, Any]
+    leakage: LeakageResult
     self_calibration: str
     int8: DeployedResult | None
     histories: list[list[EpochRow]]
@@ -193,7 +193,7 @@ class EvaluationResult:
             "leaky": self.split.leaky,
             "seeds": self.seeds,
             **self.scores.to_json(),
-            "leakage": self.leakage,
+            "leakage": self.leakage.to_json(),
             **({"self_calibration": self.self_calibration} if self.self_calibration else {}),
             **({"int8": self.int8.to_json()} if self.int8 is not None else {}),
             "histories": self.histories,

@@ -12,12 +12,9 @@ import plushsense as ps
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import Dataset
-from plushsense.evaluation.crossval import fold_windows
-from plushsense.experiments.abstention import _without_other_people
 from plushsense.experiments.streams.run import TrainStreams, recipes_for
 from plushsense.experiments.streams.score import PeopleFold
 from plushsense.experiments.streams.systems import ANYWHERE, WINDOWS
-from plushsense.scoring.splits import parse_split
 from plushsense.training import fit as fitting
 from plushsense.trials.budget import make_network
 from plushsense.trials.estimate import preview_evaluation
@@ -83,16 +80,6 @@ def test_a_training_anywhere_adds_hard_negatives_of_the_training_people(
     for theirs, first, second in ((everybody - {held}, *trained[:2]), (everybody, *trained[2:])):
         assert len(first) <= len(second) <= 1.15 * len(first)
         assert owners(rested, first) == owners(rested, second) == theirs
-
-
-def test_a_fold_of_abstaining(rested: Dataset) -> None:
-    windows = prepare(rested, from_settings(classes="all")).scored_windows()
-    for fold in fold_windows(windows, windows, parse_split("by-subject:3"), 0):
-        apart = _without_other_people(fold, windows, rested)
-        heard = set(windows.subject[np.concatenate([fold.validation, fold.test])].tolist()) - {NOBODY}
-        assert owners(rested, windows.take(fold.train)) & heard  # it would be otherwise
-        assert owners(rested, windows.take(apart.train)) and not owners(rested, windows.take(apart.train)) & heard
-        assert apart.test.tolist() == fold.test.tolist()
 
 
 def test_what_lies_in_no_stream_of_theirs(dataset: Dataset) -> None:
