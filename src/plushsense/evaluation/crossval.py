@@ -38,6 +38,8 @@ from plushsense.scoring.splits import Fold, Index, Split, make_folds, purge
 from plushsense.training.spec import EpochProgress, EpochRow
 from plushsense.windows.cut import WindowSet
 
+SharedRows = Callable[[], Collection[tuple[str, str]]]
+
 # Part of every job's id: raise it when the meaning of a stored fold changes.
 _VERSION = 1
 
@@ -220,7 +222,7 @@ def evaluate(
     cluster: str | None = None,
     seed: int = 0,
     validation: bool = True,
-    shared_rows: Collection[tuple[str, str]] = (),
+    shared_rows: SharedRows = tuple,
     progress: Callable[[JobProgress], None] | None = None,
 ) -> EvaluationResult:
     """Train and score a model on each fold of ``split``.
@@ -235,7 +237,7 @@ def evaluate(
         cluster: address of a Ray cluster that runs the folds instead.
         seed: seed of the split.
         validation: whether to hold back windows for validation; without it they are trained on.
-        shared_rows: as for `audit_leakage`.
+        shared_rows: called for the argument ``shared_rows`` of `audit_leakage`.
         progress: called when a fold reports an epoch, with (epoch, epochs, row of the history) as its message, or is
             done.
 
@@ -267,7 +269,7 @@ def _result(
     score_windows: WindowSet,
     split: Split,
     seed: int,
-    shared_rows: Collection[tuple[str, str]],
+    shared_rows: SharedRows,
 ) -> EvaluationResult:
     """Score the outcomes of all folds."""
     records = [
@@ -294,7 +296,7 @@ def _result(
         train_context=context_of(train_windows),
         seeds=[seed],
         scores=scores,
-        leakage=audit_leakage(train_windows, score_windows, folds, shared_rows),
+        leakage=audit_leakage(train_windows, score_windows, folds, shared_rows()),
         self_calibration=score_windows.self_calibration,
         int8=int8,
         histories=[with_accuracy(outcome["history"], split.separates_people) for outcome in outcomes],

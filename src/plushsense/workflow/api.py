@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -450,7 +451,7 @@ def evaluate_run(
         cluster=cluster,
         seed=run.evaluation.seed,
         validation=run.holds_back,
-        shared_rows=copied_recordings(run.dataset, score.recording_ids),
+        shared_rows=partial(copied_recordings, run.dataset, score.recording_ids),
         progress=progress,
     )
     warn_of_copies(result.leakage, warn)
