@@ -233,7 +233,7 @@ class PartResult(NamedTuple):
     accuracy: float | None
 
 
-class Confusion(NamedTuple):
+class ConfusionMatrix(NamedTuple):
     """A confusion matrix (K, K) with the names of its classes."""
 
     labels: tuple[str, ...]
@@ -269,8 +269,8 @@ class Scores:
     pooled: Metrics
     per_class: tuple[ClassResult, ...]
     affects: tuple[str, ...]
-    confusion: Confusion
-    confusion_affect: Confusion
+    confusion: ConfusionMatrix
+    confusion_affect: ConfusionMatrix
     by_context: dict[str, PartResult]
     nobody: PartResult | None
     folds: tuple[FoldResult, ...]
@@ -339,8 +339,8 @@ def compute_scores(
         pooled=_plain(metrics.scores_of(everything)),
         per_class=tuple(metrics.class_results(everything, predictions.labels)),
         affects=affects,
-        confusion=Confusion(predictions.labels, everything),
-        confusion_affect=Confusion(*metrics.grouped(everything, affects)),
+        confusion=ConfusionMatrix(predictions.labels, everything),
+        confusion_affect=ConfusionMatrix(*metrics.grouped(everything, affects)),
         by_context=scorer.by_context(counted),
         nobody=None if people.all() else scorer.part(~people),
         folds=tuple(scorer.fold(fold, mask & counted) for fold, mask in zip(folds, of_fold, strict=True)),
