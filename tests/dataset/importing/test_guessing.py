@@ -14,7 +14,7 @@ from plushsense.core.errors import DatasetError
 from plushsense.dataset.importing import guessing
 from plushsense.dataset.importing.guessing import GuessedPattern, guess_pattern
 from plushsense.dataset.importing.importers import preview_import
-from plushsense.dataset.importing.preview import ImportPreview
+from plushsense.dataset.importing.results import ImportPreview
 
 GESTURES = ("hug", "tap")
 

@@ -54,8 +54,8 @@ def test_what_is_new_is_added_and_the_rest_counted(tmp_path: Path) -> None:
     put(tmp_path / "more" / "ana", "Shake", 9, epoch=1001)
     for source, counts in (("src", (3, 2, 1)), ("src", (3, 0, 3)), ("more", (4, 1, 0))):
         done = import_recordings(tmp_path / source, tmp_path / "DS", add_to=True)
-        assert (done.recordings, done.added["recordings"], done.already_there) == counts
-        assert done.rejected == []
+        assert (done.recordings, done.added_recordings, done.already_there) == counts
+        assert done.rejected == ()
     assert (tmp_path / "DS" / "recordings" / "ana" / "again-2" / first.name).is_file()
     after = raw(tmp_path / "DS")
     assert before.items() <= after.items()
@@ -165,7 +165,7 @@ def test_gestures_that_are_new_keep_their_affect(tmp_path: Path, session_writer:
     assert done.dataset.gestures.labels[-1] == "Kiss"
     assert done.dataset.gestures.get("Kiss").affect == "positive"
     assert done.warnings == []
-    assert json.loads(json.dumps(done.to_dict()))["added"] == {"recordings": 1, "streams": 1}
+    assert json.loads(json.dumps(done.to_json()))["added"] == {"recordings": 1, "streams": 1}
 
 
 def test_what_the_recorder_says_anew_is_marked_anew(tmp_path: Path) -> None:

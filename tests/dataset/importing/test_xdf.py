@@ -55,7 +55,7 @@ def test_markers_cut_the_stream_into_recordings(
     assert wave.device_ms.tolist() == [53_200 + 10 * i for i in range(60)]
     origin = json.loads((tmp_path / "DS/streams/P03/S002-001/origin.json").read_text())
     assert (origin["source"], origin["stream"]) == (path.name, "toy")
-    assert done.rejected == []
+    assert done.rejected == ()
     unnamed = (
         f"{path.name}: stream 'toy' (#1): its channels have no names: its 3 values are taken for x, y, z, in this order"
     )
@@ -91,7 +91,7 @@ def test_other_streams_are_named_and_two_that_fit_must_be_chosen(
     eeg = xdf_stream("EEG", [50.0, 50.1], [[0.0] * 32] * 2)
     path = xdf_writer(tmp_path / "sub-A.xdf", [accel(xdf_stream), eeg, said])
     done = import_recordings(path, tmp_path / "DS", layout="accel-3")
-    assert [e["file"] for e in done.left_out] == ["sub-A.xdf: stream 'EEG'"]
+    assert [e.file for e in done.left_out] == ["sub-A.xdf: stream 'EEG'"]
     twin = accel(xdf_stream)
     twin.name = "other"
     xdf_writer(path, [accel(xdf_stream), twin, said])
@@ -111,7 +111,7 @@ def test_files_in_folders_have_the_folders_person(tmp_path: Path, xdf_writer: Wr
     done = import_recordings(tmp_path / "src", tmp_path / "DS", layout="accel-3")
     assert [(r.subject, r.session) for r in done.dataset.recordings] == [("ana", "one"), ("ana", "two"), ("ben", "1")]
     assert not any("files are the session" in note for note in done.notes)
-    assert [e["file"] for e in done.rejected] == ["ana/bad.xdf"]
+    assert [e.file for e in done.rejected] == ["ana/bad.xdf"]
     alone = tmp_path / "src" / "ana" / "one.xdf"
     with pytest.raises(FileFormatError, match="the person of 'one.xdf' is not known"):
         import_recordings(alone, tmp_path / "DS2", layout="accel-3")
@@ -198,7 +198,7 @@ def test_the_markers_are_the_texts_that_name_gestures(tmp_path: Path, xdf_writer
     expected = [("Hold strong", 150, 50), ("Tail pull", 50, 50)]
     done = import_recordings(path, tmp_path / "DS", layout="accel-3", gestures="plush-18")
     assert (places(done), done.notes) == (expected, [])
-    assert [(e["file"], e["reason"]) for e in done.left_out] == [
+    assert [(e.file, e.reason) for e in done.left_out] == [
         ("sub-A.xdf: stream 'Keyboard'", "it is not the stream of markers")
     ]
     # Without a gesture set, the keys could be gestures too.
@@ -264,7 +264,7 @@ def test_streams_with_other_labels_are_not_the_toy(tmp_path: Path, xdf_writer: W
     unnamed.name = "unnamed"
     xdf_writer(path, [unnamed, accel(xdf_stream, labels=("x", "y", "z")), said])
     done = import_recordings(path, tmp_path / "two", layout="accel-3")
-    assert [(e["file"], e["reason"]) for e in done.left_out] == [
+    assert [(e.file, e.reason) for e in done.left_out] == [
         ("sub-A.xdf: stream 'unnamed'", "its channels have no names, and those of another stream have")
     ]
     assert done.notes == []

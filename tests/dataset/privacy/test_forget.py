@@ -95,7 +95,7 @@ def test_stopped_between_the_last_line_and_the_end_it_is_buried_once(
 def test_who_comes_into_a_set_that_people_were_taken_out_of_is_named(folder: Path, tmp_path: Path) -> None:
     def told() -> list[str]:
         done = import_recordings(tmp_path / "src", folder, add_to=True)
-        return [w for w in done.to_dict()["warnings"] if "were removed" in w]
+        return [w for w in done.messages if "were removed" in w]
 
     (folder / "cache").mkdir(exist_ok=True)
     assert told() == []

@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.sentences import Sentence
-from plushsense.dataset.importing.build import DEVICE_NAME
+from plushsense.dataset.importing.sources import DEVICE_NAME
 
 _CHUNK = 1 << 20
 # The earliest time that a zip can store.

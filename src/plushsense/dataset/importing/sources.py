@@ -8,12 +8,14 @@ name of the nearest folder is the person.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from plushsense.core.errors import BadInput, DatasetError
+from plushsense.core.errors import BadInput, DatasetError, FileFormatError
 from plushsense.core.gestures import NOBODY, GestureSet, plain_label
 from plushsense.core.layouts import Layout
 from plushsense.core.recorder_csv import SIMULATION_MARK, STREAM_NAME, parse_name
@@ -25,6 +27,7 @@ from plushsense.recording.session_files import SESSION_HEAD, SESSION_LOG, SIDECA
 
 COMPANIONS = "companions"
 LEFT_OUT = "left out"
+PATTERN, WINDOWS = "pattern", "windows"
 
 _ASK = (
     "import from the folder that holds one folder a person, or name the people with --subjects map.csv (file,subject)"
@@ -56,7 +59,7 @@ class SourceFile:
 
 @dataclass
 class SourceScan:
-    """Result of searching a source: every file once (``found``), and layout, gestures and people of its sessions.
+    """Result of a scan of a source: every file once (``found``), and layout, gestures and people of its sessions.
 
     ``choices`` are those of the authors' truncation script. ``streams_named`` is whether streams were searched for the
     people.
@@ -65,12 +68,38 @@ class SourceScan:
     layout: Layout
     gestures: GestureSet | None
     shape: str
-    found: list[SourceFile]
+    found: list[SourceFile] = field(default_factory=list)
     people: list[PersonInfo] = field(default_factory=list)
     simulated: bool = False
     notes: list[str] = field(default_factory=list)
     choices: list[Choice] = field(default_factory=list)
     streams_named: bool = False
+
+    def add(self, entries: Iterable[SourceFile | str]) -> None:
+        """Add files to those found, and texts to the notes."""
+        for entry in entries:
+            if isinstance(entry, str):
+                self.notes.append(entry)
+            else:
+                self.found.append(entry)
+
+    @contextmanager
+    def refusing(self, file: Path, name: str) -> Iterator[None]:
+        """Add ``file`` as refused, with the reason, if it turns out to be unreadable; ``name`` is that in messages."""
+        try:
+            yield
+        except FileFormatError as cause:
+            self.found.append(SourceFile(file, "", origin=name, reason=Sentence.of(cause)))
+
+
+# Names that Windows reserves for devices, with any suffix.
+DEVICE_NAME = re.compile(r"^(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³]|conin\$|conout\$)\s*(\.|$)", re.IGNORECASE)
+
+
+def folder_name(code: str, otherwise: str = UNKNOWN_SUBJECT) -> str:
+    """Return a folder name for ``code`` that is valid on any system and inside the data set."""
+    name = "".join(c if c.isalnum() or c in "-_. " else "_" for c in code).strip(" .")
+    return f"{name}_" if DEVICE_NAME.match(name) else name or otherwise
 
 
 def printable_path(path: Path) -> str:
