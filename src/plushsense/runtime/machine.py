@@ -31,7 +31,7 @@ from plushsense.runtime.events import Answer, EventMachine, Update
 from plushsense.runtime.fixed import Ints, integer_logits
 from plushsense.runtime.gate import Gate, Rule
 from plushsense.runtime.health import Health, HealthSettings
-from plushsense.windows.calibration import SelfCalibration
+from plushsense.windows.self_calibration import SelfCalibration
 from plushsense.windows.clock import SampleClock
 from plushsense.windows.features import SampleInputs
 

@@ -82,7 +82,7 @@ def test_a_member_that_must_not_be_written_is_refused(tmp_path: Path, name: str,
     done = import_recordings(tmp_path / "in" / "x.zip", tmp_path / "in" / "DS", layout="accel-3")
     assert done.recordings == 1
     (refused,) = done.rejected
-    assert re.search(said, refused["reason"]), refused
+    assert re.search(said, refused.reason), refused
     assert [p.name for p in tmp_path.iterdir()] == ["in"]
     assert sorted(p.name for p in (tmp_path / "in").iterdir()) == ["DS", "x.zip"]
     assert not Path("/tmp/evil_1_60.csv").exists()

@@ -25,7 +25,7 @@ def test_a_session_comes_in_without_a_warning_or_a_layout(tmp_path: Path, sessio
     session_writer(tmp_path / "out", "P02", "s1", seed=2, age_group="adult", redo=[0])
     done = import_recordings(tmp_path / "out", tmp_path / "DS")
     assert (done.recordings, done.subjects, done.streams) == (6, 2, 3)
-    assert done.messages == []
+    assert done.messages == ()
     assert done.rejected == done.left_out == ()
     assert done.companions == 3 * 4
     assert {(r.subject, r.session) for r in done.dataset.recordings} == {("P01", "s1"), ("P01", "s2"), ("P02", "s1")}
@@ -72,7 +72,7 @@ def test_what_a_crash_left_is_named_and_no_fault(tmp_path: Path, session_writer:
         "Neck scratch 1_5_9.json": "the",
     }
     assert [e.file for e in done.rejected] == ["P01/s1/holiday.png"]
-    assert done.warnings == []
+    assert done.warnings == ()
 
 
 @pytest.mark.parametrize(

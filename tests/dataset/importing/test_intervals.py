@@ -50,7 +50,7 @@ def test_intervals_beside_samples_are_found_and_cut_recordings(
     assert any("the labels are the intervals in files such as P1/labels.csv" in doubt for doubt in guess.doubts)
     done = import_recordings(tmp_path / "src", tmp_path / "DS", pattern=ImportPattern(**found))
     assert cuts(done) == sorted([("hug", 50, 100), ("hug", 150, 50), ("tap", 250, 50)] * 2)
-    assert (done.streams, done.rejected) == (2, [])
+    assert (done.streams, done.rejected) == (2, ())
     assert [entry.file for entry in done.left_out] == ["P1/labels.csv", "P2/labels.csv"]
     of_first_row = any("counted from the first row" in note for note in done.notes)
     assert of_first_row == (first_ms > 0 and not rows[0].startswith("71"))

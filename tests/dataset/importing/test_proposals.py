@@ -228,8 +228,8 @@ def test_single_rows_of_one_gesture_may_be_hits(tmp_path: Path, value: int, adop
     layout = replace(FORCE, channels=tuple(replace(c, **whole) for c in FORCE.channels))
     done = import_recordings(tmp_path / "t.csv", tmp_path / "DS", layout=layout)
     proposed = {p.key: p for p in done.proposals}
-    assert (done.dataset.layout != layout) == proposed["valid_max"]["adopted"] == adopted
-    assert ("most of them in tap, so they may be hits" in proposed["valid_max"]["reason"]) != adopted
+    assert (done.dataset.layout != layout) == proposed["valid_max"].adopted == adopted
+    assert ("most of them in tap, so they may be hits" in proposed["valid_max"].reason) != adopted
 
 
 def test_rate_gap_and_window_are_measured(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_recordings_come_back_and_give_the_same_windows(study: Path, tmp_path: Path, categorical: bool) -> None:
     path, count = scripts.save_windows(study, categorical=categorical)
     done = import_recordings(path, tmp_path / "DS")
-    assert (done.recordings, done.subjects, done.rejected) == (RECORDINGS, 0, [])
+    assert (done.recordings, done.subjects, done.rejected) == (RECORDINGS, 0, ())
     assert done.dataset.layout.name == "plush-windows"
     assert {"train", "test"} < {r.session for r in done.dataset.recordings}
     assert sum("windows joined to 18 recordings" in w for w in done.messages) == 1

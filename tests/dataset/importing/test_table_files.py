@@ -58,14 +58,14 @@ def test_lines_between_blocks_of_rows_end_a_recording(tmp_path: Path, between: t
 
 def test_an_empty_line_after_every_row_is_a_doubled_line_end(tmp_path: Path) -> None:
     done = imported(tmp_path, block(60), ends="\r\r\n")
-    assert (rows_of(done), done.notes) == ([60], [])
+    assert (rows_of(done), done.notes) == ([60], ())
     done = imported(tmp_path / "2", joined([block(40), block(50)], ""), ends="\r\r\n")
     assert rows_of(done) == [40, 50]
 
 
 def test_the_pattern_can_name_the_lines_between_recordings(tmp_path: Path) -> None:
     done = imported(tmp_path, joined([block(40), block(50)], ""), between="none")
-    assert (rows_of(done), done.notes) == ([90], [])
+    assert (rows_of(done), done.notes) == ([90], ())
     lines = joined([block(40), block(50)], "START 2")
     done = imported(tmp_path / "2", lines, between="START.*")
     assert rows_of(done) == [40, 50]
@@ -134,7 +134,7 @@ def test_no_unit_is_guessed_from_a_clock_that_stands_still(tmp_path: Path, clock
     layout = {"rate_hz": 100.0, "channels": [{"name": "force", "unit": "", "kind": "sensor", "step": 0.5}]}
     given = ImportPattern(paths=("*.csv",), layout=layout)
     said = ["column 'timestamp' is read as milliseconds", "the clock stands still: all 60 rows have one time"]
-    assert_said(preview_import(tmp_path / "src", pattern=given).warnings, said)
+    assert_said(preview_import(tmp_path / "src", pattern=given).messages, said)
     done = import_recordings(tmp_path / "src", tmp_path / "DS", pattern=given)
     assert_said(done.messages, said)
     with pytest.raises(DatasetError, match="the clock stands still in 4 recordings"):

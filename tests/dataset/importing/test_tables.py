@@ -41,7 +41,7 @@ def test_runs_of_a_label_are_recordings(tmp_path: Path) -> None:
     done = import_recordings(path, tmp_path / "DS", layout="accel-3")
     assert got(done) == [("ana", "1", "Shake", 50), ("ana", "1", "Wave", 40), ("ben", "2", "Shake", 30)]
     assert [s.subject for s in done.dataset.streams] == ["ana"], "one gesture goes on where the other ends"
-    assert done.messages == []
+    assert done.messages == ()
     wave = done.dataset.read(done.dataset.recordings[1])
     assert wave.values[:2].tolist() == [[0, 1, 0], [1, 2, -1]]
     assert wave.device_ms[:2].tolist() == [500, 510]
@@ -60,7 +60,7 @@ def test_labels_that_become_one_are_told(tmp_path: Path) -> None:
     composed, apart = "glāsts", unicodedata.normalize("NFD", "glāsts")
     lines = rows("ana", composed, 0, 50) + rows("ana", apart, 50, 50)
     same = import_recordings(table(tmp_path / "accents.csv", lines), tmp_path / "DS2", layout="accel-3")
-    assert {gesture for _, _, gesture, _ in got(same)} == {composed} and same.messages == []
+    assert {gesture for _, _, gesture, _ in got(same)} == {composed} and same.messages == ()
     (said,) = done.messages
     assert "'swipe >' and 'swipe <' become one gesture, 'swipe _'" in said
 
@@ -165,7 +165,7 @@ def test_rows_that_cannot_be_used_are_counted(tmp_path: Path) -> None:
     done = import_recordings(table(tmp_path / "a.csv", lines), tmp_path / "DS", layout="accel-3")
     assert done.recordings == 1
     assert done.dataset.recordings[0].rows == 46
-    assert done.notes == [
+    assert list(done.notes) == [
         "a.csv: 1 row of another width than the header left out (the first: line 10: 'ana,1,Shake')",
         "a.csv: 2 rows without a number in every column left out (the first: line 7)",
         "a.csv: 1 row without a subject left out (the first: line 5)",

@@ -59,8 +59,8 @@ def test_markers_cut_the_stream_into_recordings(
     unnamed = (
         f"{path.name}: stream 'toy' (#1): its channels have no names: its 3 values are taken for x, y, z, in this order"
     )
-    assert done.notes == ([] if labels else [unnamed])
-    assert done.warnings == []
+    assert done.notes == (() if labels else (unnamed,))
+    assert done.warnings == ()
     assert not list((tmp_path / "DS").rglob("*.xdf"))
 
 
@@ -197,7 +197,7 @@ def test_the_markers_are_the_texts_that_name_gestures(tmp_path: Path, xdf_writer
     path = xdf_writer(tmp_path / "sub-A.xdf", [toy, keys, prompts])
     expected = [("Hold strong", 150, 50), ("Tail pull", 50, 50)]
     done = import_recordings(path, tmp_path / "DS", layout="accel-3", gestures="plush-18")
-    assert (places(done), done.notes) == (expected, [])
+    assert (places(done), done.notes) == (expected, ())
     assert [(e.file, e.reason) for e in done.left_out] == [
         ("sub-A.xdf: stream 'Keyboard'", "it is not the stream of markers")
     ]
@@ -219,7 +219,7 @@ def test_the_studios_markers_come_first_and_its_mark_for_a_video_is_none(
     toy = accel(xdf_stream, labels=("x", "y", "z"))
     path = xdf_writer(tmp_path / "sub-A.xdf", [other, toy, studio])
     done = import_recordings(path, tmp_path / "DS", layout="accel-3")
-    assert (places(done), done.notes) == ([("Shake", 50, 50)], [])
+    assert (places(done), done.notes) == ([("Shake", 50, 50)], ())
 
 
 def test_numbers_are_gestures_only_if_they_are_chosen_or_named(
@@ -234,7 +234,7 @@ def test_numbers_are_gestures_only_if_they_are_chosen_or_named(
         import_recordings(path, tmp_path / "DS", layout="accel-3")
     done = import_recordings(path, tmp_path / "DS", layout="accel-3", columns={"markers": "codes"})
     assert places(done) == [("3", 50, 50), ("7", 150, 50)]
-    assert (done.left_out, ["2 markers end a recording" in note for note in done.notes]) == ([], [True])
+    assert (done.left_out, ["2 markers end a recording" in note for note in done.notes]) == ((), [True])
     (tmp_path / "set.toml").write_text(
         'name = "codes"\n[[gestures]]\nlabel = "Shake"\nlabels = ["3"]\n[[gestures]]\nlabel = "Wave"\nlabels = ["7"]\n'
     )
@@ -267,7 +267,7 @@ def test_streams_with_other_labels_are_not_the_toy(tmp_path: Path, xdf_writer: W
     assert [(e.file, e.reason) for e in done.left_out] == [
         ("sub-A.xdf: stream 'unnamed'", "its channels have no names, and those of another stream have")
     ]
-    assert done.notes == []
+    assert done.notes == ()
 
 
 def test_streams_of_one_name(tmp_path: Path, xdf_writer: Writer, xdf_stream: Any) -> None:
@@ -320,7 +320,7 @@ def test_markers_without_a_recording_and_shortened_recordings_are_counted(
     )
     path = xdf_writer(tmp_path / "sub-A.xdf", [toy, said])
     done = import_recordings(path, tmp_path / "DS", layout="accel-3")
-    assert done.notes == [
+    assert list(done.notes) == [
         "sub-A.xdf: 1 markers name a gesture where the stream has no samples, and give no recording: 'Shake'",
         "sub-A.xdf: 2 recordings are cut short by the stream or a marker that names no gesture: 'Wave', 'Shake'",
     ]

@@ -19,7 +19,7 @@ from plushsense.core.files import temporary_folder, work_folder
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset import index
-from plushsense.dataset.importing import adding, importers
+from plushsense.dataset.importing import build, importers
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import LOCK, MARKS, Mark, adding_locked, append_marks, read_marks
@@ -345,7 +345,7 @@ def test_an_import_holds_the_lock_while_it_writes(folder: Path, monkeypatch: pyt
         return write
 
     for name in ("write_people", "write_marks"):
-        monkeypatch.setattr(adding, name, spy(getattr(adding, name), name))
+        monkeypatch.setattr(build, name, spy(getattr(build, name), name))
     source = folder.parent / "more" / "P3"
     source.mkdir(parents=True)
     lines = (folder.parent / "src" / "P1" / f"Wave_{10**12}_50.csv").read_text().splitlines()

@@ -82,7 +82,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
     gestures = GestureSet("four", tuple(Gesture(label, "positive") for label in LABELS))
     done = import_recordings(src / "src", src / "DS", layout=PLUSH, gestures=gestures)
     assert done.recordings == len(PEOPLE) * len(LABELS) * TIMES
-    assert done.messages == [], "a clean session is imported without a warning"
+    assert done.messages == (), "a clean session is imported without a warning"
     return src / "DS"
 
 

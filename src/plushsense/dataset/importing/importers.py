@@ -176,7 +176,7 @@ def _preview(scan: SourceScan) -> ImportPreview:
         scan.layout.name,
         len(recordings),
         len(files) - len(recordings),
-        tuple(sorted({f.subject for f in files})),
+        sorted({f.subject for f in files}),
         dict(sorted(Counter(named.values()).items())),
         tuple(rows[:_PREVIEWED_ROWS]),
         tuple(rejected),

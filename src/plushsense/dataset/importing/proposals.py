@@ -290,7 +290,13 @@ def _sensors_of(dataset: Dataset, vector: tuple[str, ...]) -> Iterator[Sensor]:
     groups: list[Sphere] = []
     left = enough.copy()
     fits = [fit for fit in (everything, *pooled, *own) if fit is not None]
-    on = np.array([_errors(fit, points, at, len(sessions)) <= _ON_SPHERE for fit in fits])
+    lies = list[NDArray[np.bool_]]()
+    for fit in fits:
+        lies.append(_errors(fit, points, at, len(sessions)) <= _ON_SPHERE)
+        if lies[-1][enough].all():
+            # No other fit has more sessions; with hundreds of sessions, their own would take seconds.
+            break
+    on = np.array(lies)
     while fits and (on & left).any():
         best = int((on & left).sum(axis=1).argmax())
         fit = _sphere(points[(on[best] & left)[at]]) or fits[best]

@@ -129,7 +129,7 @@ class ImportPreview:
     layout: str
     recordings: int
     streams: int
-    subjects: tuple[str, ...]
+    subjects: list[str]
     gestures: dict[str, int]
     rows: tuple[PreviewRow, ...]
     rejected: tuple[FileReason, ...]
@@ -144,7 +144,7 @@ class ImportPreview:
             "layout": self.layout,
             "recordings": self.recordings,
             "streams": self.streams,
-            "subjects": list(self.subjects),
+            "subjects": self.subjects,
             "gestures": self.gestures,
             "rows": [vars(row) for row in self.rows],
             "rejected": [entry.to_json() for entry in self.rejected],
