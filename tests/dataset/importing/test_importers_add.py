@@ -16,7 +16,7 @@ from plushsense.core.recorder_csv import Frames, recording_filename, write_recor
 from plushsense.dataset.importing import build
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.marks import Mark, append_marks
+from plushsense.dataset.marks import Mark, append_marks, read_marks
 from plushsense.dataset.store import PersonInfo, read_people, write_people
 from plushsense.recording.session_files import SessionEvent
 
@@ -177,7 +177,7 @@ def test_what_the_recorder_says_anew_is_marked_anew(tmp_path: Path) -> None:
         ("e", "include", "me"),
     ]
     append_marks(tmp_path, [Mark(*one) for one in decided])
-    said = [(m.recording, m.action, m.who) for m in build._new_marks(tmp_path, aside)]
+    said = [(m.recording, m.action, m.who) for m in build._new_marks(read_marks(tmp_path), aside)]
     assert said == [("a", "exclude", "recorder"), ("c", "include", "recorder")]
 
 

@@ -13,9 +13,9 @@ import pytest
 from plushsense.core.errors import ConfigError
 from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.sentences import Sentence
-from plushsense.dataset.importing.header_layouts import readable_layouts
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.importing.proposals import Sensor, find_sensors
+from plushsense.dataset.importing.scanning import readable_layouts
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.quality.checking import check
 from plushsense.dataset.quality.outliers import far_inputs, find_failed_readings

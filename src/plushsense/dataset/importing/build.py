@@ -6,7 +6,6 @@ Raw files are copied unchanged. Existing files, marks and class numbers stay as 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import shutil
 import tempfile
@@ -51,7 +50,7 @@ from plushsense.dataset.index import (
     rebuild_index,
     write_index_files,
 )
-from plushsense.dataset.marks import MARKS, Mark, MarkState, adding_locked, append_marks, read_marks, write_marks
+from plushsense.dataset.marks import Mark, MarkState, adding_locked, append_marks, read_marks, write_marks
 from plushsense.dataset.privacy.forget import read_removals
 from plushsense.dataset.store import (
     HEAD,
@@ -495,26 +494,17 @@ def _locked_work_folder(dest: Path) -> Iterator[Path]:
         raise DatasetError(message, reason="import_runs") from None
 
 
-def _new_marks(folder: Path, set_aside: Mapping[str, str]) -> list[Mark]:
+def _new_marks(states: Mapping[str, MarkState], discarded: Mapping[str, str]) -> list[Mark]:
     """Return marks for recordings that the recorder has discarded or kept since; marks of people take precedence.
 
     Args:
-        set_aside: by recording id, the reason why the recorder discarded it, "" if it did not.
+        discarded: by recording id, the reason why the recorder discarded it, "" if it did not.
     """
-    last: dict[str, tuple[str, str]] = {}
-    for line in (folder / MARKS).read_bytes().split(b"\n") if (folder / MARKS).is_file() else ():
-        try:
-            mark = json.loads(line)
-            if mark["action"] in ("exclude", "include"):
-                last[str(mark["recording"])] = (mark["action"], mark["who"])
-        except (ValueError, TypeError, KeyError, RecursionError):
-            continue
     marks = []
-    for recording, why in set_aside.items():
-        action, who = last.get(recording, ("include", RECORDER))
-        new_action = "exclude" if why else "include"
-        if who == RECORDER and action != new_action:
-            marks.append(Mark(recording, new_action, RECORDER, why or "kept after all"))
+    for recording, why in discarded.items():
+        now = states.get(recording, MarkState())
+        if now.excluded_by in ("", RECORDER) and now.excluded != bool(why):
+            marks.append(Mark(recording, "exclude" if why else "include", RECORDER, why or "kept after all"))
     return marks
 
 
@@ -552,8 +542,9 @@ def add_to_dataset(
         with generation.writing():
             if head.gestures != dataset.head.gestures:
                 write_file(dest / HEAD, head.to_toml())
-            trims, labels, remarks = files.marks(both, head.gestures, read_marks(dest))
-            marks = [*_new_marks(dest, files.discarded()), *trims, *labels]
+            states = read_marks(dest)
+            trims, labels, remarks = files.marks(both, head.gestures, states)
+            marks = [*_new_marks(states, files.discarded()), *trims, *labels]
             write_marks(dest, marks)
             if {p.subject: p for p in listed} != there:
                 write_people(dest, listed)
