@@ -186,7 +186,7 @@ def test_a_long_stream_halves_its_sums_and_reads_on(monkeypatch: pytest.MonkeyPa
     """What is asked for is a ratio of sums, so that halving all of them changes nothing while the readings repeat."""
     x = np.tile(readings(1500, 3), (6, 1))
     long = SelfCalibration(LAYOUT).apply(x)
-    monkeypatch.setattr(calibration, "MOST_WEIGHT", 1 << 16)
+    monkeypatch.setattr(self_calibration, "MOST_WEIGHT", 1 << 16)
     halving = SelfCalibration(LAYOUT)
     out = halving.apply(x)
     (fit,) = halving._fits
