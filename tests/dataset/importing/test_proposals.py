@@ -15,7 +15,7 @@ from plushsense.core.layouts import Layout, load_layout
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.importing.proposals import Sensor, find_sensors
-from plushsense.dataset.importing.scanning import readable_layouts
+from plushsense.dataset.importing.sources import readable_layouts
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.quality.checking import check
 from plushsense.dataset.quality.outliers import far_inputs, find_failed_readings

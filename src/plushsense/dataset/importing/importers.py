@@ -26,8 +26,8 @@ from plushsense.dataset.importing.counters import counters_note
 from plushsense.dataset.importing.pattern import ImportPattern, read_pattern
 from plushsense.dataset.importing.proposals import SELF_CALIBRATION, Proposal, adopt, find_sensors, propose_settings
 from plushsense.dataset.importing.results import FileReason, ImportPreview, ImportResult, PreviewRow, group_flags
-from plushsense.dataset.importing.scanning import ScanSpec, scan_source
-from plushsense.dataset.importing.sources import LEFT_OUT, SourceFile, SourceScan, read_mapping
+from plushsense.dataset.importing.scanning import scan_source
+from plushsense.dataset.importing.sources import LEFT_OUT, ScanSpec, SourceFile, SourceScan, read_mapping
 from plushsense.dataset.index import rebuild_index
 from plushsense.dataset.quality.measurements import Examination
 from plushsense.dataset.quality.recordings import clock_still

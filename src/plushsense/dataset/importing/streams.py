@@ -14,10 +14,10 @@ from plushsense.core.errors import DatasetError, FileFormatError
 from plushsense.core.gestures import NOBODY
 from plushsense.core.recorder_csv import STREAM_NAME, ReadResult, read_recording, read_stream
 from plushsense.core.sentences import join_names, plural
+from plushsense.dataset.importing.folders import classify_files
 from plushsense.dataset.importing.sources import (
     SourceFile,
     SourceScan,
-    classify_files,
     is_simulation,
     printable_path,
     source_files,

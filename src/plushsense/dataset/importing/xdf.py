@@ -30,7 +30,7 @@ from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.markers import Marker, MarkerCuts, cut_by_markers, read_marker
 from plushsense.dataset.importing.pattern import MARKERS_ROLE, STREAM_ROLE
-from plushsense.dataset.importing.sources import LEFT_OUT, SourceFile
+from plushsense.dataset.importing.sources import LEFT_OUT, ScanSpec, SourceFile, SourceScan
 from plushsense.dataset.importing.tables import (
     ConvertedSource,
     SessionTarget,
@@ -422,6 +422,22 @@ def _about_cuts(cuts: MarkerCuts, hint: str) -> Iterator[Sentence]:
     if not cuts.segments:
         message = f"no marker gives a recording{hint}"
         yield Sentence(message, reason="xdf_no_gesture")
+
+
+def convert_xdf(path: Path, name: str, person: str | None, spec: ScanSpec, scan: SourceScan) -> tuple[str, str]:
+    """Convert an XDF file, and add its recordings and notes to ``scan``; return the person and the session."""
+    subject, session = person_and_session(path, person)
+    if spec.mapping is not None:
+        subject = person
+    if subject is None:
+        raise FileFormatError(
+            f"the person of '{name}' is not known: name the person with --subjects map.csv (file,subject), or call "
+            "the file sub-<code>_ses-<session>.xdf as LabRecorder does",
+            reason="person_unknown",
+        )
+    target = SessionTarget(spec.new_folder("converted"), subject, session, scan.layout)
+    scan.add(read_xdf(path, name, target, scan.gestures, spec.columns, spec.limits))
+    return subject, session
 
 
 def read_xdf(
