@@ -231,7 +231,7 @@ def test_a_pattern_reads_a_zip_and_gets_people_from_a_mapping(tmp_path: Path) ->
     (tmp_path / "map.csv").write_text("file,subject\ntaps.jsonl,eve\n")
     (tmp_path / "p.toml").write_text((PATTERNS / "taps.toml").read_text().replace('subject = "user.id"\n', ""))
     unknown = preview_import(tmp_path / "taps.zip", pattern=tmp_path / "p.toml")
-    assert unknown.subjects == ["unknown"] and "--subjects map.csv" in unknown.warnings[-1]
+    assert unknown.subjects == ["unknown"] and "--subjects map.csv" in unknown.messages[-1]
     with pytest.raises(DatasetError, match="no column 'subject'.*--subjects map.csv"):
         import_recordings(tmp_path / "src", tmp_path / "DS", pattern=tmp_path / "p.toml", person="")
     done = import_recordings(
