@@ -110,7 +110,7 @@ class Paper:
         if not (folder / "dataset.toml").is_file():
             done = ps.import_recordings(archive, folder, layout="plush-15", name="the paper's archive", **given)
             for entry in done.rejected:
-                say(f"rejected: {entry['file']}: {entry['reason']}")
+                say(f"rejected: {entry.file}: {entry.reason}")
         else:
             say(f"using the data set '{folder}' that an earlier run imported")
         self.dataset = ps.open_dataset(folder)

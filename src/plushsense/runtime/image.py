@@ -27,7 +27,7 @@ of everything after the head. The following sections come in this order:
   u8 baseline, u8 noise, u32 floor; for each rule: u8 terms, u8 affect, u8 gesture, u8 within, u16 deaf; then for each
   of its terms: u8 signal, i8 sign, u8 times, u8 0, u32 threshold
 
-Images with a self-calibration (`plushsense.windows.calibration`) have a version of their own, because its code is
+Images with a self-calibration (`plushsense.windows.self_calibration`) have a version of their own, because its code is
 compiled for such models only. Networks that compute a window again at every step (padding ``mirror``) have no image.
 
 A patch replaces the dense layer of one image. Its head is that of an image with ``PLPT`` for ``PLSH``; then come the

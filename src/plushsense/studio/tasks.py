@@ -143,12 +143,12 @@ def run_import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         "dataset": str(spec["dest"]),
         "recordings": done.recordings,
         "subjects": done.subjects,
-        "added": done.added,
+        "added": done.to_json()["added"],
         "already_there": done.already_there,
-        "warnings": done.notes,
+        "warnings": list(done.notes),
         "flagged": len(done.warnings),
-        "left_out": done.left_out,
-        "rejected": done.rejected,
+        "left_out": [entry.to_json() for entry in done.left_out],
+        "rejected": [entry.to_json() for entry in done.rejected],
         "seconds": round(done.seconds, 2),
     }
 
@@ -211,14 +211,12 @@ def run_inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
             rejected.append({"file": source.name, "reason": Sentence.of(refusal)})
             continue
         notes += done.notes
-        rejected += done.rejected
+        rejected += [entry.to_json() for entry in done.rejected]
         flagged += len(done.warnings)
     if not dest.exists():
         raise refusals[0]
     if len(sources) > 1:
-        before = len(done.notes)
-        propose(done, adopting=True)
-        notes += done.notes[before:]
+        notes += propose(done, adopting=True).notes[len(done.notes) :]
     dataset = open_dataset(dest)
     return {
         "name": dataset.head.name if restored else "",

@@ -25,6 +25,7 @@ from plushsense.dataset.importing.sources import SourceFile
 from plushsense.dataset.importing.tables import (
     ConvertedSource,
     LabelledSegment,
+    SessionTarget,
     usable_rows,
     whole_steps,
     write_session,
@@ -268,6 +269,5 @@ def write_windows(
             clocks.append(begin + np.round(np.arange(len(r.values)) * 1000.0 / layout.rate_hz).astype(np.int64))
             begin = int(clocks[-1][-1]) + _APART_MS
         frames = Frames(values, np.concatenate(clocks))
-        yield from write_session(
-            folder / str(number), subject or UNKNOWN_SUBJECT, name, frames, cuts, layout, original, with_stream=False
-        )
+        target = SessionTarget(folder / str(number), subject or UNKNOWN_SUBJECT, name, layout)
+        yield from write_session(target, original, frames, cuts, with_stream=False)
