@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.options import options
 from plushsense.cli.output import emit, figure, say, table, warn
@@ -13,6 +13,9 @@ from plushsense.cli.settings import listed, marks, report_jobs, settings
 from plushsense.core.errors import ConfigError
 from plushsense.core.sentences import plural
 from plushsense.jobs.progress import ProgressReporter
+
+if TYPE_CHECKING:
+    from plushsense.experiments.protocol.score import ProtocolResult
 
 
 def run_stream_eval(args: argparse.Namespace) -> int:
@@ -195,37 +198,38 @@ def _format_systems(result: dict[str, Any]) -> list[str]:
 
 
 def run_protocol(args: argparse.Namespace) -> int:
-    from plushsense.experiments.protocol.run import protocol
+    from plushsense.experiments.protocol.run import VirtualPeople, protocol
 
     virtual = options(args, "people", "first", "seed", "repetitions")
     virtual = {name: value for name, value in virtual.items() if value is not None}
     if virtual and (args.dataset or args.session):
         raise ConfigError(f"--{next(iter(virtual))} is for virtual people: leave it out, or --dataset and --session.")
+    reporter = ProgressReporter("people")
     result = protocol(
         args.model,
-        **virtual,
+        virtual=VirtualPeople(**virtual),
         **options(args, "dataset", "session", "engine", "out"),
         subjects=listed(args.subjects) if args.subjects else None,
         rules=not args.no_rules,
-        progress=ProgressReporter("people"),
+        progress=lambda at: reporter(at.done, at.total),
     )
-    emit(args, result, _protocol_lines(result))
+    emit(args, result.to_json(), _protocol_lines(result))
     return 0
 
 
-def _protocol_lines(result: dict[str, Any]) -> list[str]:
+def _protocol_lines(result: ProtocolResult) -> list[str]:
     """Format the outcome of the protocol as text: the table, the aims and the notes."""
     from plushsense.experiments.protocol.report import SIMULATION, aim_table, between_table, group_table
 
-    out = [result["heading"], *([SIMULATION] if result["simulated"] else [])]
-    out += [f"{name}: {value}" for name, value in result["about"]]
+    out = [result.heading, *([SIMULATION] if result.simulated else [])]
+    out += [f"{name}: {value}" for name, value in result.about]
     out += ["", group_table(result).text(), ""]
     out += [
         f"{row['system']}, {row['minutes']} minutes between the gestures: {row['positive']} positive and "
         f"{row['negative']} negative events, {row['none']} without affect: {row['reactions']} an hour"
         for row in between_table(result).rows
     ]
-    if result["aims"]:
+    if result.aims:
         out += ["", *(f"{row['met']}: {row['aim']}: {row['measured']}" for row in aim_table(result).rows)]
-    out += ["", *result["said"]]
-    return [*out, f"written: {result['files'][0]}"] if "files" in result else out
+    out += ["", *result.said]
+    return [*out, f"written: {result.files[0]}"] if result.files else out
