@@ -55,7 +55,7 @@ def virtual_rules(seed: int, layout: Layout, gestures: GestureSet, people: int =
         raw, folder = Path(work) / "raw", Path(work) / "ds"
         simulate(raw, people, (seed + _ELSEWHERE) % 2**31, 2, at_rest=0, layout=layout)
         dataset = import_recordings(raw, folder, layout=layout, gestures=gestures, name="others").dataset
-        settings, _ = fit_rule_baseline(dataset, gestures, dataset.subjects)
+        settings = fit_rule_baseline(dataset, gestures, dataset.subjects)
     baseline = partial(rule_baseline_events, layout=layout, settings=settings)
     return baseline, f"Tuned on {people} other virtual people, of another population."
 
@@ -66,7 +66,7 @@ def recorded_rules(dataset: Dataset, gestures: GestureSet, scored: Collection[st
     if not others:
         return None, "Everybody is scored here, so nobody is left to tune the rule baseline on: it is left out."
     try:
-        settings, _ = fit_rule_baseline(dataset, gestures, others)
+        settings = fit_rule_baseline(dataset, gestures, others)
     except ConfigError as cause:
         return None, f"The rule baseline cannot be tuned: {cause}"
     baseline = partial(rule_baseline_events, layout=dataset.layout, settings=settings)
