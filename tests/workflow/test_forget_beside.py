@@ -22,7 +22,7 @@ from plushsense.experiments.abstention import abstaining
 from plushsense.experiments.adaptation import evaluate_adapting
 from plushsense.experiments.baselines.run import ComparisonSpec, baselines
 from plushsense.experiments.search.run import search
-from plushsense.experiments.streams.run import stream_benchmark
+from plushsense.experiments.streams.run import BenchmarkSpec, stream_benchmark
 from plushsense.experiments.sweep.run import sweep
 from plushsense.workflow.api import unfinished
 
@@ -77,7 +77,8 @@ def run_search(ds: Dataset, out: Path, hook: Hook) -> None:
 
 
 def run_streams(ds: Dataset, out: Path, hook: Hook) -> None:
-    stream_benchmark(ds, split="by-subject:2", systems=("argmax", "hysteresis"), out=out, progress=hook, **SMALL)
+    spec = BenchmarkSpec("by-subject:2", ("argmax", "hysteresis"))
+    stream_benchmark(ds, spec=spec, out=out, progress=hook, **SMALL)
 
 
 def run_abstaining(ds: Dataset, out: Path, hook: Hook) -> None:

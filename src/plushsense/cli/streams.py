@@ -16,6 +16,7 @@ from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
     from plushsense.experiments.protocol.score import ProtocolResult
+    from plushsense.experiments.streams.run import PredictionsResult, StreamEvalResult
 
 
 def run_stream_eval(args: argparse.Namespace) -> int:
@@ -34,12 +35,13 @@ def run_stream_eval(args: argparse.Namespace) -> int:
         return _run_split(args)
     if args.out or args.systems or args.anywhere_pool is not None:
         raise ConfigError("--out, --systems and --anywhere-pool belong to --split: leave them out, or give --split.")
-    result = _score_model(args) if args.model is not None else _score_predictions(args)
+    scored = _score_model(args) if args.model is not None else _score_predictions(args)
+    result = scored.to_json()
     emit(args, result, _format_scores(result))
     return 0
 
 
-def _score_model(args: argparse.Namespace) -> dict[str, Any]:
+def _score_model(args: argparse.Namespace) -> StreamEvalResult:
     from plushsense.experiments.streams.run import stream_eval
 
     return stream_eval(
@@ -53,7 +55,7 @@ def _score_model(args: argparse.Namespace) -> dict[str, Any]:
     )
 
 
-def _score_predictions(args: argparse.Namespace) -> dict[str, Any]:
+def _score_predictions(args: argparse.Namespace) -> PredictionsResult:
     from plushsense.experiments.streams.run import score_predictions
 
     return score_predictions(
@@ -69,7 +71,7 @@ def _score_predictions(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _run_split(args: argparse.Namespace) -> int:
-    from plushsense.experiments.streams.run import PAGE, stream_benchmark
+    from plushsense.experiments.streams.run import PAGE, BenchmarkSpec, stream_benchmark
 
     if args.subjects:
         raise ConfigError("--subjects belongs to --model and --predictions: a split scores all people.")
@@ -77,13 +79,15 @@ def _run_split(args: argparse.Namespace) -> int:
     result = stream_benchmark(
         args.source,
         config,
-        split=args.split,
-        systems=None if args.systems is None else listed(args.systems),
+        BenchmarkSpec(
+            args.split,
+            None if args.systems is None else listed(args.systems),
+            args.late,
+            args.labels == "use",
+            args.anywhere_pool,
+        ),
         out=args.out,
         overwrite=args.force,
-        late_s=args.late,
-        labels=args.labels == "use",
-        anywhere_pool_s=args.anywhere_pool,
         progress=report_jobs("streams"),
         warn=warn,
     )

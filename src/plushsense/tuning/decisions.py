@@ -228,9 +228,7 @@ def fit_decisions(
     streams = marked_streams(bundle, dataset, people, spec)
     report = {"people": len(people), **_described(streams, bundle.gestures), "simulated": dataset.head.simulated}
     if streams:
-        # Where nobody practises between the marked gestures, every event outside of them is false.
-        labelled_throughout = dataset.head.simulated or dataset.layout.is_labelled
-        spec, report["events"] = _fit_events(bundle, streams, spec, aims, labelled_throughout, keep)
+        spec, report["events"] = _fit_events(bundle, dataset, streams, spec, aims, keep)
         labelled = labelled_steps(bundle, streams, spec)
     else:
         labelled = labelled_windows(bundle, dataset, people)
@@ -267,10 +265,10 @@ class _AnswerAims:
 
 def _fit_events(
     bundle: Bundle,
+    dataset: Dataset,
     streams: Sequence[MarkedStream],
     spec: DecideSpec,
     aims: _AnswerAims,
-    labelled_throughout: bool,
     keep: Collection[str],
 ) -> tuple[DecideSpec, dict[str, Any]]:
     """Return the event settings of least cost, and a report on the search."""
@@ -278,7 +276,8 @@ def _fit_events(
         labelled = labelled_steps(bundle, streams, spec)
         spec = replace(spec, known_margin=known_threshold(labelled, bundle.gestures, aims.known_share))
     costs = ErrorCosts()
-    if labelled_throughout:
+    if dataset.head.simulated or dataset.layout.is_labelled:
+        # Nobody practises there between the marked gestures, so every event outside of them is false.
         costs = replace(costs, unmarked=costs.outside)
     tuned = tune(streams, spec, bundle.gestures, costs, keep)
     report = {

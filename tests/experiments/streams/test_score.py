@@ -368,7 +368,8 @@ def test_folds_keep_people_apart_and_are_resumed(dataset: Dataset, tmp_path: Pat
     assert plain["truths"] == 12 and plain["hits"] + plain["deletions"] == 12
     assert [p["subject"] for p in plain["people"]] == sorted(tested)
     assert sum(p["truths"] for p in plain["people"]) == 12
-    alone = pooled_scores(people_scores(model_events(dataset, bundle(), tested, argmax_spec(0.0)), GESTURES))
+    scores = people_scores(model_events(dataset, bundle(), tested, argmax_spec(0.0)), GESTURES)
+    alone = pooled_scores(scores.values()).to_dict()
     for name in ("events", "hits", "insertions", "fragmentations", "merges", "latency_s", "cost_per_truth"):
         assert alone[name] == plain[name], name
     assert table["reference"] is None and table["at_recall"] == []
