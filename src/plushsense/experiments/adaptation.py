@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import BadInput, BundleError, ConfigError, DatasetError, nearest, python_warning
 from plushsense.core.files import temporary_folder
-from plushsense.core.gestures import GestureSet
 from plushsense.dataset.files import CACHE
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import as_dataset
@@ -36,13 +35,12 @@ from plushsense.live.adaptation import (
     personalise,
     restore_original,
 )
-from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.scoring import metrics
 from plushsense.scoring.splits import Fold, parse_split, purge
 from plushsense.windows.cut import WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, windows_for
+from plushsense.workflow.preparation import Run, Warn, prepare, windows_for
 from plushsense.workflow.reporting import journal_of, keep_bundle
 
 Predictor = Callable[[WindowSet], NDArray[np.floating[Any]]]
@@ -556,20 +554,18 @@ def evaluate_adapting(
         use, random: as for `ChoiceSpec`.
         int8: also score the deployed networks, before and after.
     """
-    dataset, config = network_inputs_of(as_dataset(dataset), config or from_settings(**settings))
+    run = prepare(dataset, config or from_settings(**settings), warn)
     spec = spec or PersonalSpec()
     if use < spec.least or random < 0:
         raise ConfigError(f"--use {use}, --choices {random}: accepted are {spec.least} and more, 0 and more.")
     division = parse_split(split)
     if not division.separates_people:
         raise ConfigError(f"The split {split} does not keep people apart: use leave-one-subject-out or by-subject:5.")
-    gestures = choose_classes(dataset, config.evaluation.classes, warn)
-    arch = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     if int8:
-        refuse_undeployable(arch)
-    windows = windows_for(dataset, arch, config.windows, gestures, warn)
-    choice = ChoiceSpec(use, random, config.evaluation.seed)
-    work = _FoldWork(config, arch, gestures, choice, spec, int8)
+        refuse_undeployable(run.network)
+    windows = windows_for(run.dataset, run.network, run.windows, run.gestures, warn)
+    choice = ChoiceSpec(use, random, run.evaluation.seed)
+    work = _FoldWork(run, choice, spec, int8)
     context = context_of(windows)
 
     def summarise(study: StudyResults) -> AdaptationScores:
@@ -579,16 +575,16 @@ def evaluate_adapting(
     scores = run_study(
         [
             StudyPart(fold.name, {"fold": fold_fingerprint(fold)}, fold)
-            for fold in fold_windows(windows, windows, division, config.evaluation.seed)
+            for fold in fold_windows(windows, windows, division, run.evaluation.seed)
         ],
         work,
         summarise,
-        key=work.key(dataset, windows),
-        shared=(dataset, windows),
-        spec=JobsSpec(config.evaluation.processes, journal=journal_of(dataset, _FOLDER)),
+        key=work.key(windows),
+        shared=windows,
+        spec=JobsSpec(run.evaluation.processes, journal=journal_of(run.dataset, _FOLDER)),
         progress=progress,
     )
-    return AdaptingResult(division.text, dataset.head.simulated, spec, scores)
+    return AdaptingResult(division.text, run.dataset.head.simulated, spec, scores)
 
 
 # Part of every job's id: increase it when the meaning of a stored fold changes.
@@ -600,49 +596,46 @@ _FOLDER = "adapting"
 class _FoldWork:
     """The work of one fold: train its network, or load it, and adapt it to each person who was left out."""
 
-    config: RunConfig
-    arch: Arch
-    gestures: GestureSet
+    run: Run
     choice: ChoiceSpec
     spec: PersonalSpec
     int8: bool
 
-    def key(self, dataset: Dataset, windows: WindowSet) -> dict[str, Any]:
+    def key(self, windows: WindowSet) -> dict[str, Any]:
         """Return what the result of every fold depends on."""
-        times = sorted((r.id, r.epoch_ms) for r in dataset.recordings)
+        times = sorted((r.id, r.epoch_ms) for r in self.run.dataset.recordings)
         tried = {"choice": vars(self.choice), "spec": asdict(self.spec), "int8": self.int8, "times": times}
-        return {"version": _VERSION, **self._network_key(dataset, windows), "tried": tried}
+        return {"version": _VERSION, **self._network_key(windows), "tried": tried}
 
-    def _network_key(self, dataset: Dataset, windows: WindowSet) -> dict[str, Any]:
+    def _network_key(self, windows: WindowSet) -> dict[str, Any]:
         return {
             "windows": windows_fingerprint(windows),
-            "arch": self.arch.to_dict(),
-            "layout": dataset.layout.to_dict(),
-            "training": self.config.training.key(),
+            "arch": self.run.network.to_dict(),
+            "layout": self.run.dataset.layout.to_dict(),
+            "training": self.run.training.key(),
         }
 
-    def __call__(self, shared: tuple[Dataset, WindowSet], task: Fold, report: Report, /) -> Result:
-        dataset, windows = shared
-        bundle = self._bundle_of(dataset, windows, task, report)
+    def __call__(self, windows: WindowSet, task: Fold, report: Report, /) -> Result:
+        bundle = self._bundle_of(windows, task, report)
         predictors = _predictors(bundle, self.int8)
-        times = {r.id: r.epoch_ms for r in dataset.recordings}
+        times = {r.id: r.epoch_ms for r in self.run.dataset.recordings}
         people = [
             HeldOutPerson(who, predictors, partial(_adapt_to, bundle, who, self.spec, self.int8))
             for who in task.subjects
         ]
         return {"people": [asdict(try_adapting(windows, person, times, self.choice)) for person in people]}
 
-    def _bundle_of(self, dataset: Dataset, windows: WindowSet, fold: Fold, report: Report) -> Bundle:
+    def _bundle_of(self, windows: WindowSet, fold: Fold, report: Report) -> Bundle:
         """Return the fold's network from the cache, or train it."""
-        made = json.dumps({**self._network_key(dataset, windows), "fold": fold_fingerprint(fold)}, sort_keys=True)
+        run, dataset, arch = self.run, self.run.dataset, self.run.network
+        made = json.dumps({**self._network_key(windows), "fold": fold_fingerprint(fold)}, sort_keys=True)
         path = dataset.path / CACHE / _FOLDER / f"{hashlib.sha256(made.encode()).hexdigest()[:32]}.plush"
         if path.exists():
             return Bundle.load(path)
         from plushsense.training.fit import fit
 
         mine = windows.take(fold.train)
-        training, arch = self.config.training, self.arch
-        fitted = fit(mine, windows.take(fold.validation), arch, training, lambda at, of, row: report((at, of)))
+        fitted = fit(mine, windows.take(fold.validation), arch, run.training, lambda at, of, row: report((at, of)))
         origin = {
             "dataset": dataset.head.name,
             "dataset_hash": dataset.hash,
@@ -655,9 +648,9 @@ class _FoldWork:
             fitted.weights,
             dataset.layout,
             fitted.scaler,
-            self.gestures,
-            self.config.to_dict()["windows"],
-            self.config.live.to_dict(),
+            run.gestures,
+            asdict(run.windows),
+            run.live.to_dict(),
             origin,
             calibration(arch, fitted.weights, fitted.scaler, mine.integers),
         )
