@@ -231,9 +231,8 @@ NEW = {
     "import": "dest",
     "simulate": "out dataset",
     "export": "out",
-    "pseudonymise": "out",
+    "publish": "out",
     "backup": "file",
-    "restore": "dest",
     "merge": "out",
 }
 # What stands on the pages for something that is not here, and what stands in for it.

@@ -24,6 +24,7 @@ from plushsense.experiments.search.run import search
 from plushsense.experiments.streams.run import BenchmarkSpec, stream_benchmark
 from plushsense.experiments.sweep.run import sweep
 from plushsense.workflow.api import unfinished
+from plushsense.workflow.datasets import PublishSpec, share_copy
 
 PERSON = "Yv0nne-77"
 SMALL: dict[str, Any] = {"filters": (2, 3, 3), "context": "loop", "epochs": 2, "workers": 1}
@@ -207,7 +208,7 @@ def test_no_byte_of_the_person_is_left_that_is_not_listed(
     ps.evaluate(dataset, split="by-subject:2", out=dataset / "results" / "mine", workers=1, **net)
     shutil.copytree(dataset / "results" / "mine", dataset / "evaluations" / "mine")
     assert cli("backup", dataset, home / "backups" / "b.zip").status == 0
-    assert cli("pseudonymise", dataset, home / "copy", "--key", home / "key.csv").status == 0
+    assert share_copy(dataset, home / "copy", PublishSpec(key=home / "key.csv", pseudonyms=True)).files > 0
     shutil.copytree(folder.parent / "src" / PERSON, home / "recordings" / PERSON)
     shutil.copytree(folder.parent / "src" / PERSON, home / "discarded" / "recordings" / PERSON)
     for place, text in {

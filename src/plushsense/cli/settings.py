@@ -22,6 +22,21 @@ def listed(*values: str) -> list[str]:
     return [word.strip() for value in values for word in value.split(",") if word.strip()]
 
 
+def seconds_between(option: str, text: str) -> tuple[float | None, float | None]:
+    """Return the seconds of ``FROM:TO``; None where one is left out.
+
+    Raises:
+        ConfigError: for another text; the message names ``option``.
+    """
+    start, colon, stop = text.partition(":")
+    try:
+        if not colon:
+            raise ValueError
+        return (float(start) if start.strip() else None, float(stop) if stop.strip() else None)
+    except ValueError:
+        raise ConfigError(f"{option} was given '{text}': seconds as FROM:TO are accepted, such as 0.35:2.1.") from None
+
+
 _MOST_SEEDS = 1000
 _GRID_OPTIONS = (
     *("architectures", "filters", "batches", "padding", "norm", "scaling", "weight_decay", "context", "classes"),

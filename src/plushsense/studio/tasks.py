@@ -19,7 +19,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,6 @@ from plushsense.dataset.importing.archives import UnpackLimits
 from plushsense.dataset.importing.importers import import_recordings, propose
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.privacy.forget import forget
-from plushsense.dataset.privacy.pseudonymise import pseudonymise
 from plushsense.dataset.publishing.checking import validate_package
 from plushsense.dataset.store import HEAD
 from plushsense.deploy.profile import profile
@@ -44,7 +43,7 @@ from plushsense.studio.pages.export.exports import folder_digest
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import simulate, train, unfinished
 from plushsense.workflow.config import from_settings
-from plushsense.workflow.datasets import check_dataset, publish_dataset
+from plushsense.workflow.datasets import PublishSpec, check_dataset, publish_dataset
 from plushsense.workflow.export import export
 from plushsense.workflow.networks import FIRST_NETWORK, REFIT
 from plushsense.workflow.preparation import count_people, refits
@@ -251,29 +250,9 @@ def run_simulate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
     return {"dataset": str(spec["dest"]), "recordings": done["recordings"], "people": done["people"]}
 
 
-def run_pseudonymise(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Write a pseudonymised copy of ``dataset`` to ``place``; the other keys are arguments of `pseudonymise`.
-
-    Raises:
-        ConfigError: if ``words`` is missing, as in a job resumed after a restart, because words are never stored.
-    """
-    if "words" not in spec:
-        message = "The words to remove are not stored: enter them again on the publish page."
-        raise ConfigError(message, reason="words_not_stored")
-    done = pseudonymise(
-        spec["dataset"],
-        spec["place"],
-        key=spec["key"],
-        words=spec["words"],
-        drop_notes=spec.get("drop_notes", False),
-        progress=partial(reporter.stage, "rewriting"),
-    )
-    return done.to_dict()
-
-
 def run_backup(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Write the data set ``dataset`` into the new backup ``place``."""
-    return {**backup(spec["dataset"], spec["place"], progress=reporter.count).to_dict(), "dataset": spec["dataset"]}
+    return {**asdict(backup(spec["dataset"], spec["place"], progress=reporter.count)), "dataset": spec["dataset"]}
 
 
 def run_restore(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -302,7 +281,7 @@ def run_forget(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
 
 
 def run_publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Publish ``dataset`` as the package ``place``; the other keys are arguments of `publish_dataset`."""
+    """Publish ``dataset`` as the package ``place``; the other keys are those of `PublishSpec`."""
     key = spec.get("key") or None
     if key is not None:
         try:
@@ -313,7 +292,7 @@ def run_publish(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
             raise DatasetError(message, reason="key_not_written", file=file, why=why) from None
     options = {name: value for name, value in spec.items() if name not in ("dataset", "place")}
     options |= {"columns": tuple(spec.get("columns", ())), "key": key}
-    return publish_dataset(spec["dataset"], spec["place"], **options, progress=reporter.stage).to_dict()
+    return publish_dataset(spec["dataset"], spec["place"], PublishSpec(**options), reporter.stage).to_dict()
 
 
 def run_validate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -557,7 +536,6 @@ TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
     "simulate": run_simulate,
     "profile": run_profile,
     "validate": run_validate,
-    "pseudonymise": run_pseudonymise,
     "backup": run_backup,
     "restore": run_restore,
     "forget": run_forget,

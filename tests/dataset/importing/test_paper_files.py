@@ -13,9 +13,8 @@ from plushsense.dataset.importing.build import ImportSummary, group_flags
 from plushsense.dataset.importing.importers import import_recordings, preview_import
 from plushsense.dataset.importing.truncation import CHOICES
 from plushsense.dataset.index import open_dataset
-from plushsense.dataset.labelling import relabel
+from plushsense.dataset.labelling import relabel_recordings
 from plushsense.dataset.marks import BY_HAND, read_marks
-from plushsense.dataset.privacy.pseudonymise import pseudonymise
 from plushsense.dataset.quality.checking import check
 from support import paper_scripts as scripts
 from support.real_times import as_if_real
@@ -199,7 +198,7 @@ def test_a_correction_after_the_import_reaches_the_data_set(labelled: Path, tmp_
     first, other = sorted((folder / "Tail pull").glob("*.csv"))[:2]
     for path in (first, other):
         path.rename(folder / "Tail tap 2" / path.name)
-    relabel(open_dataset(tmp_path / "DS"), [f"unknown/{other.stem}"], "Back stroke 1", "K")
+    relabel_recordings(open_dataset(tmp_path / "DS"), [f"unknown/{other.stem}"], "Back stroke 1", "K")
     done = import_recordings(labelled, tmp_path / "DS", add_to=True)
     labels = {Path(r.file).name: r.gesture for r in done.dataset.recordings}
     assert (labels[first.name], labels[other.name]) == ("Tail tap 2", "Back stroke 1"), "a person's mark stays"
@@ -219,7 +218,7 @@ def test_later_moves_reach_the_data_set_until_a_person_decides(labelled: Path, t
         (folder / before / name).rename(folder / after / name)
         assert label() == after
         before = after
-    relabel(open_dataset(tmp_path / "DS"), [f"unknown/{name.removesuffix('.csv')}"], "", "K")
+    relabel_recordings(open_dataset(tmp_path / "DS"), [f"unknown/{name.removesuffix('.csv')}"], "", "K")
     assert label() == "Tail pull", "a person's undo stays"
 
 
@@ -273,18 +272,6 @@ def test_choices_that_cannot_be_used(labelled: Path, tmp_path: Path) -> None:
     done = imported(labelled, tmp_path / "other")
     assert done.trimmed == 0
     assert any("1 do not fit" in w for w in kinds(done))
-
-
-def test_pseudonyms_shift_the_time_in_such_a_name_and_keep_its_mark(labelled: Path, tmp_path: Path) -> None:
-    (odd,) = (labelled / scripts.LABELLED).rglob("* (1).csv")
-    scripts.choose(labelled, every=1)
-    imported(labelled, tmp_path / "DS")
-    pseudonymise(tmp_path / "DS", tmp_path / "OUT", key=tmp_path / "key.csv")
-    done = open_dataset(tmp_path / "OUT")
-    (found,) = (r for r in done.recordings if r.id.endswith(" (1)"))
-    assert Path(found.file).name != odd.name
-    assert (found.gesture, found.start) == ("Tail pull", 40)
-    assert "plushsense import" in (tmp_path / "OUT" / "marks.jsonl").read_text()
 
 
 def test_flags_of_one_kind_are_one_warning() -> None:

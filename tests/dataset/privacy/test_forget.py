@@ -8,6 +8,7 @@ import shutil
 import tempfile
 import zipfile
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from plushsense.core.errors import DatasetError, ForgottenError
 from plushsense.core.files import temporary_folder, work_folder
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
+from plushsense.dataset import files as dataset_files
 from plushsense.dataset import index
 from plushsense.dataset.importing import adding, importers
 from plushsense.dataset.importing.importers import import_recordings
@@ -286,12 +288,12 @@ def test_an_index_that_still_names_the_person_is_made_anew(folder: Path) -> None
     assert open_dataset(folder).subjects == ["P11", "P2"]
 
 
-@pytest.mark.parametrize("slow", ["build_index", "current_stamp"])
+@pytest.mark.parametrize(("module", "slow"), [(index, "build_index"), (dataset_files, "_index_hashes")])
 def test_who_opens_meanwhile_sees_and_writes_the_data_set_of_afterwards(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, slow: str
+    folder: Path, monkeypatch: pytest.MonkeyPatch, module: ModuleType, slow: str
 ) -> None:
     (folder / "index.json").unlink()
-    real, begun = getattr(index, slow), list[bool]()
+    real, begun = getattr(module, slow), list[bool]()
 
     def meanwhile(*args: Any) -> Any:
         found = real(*args)
@@ -300,7 +302,7 @@ def test_who_opens_meanwhile_sees_and_writes_the_data_set_of_afterwards(
             forget(folder, "P1")
         return found
 
-    monkeypatch.setattr(index, slow, meanwhile)
+    monkeypatch.setattr(module, slow, meanwhile)
     assert open_dataset(folder).subjects == ["P11", "P2"]
     assert not any("P1/" in (folder / name).read_text() for name in INDEX)
 
