@@ -27,12 +27,12 @@ import plushsense as ps
 from plushsense.core.errors import PlushSenseError
 from plushsense.experiments.baselines.run import ComparisonSpec, baselines
 from plushsense.experiments.baselines.score import UNSCALED, Pca, reads
+from plushsense.experiments.sweep.grid import CHOSEN
 from plushsense.experiments.sweep.report import training_settings
 from plushsense.experiments.sweep.results import read_sweep
 from plushsense.experiments.sweep.run import sweep
 from plushsense.experiments.sweep.tables import TABLE4
 from plushsense.scoring.splits import make_folds, parse_split
-from plushsense.trials.grid import CHOSEN
 from plushsense.windows.cut import WindowSpec
 
 UNTESTED = "Untested on the original archive, which was not available to this project."
@@ -171,7 +171,7 @@ class Paper:
             out=self.out / "sweeps" / f"{symbol}-{self.seeds}-{grid}{'-quick' * self.quick}",
         )
         results = read_sweep(swept.out)
-        described = [("Split", swept.summary["split"]), ("Context", swept.summary["context"])]
+        described = [("Split", swept.head.split), ("Context", swept.head.context)]
         described += [("Padding", swept.trials["padding"][0]), *training_settings(results)]
         self.settings[grid] = "; ".join(f"{key.lower()}: {value}" for key, value in described)
         tested = swept.runs["test_windows"][0]

@@ -49,8 +49,7 @@ def test_every_verb_has_help(verb: str, capsys: pytest.CaptureFixture[str]) -> N
     [
         ["--help"],
         ["arch", "14d1", "--filters", "8"],
-        ["search", "no-such-folder"],
-        *([v, "--help"] for v in ("info", "sweep", "search", "baselines")),
+        *([v, "--help"] for v in ("info", "sweep", "baselines")),
     ],
 )
 def test_light_verbs_load_nothing_heavy(words: list[str]) -> None:

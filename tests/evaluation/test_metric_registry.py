@@ -15,7 +15,7 @@ from plushsense.evaluation.crossval import compare_deployed
 from plushsense.evaluation.scores import FoldRecord, Predictions, compute_scores
 from plushsense.experiments.sweep import mlflow, tables as sweep
 from plushsense.reports import evaluation as report
-from plushsense.trials import tables as trials
+from plushsense.experiments.sweep import folder, trials
 
 n = 12
 subject = np.repeat(["P1", "P2"], n // 2)
@@ -36,7 +36,7 @@ assert "kappa           0.250" in text and "kappa lost          0.000" in text
 assert report.metric_table({**head, **found}).rows[-2]["name"] == "Kappa"
 assert report.subject_rows([found])[0]["cells"][0]["kappa"] == "0.25"
 assert len(report.comparison_rows([{**head, **found, "title": "t"}])[0]["scores"]) == 3
-assert {"kappa", "kappa_sd"} <= trials.TRIAL_COLUMNS.keys() and "kappa" in trials._RUN_COLUMNS
+assert {"kappa", "kappa_sd"} <= trials.TRIAL_COLUMNS.keys() and "kappa" in folder._RUN_COLUMNS
 assert {"kappa", "kappa_sd"} <= set(mlflow._METRICS)
 assert "Kappa" in [c.head for c in trials.listed_columns(terminal=True)]
 assert [c.head for c in sweep._metric_columns(without="accuracy")] == ["Macro-F1", "Kappa"]

@@ -20,7 +20,6 @@ from plushsense.dataset.privacy.forget import forget
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.adaptation import evaluate_adapting
 from plushsense.experiments.baselines.run import ComparisonSpec, baselines
-from plushsense.experiments.search.run import search
 from plushsense.experiments.streams.run import BenchmarkSpec, stream_benchmark
 from plushsense.experiments.sweep.run import sweep
 from plushsense.workflow.api import unfinished
@@ -72,8 +71,8 @@ def run_sweep(ds: Dataset, out: Path, hook: Hook) -> None:
     sweep(ds, epochs=(1, 2), split="by-subject:2", out=out, progress=hook, **GRID)
 
 
-def run_search(ds: Dataset, out: Path, hook: Hook) -> None:
-    search(ds, rungs=(1, 2), share=1.0, split="by-subject:2", out=out, progress=hook, **GRID)
+def run_halving(ds: Dataset, out: Path, hook: Hook) -> None:
+    sweep(ds, halving=True, epochs=(1, 2), share=1.0, split="by-subject:2", out=out, progress=hook, **GRID)
 
 
 def run_streams(ds: Dataset, out: Path, hook: Hook) -> None:
@@ -91,7 +90,7 @@ def run_train(ds: Dataset, out: Path, hook: Hook) -> None:
 
 
 RUNS = (
-    run_evaluate, run_evaluate_in_processes, run_baselines, run_sweep, run_search, run_streams,
+    run_evaluate, run_evaluate_in_processes, run_baselines, run_sweep, run_halving, run_streams,
 )  # fmt: skip
 
 

@@ -139,7 +139,7 @@ def _sweep_report(args: argparse.Namespace) -> int:
             f"'{args.out}' is a sweep: --dataset, --evaluation, --model and --recording are for a page of evaluations."
         )
     done = write_sweep_report(args.out, args.page, title=args.title, mlflow=args.mlflow)
-    emit(args, done, [f"{done['report']}: {done['done']} of {plural(done['trials'], 'trial')}", *done["said"]])
+    emit(args, done.to_json(), [f"{done.report}: {done.done} of {plural(done.trials, 'trial')}", *done.summary])
     return 0
 
 

@@ -304,9 +304,9 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     """Train and save a bundle; for a dry run, return only the estimate made by `preview_training`."""
     config = from_settings(**spec.get("settings", {}))
     if spec.get("dry"):
-        from plushsense.trials.estimate import preview_training
+        from plushsense.workflow.estimate import preview_training
 
-        return preview_training(spec["dataset"], config, warn=reporter.warn)
+        return preview_training(spec["dataset"], config, warn=reporter.warn).to_json()
     out = Path(spec["out"])
     check_folder(out.parent, "A bundle")
     reporter.progress(stage="reading", share=0.0)
@@ -351,7 +351,7 @@ def run_make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     out = Path(spec["out"])
     reporter.progress(stage="reading", share=0.0)
 
-    from plushsense.trials.budget import BudgetProgress, make_network
+    from plushsense.workflow.budget import BudgetProgress, make_network
     from plushsense.workflow.reporting import load_evaluation
 
     clock = Clock()
@@ -371,7 +371,7 @@ def run_make(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         progress=report,
         warn=reporter.warn,
     )
-    return {**_evaluation(load_evaluation(done["evaluation"])), **done, "out": done["evaluation"]}
+    return {**_evaluation(load_evaluation(done.evaluation)), **done.to_json(), "out": str(done.evaluation)}
 
 
 def _evaluation(table: dict[str, Any]) -> dict[str, Any]:
@@ -393,9 +393,9 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
     if spec.get("split"):
         config = config.for_split(spec["split"])
     if spec.get("dry"):
-        from plushsense.trials.estimate import preview_evaluation
+        from plushsense.workflow.estimate import preview_evaluation
 
-        return preview_evaluation(spec["dataset"], config, warn=reporter.warn)
+        return preview_evaluation(spec["dataset"], config, warn=reporter.warn).to_json()
     reporter.progress(stage="reading", share=0.0)
 
     from plushsense.workflow.api import evaluate_run
@@ -419,51 +419,32 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
 
 
 def run_sweep(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Run a sweep; return the folder ``out`` and main values of the summary, or the preview for a dry run."""
-    from plushsense.experiments.sweep.run import preview, sweep
+    """Run a sweep; return the folder ``out`` and main values of the result, or the preview for a dry run."""
+    from plushsense.experiments.sweep.run import SweepProgress, preview, sweep
 
     changes = dict(spec.get("changes", {}))
     if spec.get("dry"):
-        return preview(spec["dataset"], spec["grid"], measure=True, warn=reporter.warn, **changes)
+        return preview(spec["dataset"], spec["grid"], measure=True, warn=reporter.warn, **changes).to_json()
     reporter.progress(stage="reading", share=0.0)
     clock = Clock()
 
-    def training(at: JobProgress) -> None:
+    def training(at: SweepProgress) -> None:
         row = at.best and at.best.row
         best = row and {key: row[key] for key in ("arch", "filters", "accuracy", "macro_f1")}
-        counts = {"done": at.done, "trainings": at.total, "resumed": at.resumed, "what": at.name}
-        reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, best=best, **counts, **clock.at(at.share))
-
-    done = sweep(spec["dataset"], spec["grid"], progress=training, warn=reporter.warn, **changes)
-    s = done.summary
-    for lost in s["failed"]:
-        network = f"{lost['arch']} {lost['filters']}"
-        reporter.warn(Sentence(f"{network} was given up: {lost['why']}", "network_lost", network=network))
-    keys = ("name", "split", "leaky", "context", "simulated", "trials", "done", "trainings_lost", "best", "seconds")
-    return {"out": str(done.out), **{key: s[key] for key in keys}}
-
-
-def run_search(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
-    """Run a search; return the folder ``out`` and main values of the summary, or the preview for a dry run."""
-    from plushsense.experiments.search.run import preview_search, search
-
-    changes = {**spec.get("asked", {}), **spec.get("changes", {})}
-    if spec.get("dry"):
-        return preview_search(spec["dataset"], spec["grid"], measure=True, warn=reporter.warn, **changes)
-    reporter.progress(stage="reading", share=0.0)
-    clock = Clock()
-
-    def training(at: Any) -> None:
-        best = at.best and {"title": at.best.name, "macro_f1": at.best.score}
-        counts = {"rung": at.rung, "rungs": at.rungs, "networks": at.networks, "what": at.name}
-        counts |= {"done": at.done, "trainings": at.total, "resumed": at.resumed}
+        counts: dict[str, Any] = {"done": at.done, "trainings": at.total, "resumed": at.resumed, "what": at.name}
+        if at.rung:
+            counts |= {"rung": at.rung, "rungs": at.rungs, "networks": at.networks}
         share = min(1.0, at.share)
         reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, best=best, **counts, **clock.at(share))
 
-    done = search(spec["dataset"], spec["grid"], progress=training, warn=reporter.warn, **changes)
-    s = done.summary
-    keys = ("name", "split", "leaky", "context", "simulated", "candidates", "winner", "smallest_equal", "seconds")
-    return {"out": str(done.out), **{key: s[key] for key in keys}, "command": s["command"]}
+    done = sweep(spec["dataset"], spec["grid"], progress=training, warn=reporter.warn, **changes)
+    for lost in done.failed:
+        network = f"{lost.arch} {lost.filters}"
+        reporter.warn(Sentence(f"{network} was given up: {lost.why}", "network_lost", network=network))
+    keys = ("name", "split", "leaky", "context", "simulated", "trials", "done", "trainings_lost", "best", "seconds")
+    stored = done.to_json()
+    halving = {key: stored["halving"][key] for key in ("winner", "smallest_equal")} if done.halving else {}
+    return {"out": str(done.out), **{key: stored[key] for key in keys}, **halving}
 
 
 def run_profile(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
@@ -526,7 +507,7 @@ TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {
     "make": run_make,
     "train": run_train,
     "sweep": run_sweep,
-    "search": run_search,
+    "search": run_sweep,
     "evaluate": run_evaluate,
     "import": run_import,
     "inspect": run_inspect,
