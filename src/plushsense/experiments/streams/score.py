@@ -7,7 +7,7 @@ PyTorch. The journal stores a finished fold as counts (some kilobytes), without 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -399,9 +399,9 @@ def _at_recall(counts: Mapping[str, NDArray[np.float64]]) -> list[dict[str, Any]
     return rows
 
 
-def pooled_scores(scores: Mapping[str, StreamScore]) -> dict[str, Any]:
-    """Return the scores of all people together as one table, with a row for each person."""
+def pooled_scores(scores: Iterable[StreamScore]) -> StreamScore:
+    """Return the scores of all people together."""
     whole = StreamScore()
-    for mine in scores.values():
-        whole.add(mine)
-    return {**whole.to_dict(), "people": {person: mine.to_dict() for person, mine in scores.items()}}
+    for one in scores:
+        whole.add(one)
+    return whole
