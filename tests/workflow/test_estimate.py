@@ -20,9 +20,9 @@ def test_a_training_is_told_as_it_then_is(dataset: Dataset) -> None:
     arch = done.bundle.arch
     assert told.parameters == arch.parameters
     assert told.classes == len(done.bundle.gestures)
-    assert (told.split, told.leaky, told.epochs) == (done.scores["split"], False, 2)
+    assert (told.split, told.leaky, told.epochs) == (done.scores.split, False, 2)
     # Once without the people held back, once on everybody.
-    trained = 2 * told.windows - done.scores["windows"]
+    trained = 2 * told.windows - done.scores.windows
     assert told.macs == PASSES * arch.macs_per_window * trained * 2
     assert told.seconds > 0
     longer = preview_training(dataset, replace(CONFIG, training=replace(CONFIG.training, epochs=200)))
@@ -33,7 +33,7 @@ def test_an_evaluation_is_told_as_it_then_is(dataset: Dataset) -> None:
     config = replace(CONFIG, evaluation=replace(CONFIG.evaluation, split="windows:3", workers=1))
     told = preview_evaluation(dataset, config)
     done = ps.evaluate(dataset, config)
-    sizes = [fold["train_windows"] for fold in done.table["folds"]]
+    sizes = [fold.record.windows[0] for fold in done.scores.folds]
     assert (told.split, told.leaky, told.folds) == ("windows:3", True, len(sizes))
     arch = prepare(dataset, config).network
     assert told.macs == PASSES * arch.macs_per_window * sum(sizes) * 2

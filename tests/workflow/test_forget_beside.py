@@ -20,7 +20,7 @@ from plushsense.dataset.privacy.forget import forget
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.adaptation import evaluate_adapting
 from plushsense.experiments.baselines.run import ComparisonSpec, baselines
-from plushsense.experiments.streams.run import stream_benchmark
+from plushsense.experiments.streams.run import BenchmarkSpec, stream_benchmark
 from plushsense.experiments.sweep.run import sweep
 from plushsense.workflow.api import unfinished
 from plushsense.workflow.datasets import PublishSpec, share_copy
@@ -76,7 +76,8 @@ def run_halving(ds: Dataset, out: Path, hook: Hook) -> None:
 
 
 def run_streams(ds: Dataset, out: Path, hook: Hook) -> None:
-    stream_benchmark(ds, split="by-subject:2", systems=("argmax", "hysteresis"), out=out, progress=hook, **SMALL)
+    spec = BenchmarkSpec("by-subject:2", ("argmax", "hysteresis"))
+    stream_benchmark(ds, spec=spec, out=out, progress=hook, **SMALL)
 
 
 def run_adapting(ds: Dataset, out: Path, hook: Hook) -> None:

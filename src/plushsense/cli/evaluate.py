@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         warn=warn,
     )
     report = write_report(out / PAGE, dataset, [out])
-    content = {**result.to_dict(), "out": str(out), "report": str(report), "simulated": dataset.head.simulated}
+    content = {**result.to_json(), "out": str(out), "report": str(report), "simulated": dataset.head.simulated}
     say(f"written: {out}")
     emit(args, content, lines(content))
     return 0

@@ -12,6 +12,7 @@ from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
     from plushsense.jobs.progress import JobProgress
+    from plushsense.training.spec import EpochProgress, EpochRow
     from plushsense.workflow.config import RunConfig
 
 SIMULATION = "SIMULATION: these scores say nothing about a real toy."
@@ -80,11 +81,11 @@ def settings(args: argparse.Namespace, **evaluation: Any) -> RunConfig:
     )
 
 
-def report_epochs(title: str = "training") -> Callable[[int, int, dict[str, Any]], None]:
+def report_epochs(title: str = "training") -> EpochProgress:
     """Return a callback that displays the epochs of one training."""
     reporters: dict[str, ProgressReporter] = {}
 
-    def report(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+    def report(epoch: int, epochs: int, row: EpochRow) -> None:
         loss = row["train_loss"]  # the loss of fine-tuning is of another kind, and small
         text = f"loss {loss:{'.3f' if loss >= 0.01 else '.1e'}}"
         if row["accuracy"] is not None:

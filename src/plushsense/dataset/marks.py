@@ -91,8 +91,8 @@ class MarkState:
     """State of a recording or a stream after all its marks.
 
     ``accepted`` holds the checks whose findings are accepted; ``how`` is that of the current trim. ``stretches`` of a
-    stream are ordered and do not overlap. ``gesture`` is "" if it is the recorded one. ``trim_by`` and ``gesture_by``
-    name who decided last on the trim and on the gesture, also to undo them; "" if nobody did.
+    stream are ordered and do not overlap. ``gesture`` is "" if it is the recorded one. ``excluded_by``, ``trim_by`` and
+    ``gesture_by`` name who decided last on these, also to undo them; "" if nobody did.
     """
 
     excluded: bool = False
@@ -102,6 +102,7 @@ class MarkState:
     how: str = ""
     stretches: tuple[LabelledStretch, ...] = ()
     gesture: str = ""
+    excluded_by: str = field(default="", compare=False)
     trim_by: str = field(default="", compare=False)
     gesture_by: str = field(default="", compare=False)
 
@@ -339,9 +340,9 @@ def apply_mark(now: MarkState, mark: Mark) -> MarkState:
         case "untrim":
             return replace(now, start=0, stop=-1, how="", trim_by=mark.who)
         case "exclude":
-            return replace(now, excluded=True)
+            return replace(now, excluded=True, excluded_by=mark.who)
         case "include":
-            return replace(now, excluded=False)
+            return replace(now, excluded=False, excluded_by=mark.who)
         case "relabel":
             return replace(now, gesture=mark.gesture, gesture_by=mark.who)
         case "accept":

@@ -40,6 +40,7 @@ from plushsense.deploy.proof.verify import verify
 from plushsense.jobs.progress import JobProgress
 from plushsense.studio.app.jobs import UNFINISHED
 from plushsense.studio.app.workspace import folder_digest
+from plushsense.training.spec import EpochRow
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import simulate, train, unfinished
 from plushsense.workflow.config import from_settings
@@ -137,12 +138,12 @@ def run_import(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         "dataset": str(spec["dest"]),
         "recordings": done.recordings,
         "subjects": done.subjects,
-        "added": done.added,
+        "added": done.to_json()["added"],
         "already_there": done.already_there,
-        "warnings": done.notes,
+        "warnings": list(done.notes),
         "flagged": len(done.warnings),
-        "left_out": done.left_out,
-        "rejected": done.rejected,
+        "left_out": [entry.to_json() for entry in done.left_out],
+        "rejected": [entry.to_json() for entry in done.rejected],
         "seconds": round(done.seconds, 2),
     }
 
@@ -205,14 +206,12 @@ def run_inspect(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
             rejected.append({"file": source.name, "reason": refusal.message})
             continue
         notes += done.notes
-        rejected += done.rejected
+        rejected += [entry.to_json() for entry in done.rejected]
         flagged += len(done.warnings)
     if not dest.exists():
         raise refusals[0]
     if len(sources) > 1:
-        before = len(done.notes)
-        propose(done, adopting=True)
-        notes += done.notes[before:]
+        notes += propose(done, adopting=True).notes[len(done.notes) :]
     dataset = open_dataset(dest)
     return {
         "name": dataset.head.name if restored else "",
@@ -307,7 +306,7 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     first = epochs if config.windows.context == ANYWHERE and config.anywhere.hard_share > 0 else 0
     each, again = first + epochs + tuning, refits(config, count_people(open_dataset(spec["dataset"])))
 
-    def epoch(at: int, of: int, row: dict[str, Any]) -> None:
+    def epoch(at: int, of: int, row: EpochRow) -> None:
         what = str(row.get("what", ""))
         second, part = what.startswith(REFIT), what.removeprefix(REFIT).lstrip(", ")
         past = {"": first, FIRST_NETWORK: 0}.get(part, first + epochs)
@@ -330,7 +329,7 @@ def run_train(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
     bundle = done.save(free_path(out, done.bundle.to_bytes()))
     return {
         "bundle": str(bundle),
-        "scores": done.scores,
+        "scores": done.scores.to_json(),
         "seconds": round(done.seconds, 1),
         "parameters": done.bundle.arch.parameters,
         "title": done.bundle.arch.title,

@@ -23,10 +23,12 @@ from plushsense.core.errors import PlushSenseError, python_warning
 from plushsense.core.files import free_path, write_file
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
+from plushsense.evaluation.scores import Scores
 from plushsense.jobs.journal import job_id
 from plushsense.jobs.progress import JobProgress
 from plushsense.models.bundle import Bundle
 from plushsense.scoring.metrics import summary
+from plushsense.training.spec import EpochRow
 from plushsense.windows.cut import ANYWHERE
 from plushsense.workflow.api import evaluate_run, train, unfinished
 from plushsense.workflow.config import RunConfig, from_settings
@@ -191,7 +193,9 @@ def learning_curve(points: Mapping[int, Mapping[str, float | None]], more: int =
     step = math.log((sizes[-1] + more) / sizes[-1])
     gain = summary(slopes * step)
     means = tuple((m, float(table[:, k].mean())) for k, m in enumerate(sizes))
-    return LearningCurve(means, more, gain["mean"], tuple(gain["ci95"]))
+    if gain.mean is None or gain.ci95 is None:
+        return None
+    return LearningCurve(means, more, gain.mean, gain.ci95)
 
 
 @dataclass(frozen=True)
@@ -327,10 +331,10 @@ class _Making:
         """Train the network and save it; return its path, and the seconds that one training on everybody took."""
         whole, again, progress = sum(_work(plan, self._networks)), self._again, self._progress
 
-        def epoch_done(epoch: int, epochs: int, row: dict[str, Any]) -> None:
+        def epoch_done(epoch: int, epochs: int, row: EpochRow) -> None:
             second = str(row.get("what", "")).startswith(REFIT)
             done = epoch / epochs + second
-            progress(BudgetProgress(TRAINING, done / whole, row | {"epoch": epoch, "epochs": epochs}))
+            progress(BudgetProgress(TRAINING, done / whole, {**row, "epoch": epoch, "epochs": epochs}))
             if epoch == epochs and second == again:
                 progress(BudgetProgress(DECIDING, done / whole, {}))
 
@@ -356,14 +360,14 @@ class _Making:
         result = evaluate_run(run, out=out, progress=reported(EVALUATING, 1.0), warn=self._warn)
         evaluation_s = time.monotonic() - started
         before += plan.folds - 1
-        points = {plan.trained_people: _accuracies(result.table)}
+        points = {plan.trained_people: _accuracies(result.scores)}
         for size in plan.sizes:
             share = size / plan.trained_people
             if not resumed and share * evaluation_s > self._budget_s - self._seconds:
                 break
             progress = reported(LEARNING_CURVE, share)
             smaller = evaluate_run(run, training_people=size, progress=progress, warn=silent)
-            points[size] = _accuracies(smaller.table)
+            points[size] = _accuracies(smaller.scores)
             before += (plan.folds - 1) * share
         return learning_curve(points)
 
@@ -411,8 +415,8 @@ def _work(plan: BudgetPlan, networks: int) -> list[float]:
     return [float(networks), evaluation, *(evaluation * size / plan.trained_people for size in plan.sizes)]
 
 
-def _accuracies(table: Mapping[str, Any]) -> dict[str, float | None]:
-    return {row["subject"]: row["accuracy"] for row in table["subjects"]}
+def _accuracies(scores: Scores) -> dict[str, float | None]:
+    return {row.subject: row.metrics["accuracy"] for row in scores.subjects}
 
 
 def _cut(plan: BudgetPlan, learning: object, seconds: float, budget_s: float) -> tuple[Mapping[str, Any], ...]:

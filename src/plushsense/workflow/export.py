@@ -164,20 +164,26 @@ def export(
     model = integer_model(given)
     given = given.without_people()
 
-    def converted(folder: Path, facts: dict[str, Any]) -> None:
-        facts |= {"url": url} if url else {}
-        for other in dict.fromkeys(also):
-            done = convert(given, folder / CONVERTERS[other].file_name, other, windows=windows)
-            facts.setdefault("conversions", {})[other] = {
-                "file": done.path.name,
-                "bytes": done.bytes,
-                "largest_difference": done.largest_difference,
-                "notes": list(done.notes),
-            }
-
     for other in also:
         check_format(other)
+
+    def converted(folder: Path, facts: dict[str, Any]) -> None:
+        facts |= {"url": url} if url else {}
+        conversions = {other: _converted(given, folder, other, windows) for other in dict.fromkeys(also)}
+        facts |= {"conversions": conversions} if conversions else {}
+
     return emit(model, given, Path(out), extras=[converted, package], name=name)
+
+
+def _converted(bundle: Bundle, folder: Path, name: str, windows: NDArray[np.int32] | None) -> dict[str, Any]:
+    """Write the network in the format ``name``; return the facts about the file."""
+    done = convert(bundle, folder / CONVERTERS[name].file_name, name, windows=windows)
+    return {
+        "file": done.path.name,
+        "bytes": done.bytes,
+        "largest_difference": done.largest_difference,
+        "notes": list(done.notes),
+    }
 
 
 @dataclass(frozen=True)

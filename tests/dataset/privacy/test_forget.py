@@ -21,7 +21,7 @@ from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import Frames, format_rows, write_recording
 from plushsense.dataset import files as dataset_files
 from plushsense.dataset import index
-from plushsense.dataset.importing import adding, importers
+from plushsense.dataset.importing import build, importers
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.marks import LOCK, MARKS, Mark, adding_locked, append_marks, read_marks
@@ -97,7 +97,7 @@ def test_stopped_between_the_last_line_and_the_end_it_is_buried_once(
 def test_who_comes_into_a_set_that_people_were_taken_out_of_is_named(folder: Path, tmp_path: Path) -> None:
     def told() -> list[str]:
         done = import_recordings(tmp_path / "src", folder, add_to=True)
-        return [w for w in done.to_dict()["warnings"] if "were removed" in w]
+        return [w for w in done.messages if "were removed" in w]
 
     (folder / "cache").mkdir(exist_ok=True)
     assert told() == []
@@ -347,7 +347,7 @@ def test_an_import_holds_the_lock_while_it_writes(folder: Path, monkeypatch: pyt
         return write
 
     for name in ("write_people", "write_marks"):
-        monkeypatch.setattr(adding, name, spy(getattr(adding, name), name))
+        monkeypatch.setattr(build, name, spy(getattr(build, name), name))
     source = folder.parent / "more" / "P3"
     source.mkdir(parents=True)
     lines = (folder.parent / "src" / "P1" / f"Wave_{10**12}_50.csv").read_text().splitlines()

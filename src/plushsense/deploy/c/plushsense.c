@@ -1906,7 +1906,7 @@ static void read_inputs(plush_toy *toy)
 }
 
 #ifdef PLUSH_CALIBRATE
-/* ---- Self-calibration: windows/calibration ---------------------------------------------------------------------- */
+/* ---- Self-calibration: windows/self_calibration ----------------------------------------------------------------- */
 
 #define MEAN_SIZE_BITS 12u
 #define SHARE_BITS 14u

@@ -26,7 +26,7 @@ from plushsense.experiments.sweep.trials import TRIAL_COLUMNS, Network, SweepHea
 from plushsense.jobs.journal import Result
 from plushsense.models.arch import slashed
 from plushsense.reports.table import Table
-from plushsense.scoring.metrics import class_rows, column_metrics
+from plushsense.scoring.metrics import class_results, column_metrics
 from plushsense.workflow.reporting import PREDICTIONS
 
 SUMMARY, SETTINGS = "sweep.json", "train.toml"
@@ -173,7 +173,10 @@ class SweepResult:
             "best_on_validation": None if chosen is None else chosen.row(),
             "predictions": dict(self.predictions),
             "confusions": {result.trial.id: result.counts.tolist() for result in detailed},
-            "per_class": {result.trial.id: class_rows(result.counts, self.head.labels) for result in detailed},
+            "per_class": {
+                result.trial.id: [row._asdict() for row in class_results(result.counts, self.head.labels)]
+                for result in detailed
+            },
             **({} if self.halving is None else {"halving": self.halving.to_json()}),
         }
 

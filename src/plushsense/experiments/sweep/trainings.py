@@ -106,7 +106,7 @@ class TrainAndScore:
             read = predict(task.arch, weights, fitted.scaler, validation, task.spec.device).argmax(axis=1)
             counts = metrics.confusion(validation.y, read.astype(np.int64), len(validation.labels))
             watched.append((metrics.accuracy(counts), metrics.macro_f1(counts)))
-        history = [] if fitted is None else fitted.history
+        history: list[dict[str, Any]] = [] if fitted is None else [dict(row) for row in fitted.history]
         result: Result = {
             "epochs": list(epochs_left),
             "at": list(epochs_left) if task.nested or fitted is None else [fitted.best_epoch],

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from plushsense.core.errors import ConfigError, PlushSenseError
 from plushsense.dataset.files import sha256_of
-from plushsense.dataset.importing.build import DEVICE_NAME
+from plushsense.dataset.importing.archives import DEVICE_NAME
 from plushsense.dataset.index import change_head
 from plushsense.dataset.publishing.tables import list_package_files
 from plushsense.dataset.store import DatasetHead

@@ -22,8 +22,8 @@ from plushsense.core.layouts import layout_names, load_layout
 from plushsense.core.recorder_csv import STREAM_NAME, parse_name
 from plushsense.core.sentences import Message
 from plushsense.dataset.importing.archives import UnpackLimits, member_target
-from plushsense.dataset.importing.build import SIMULATED
-from plushsense.dataset.importing.importers import LAYOUT_GUESSED
+from plushsense.dataset.importing.results import SIMULATED
+from plushsense.dataset.importing.sources import LAYOUT_GUESSED
 from plushsense.dataset.store import HEAD, UNKNOWN_SUBJECT, DatasetHead
 from plushsense.models.bundle import Bundle
 from plushsense.studio.app.guard import UPLOAD_BYTES
