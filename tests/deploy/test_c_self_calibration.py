@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plushsense.core.layouts import MOST_CALIBRATED_OTHER, Channel
-from plushsense.deploy.emit import LIBRARY, library_text
+from plushsense.deploy.code import CALIBRATE, LIBRARY, library_files
 from plushsense.deploy.golden import answers_of
 from plushsense.deploy.quantize import integer_model
 from plushsense.runtime.image import IntegerModel, image_head, memory_bytes
@@ -55,12 +55,11 @@ def test_each_library_takes_its_own_models(c_library: Any, calibrated_library: A
     model = calibrated_model()
     assert seat(calibrated_library, model).status == OK
     assert seat(c_library, model).status == seat(calibrated_library, vector_model()).status == OTHER_VERSION
-    for name in LIBRARY:
-        text, without = library_text(name, calibrate=True), library_text(name)
-        assert "PLUSH_CALIBRATE" not in text + without and "plush_sensor" in text and "plush_sensor" not in without
-    versions = (library_text(LIBRARY[0]), library_text(LIBRARY[0], calibrate=True))
-    for text, version in zip(versions, (6, 8), strict=True):
-        assert f"#define PLUSH_IMAGE_VERSION {version}\n" in text
+    plain, calibrating = library_files(), library_files(calibrate=True)
+    assert set(plain) == set(LIBRARY) and set(calibrating) == {*LIBRARY, CALIBRATE}
+    assert plain[LIBRARY[1]] == calibrating[LIBRARY[1]], "one line of the header chooses"
+    defined = "#define PLUSH_CALIBRATE\n"
+    assert defined in calibrating[LIBRARY[0]] and defined not in plain[LIBRARY[0]]
 
 
 def test_ten_touch_channels_and_an_accelerometer(calibrated_library: Any) -> None:

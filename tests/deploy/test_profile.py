@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import BadInput, ProgramError, ToolError
-from plushsense.deploy.emit import TOY_BYTES, read_facts
+from plushsense.deploy.code import TOY_BYTES, read_facts
 from plushsense.deploy.profile import Core, Cost, Estimate, _stack_usage, cores, count, estimate, profile
 from plushsense.deploy.targets import TARGETS
 from plushsense.models.arch import Arch
@@ -35,11 +35,11 @@ def test_counts(target: str, small: Path, target_here: Here) -> None:
     assert 1.6 * cost.step < cost.gap < 2.2 * cost.step
     assert cost.call_most is not None and cost.call_bound is not None
     assert cost.gap <= cost.call_most <= cost.call_bound < 1.5 * cost.call_most
-    assert cost.sections["plush_model"]["rodata"] == facts["model_bytes"]
-    assert cost.flash_bytes > facts["model_bytes"] + 2000
+    assert cost.sections["plush_model"]["rodata"] == facts.model_bytes
+    assert cost.flash_bytes > facts.model_bytes + 2000
     code = cost.sections["plushsense"]
     assert 3_000 < code["others"] < code["text"] - 4_000, "plush_begin and its like, and what plush_push runs"
-    assert 0 <= TOY_BYTES - cost.toy_bytes <= 24 and cost.memory_bytes == facts["memory_bytes"]
+    assert 0 <= TOY_BYTES - cost.toy_bytes <= 24 and cost.memory_bytes == facts.memory_bytes
     assert cost.ram_bytes == cost.toy_bytes + cost.memory_bytes
     assert cost.stack_push is not None
     assert cost.stack_functions["plush_push"] < cost.stack_push < sum(cost.stack_functions.values()) + 64

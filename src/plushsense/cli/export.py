@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import textwrap
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from plushsense.cli.output import emit, say, table, warn
 from plushsense.cli.settings import listed
@@ -12,6 +12,7 @@ from plushsense.core.errors import ConfigError
 from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
+    from plushsense.deploy.code import ConversionFacts
     from plushsense.deploy.paper_estimate import PaperComparison
     from plushsense.deploy.profile import Cost, Profile
     from plushsense.deploy.proof.verify import VerificationReport
@@ -30,10 +31,10 @@ _STAGES = {
 }
 
 
-def _conversion(entry: dict[str, Any]) -> str:
-    largest = entry["largest_difference"]
+def _conversion(entry: ConversionFacts) -> str:
+    largest = entry.largest_difference
     difference = "" if largest is None else f"; logits differ from the original by at most {largest:.1g}"
-    return f"  {entry['file']:<17} {entry['bytes']:,} bytes{difference}"
+    return f"  {entry.file:<17} {entry.bytes:,} bytes{difference}"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -45,17 +46,17 @@ def run(args: argparse.Namespace) -> int:
     package = {"name": args.name, "model_version": args.model_version, "url": args.url}
     done = export(args.bundle, args.out, dataset=args.dataset, also=also, **package, warn=warn)
     facts = done.facts
-    simulated = ["  SIMULATION: trained on a virtual toy, not on real touch"] if facts["simulated"] else []
+    simulated = ["  SIMULATION: trained on a virtual toy, not on real touch"] if facts.simulated else []
     emit(
         args,
-        done.to_dict(),
+        done.to_json(),
         [
-            f"{args.out}: {facts['title']}, {facts['classes']} gestures, layout {facts['layout']}",
+            f"{args.out}: {facts.title}, {facts.classes} gestures, layout {facts.layout}",
             *simulated,
-            f"  model             {done.flash_bytes:,} bytes of flash, without the code (see plushsense profile)",
-            f"  memory            {done.ram_bytes:,} bytes of RAM",
-            f"  a step            {facts['step_ms']:g} ms, {facts['macs_per_step']:,} MACs",
-            *(_conversion(entry) for entry in facts.get("conversions", {}).values()),
+            f"  model             {facts.flash_bytes:,} bytes of flash, without the code (see plushsense profile)",
+            f"  memory            {facts.ram_bytes:,} bytes of RAM",
+            f"  a step            {facts.step_ms:g} ms, {facts.macs_per_step:,} MACs",
+            *(_conversion(entry) for entry in facts.conversions.values()),
             f"  prove it          plushsense verify {args.out}",
         ],
     )
@@ -230,7 +231,7 @@ def _counts(profile: Profile) -> list[str]:
     rows += [
         ["whole step", *(f"{c.step:,}" for c in costs)],
         ["dearest step", *(f"{c.step_most:,}" for c in costs)],
-        [f"longest gap ({profile.facts['gap_ms']} ms), one call", *(f"{c.gap:,}" for c in costs)],
+        [f"longest gap ({profile.facts.gap_ms} ms), one call", *(f"{c.gap:,}" for c in costs)],
         ["longest call seen", *(f"{c.call_most:,}" for c in costs)],
         ["longest call, bound", *(f"{c.call_bound:,}" for c in costs)],
         ["plush_begin, once", *(f"{c.begin:,}" for c in costs)],

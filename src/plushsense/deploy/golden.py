@@ -5,7 +5,9 @@ No recordings are used, because exports are given to others and must not contain
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Container, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +17,15 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BadInput
 from plushsense.core.files import read_bytes
 from plushsense.core.layouts import MAGNITUDE_FRACTION_BITS, Layout
+from plushsense.core.recorder_csv import Frames
 from plushsense.core.templates import fill_text
 from plushsense.runtime.events import AFFECT_CODES
 from plushsense.runtime.fixed import InputScale, Ints
 from plushsense.runtime.health import HealthSettings
-from plushsense.runtime.image import IntegerModel
+from plushsense.runtime.image import IntegerModel, memory_bytes
 from plushsense.runtime.integer import IntegerDense, IntegerStepper
 from plushsense.runtime.machine import Moment, ToyMachine
+from plushsense.windows.clock import resample
 from plushsense.windows.features import Scaler
 
 _MS_BITS = 32
@@ -502,3 +506,85 @@ def read_golden(folder: Path, channels: int, classes: int) -> tuple[Ints, NDArra
     frames = tables[0].astype(np.int64)
     frames[:, 0] &= 0xFFFFFFFF
     return frames, tables[1].astype(np.int32)
+
+
+def samples_of(frames: Ints, layout: Layout) -> int:
+    """Return the number of samples that frames are resampled to."""
+    return sum(map(len, resample(Frames(frames[:, 1:], frames[:, 0]), layout)))
+
+
+@dataclass(frozen=True, eq=False)
+class Vectors:
+    """A test case for the C: frames to feed to it, and the expected answers.
+
+    Attributes:
+        frames: (n, 1 + C), the time in ms and the channels.
+        answers: (m, 12 + 2 K), as `answers_of` computes them.
+        samples: length of the resampled frames.
+        model: model to run, if not that of the export.
+        silences: indices of the frames after which a silence is reported.
+        patches: indices of the frames after which a patch is offered, and its bytes; none: the patch is undone.
+    """
+
+    name: str
+    frames: Ints
+    answers: NDArray[np.int32]
+    samples: int
+    model: IntegerModel | None = None
+    silences: tuple[int, ...] = ()
+    patches: tuple[tuple[int, bytes], ...] = ()
+
+    @property
+    def decisions(self) -> int:
+        """Number of answers after the warm-up."""
+        return int((column(self.answers, "state") == TRACKING).sum())
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of memory that ``model`` needs; 0 for the model of the export."""
+        return memory_bytes(self.model) if self.model else 0
+
+    @property
+    def kept_bytes(self) -> int:
+        """Bytes of the model and the patches, which the test program keeps until the end."""
+        model = len(self.model.to_bytes()) if self.model else 0
+        return sum(-(-n // 4) * 4 for n in (model, *(len(patch) for _, patch in self.patches)))
+
+    def to_bytes(self) -> bytes:
+        """Serialise for the test program, whose source describes the format: model, frames, silences and patches."""
+        pieces = [_counted(self.model.to_bytes() if self.model else b"")]
+        between = [(at, struct.pack("<I", _SILENCE)) for at in self.silences]
+        between += [(at, struct.pack("<I", _PATCH) + _counted(patch)) for at, patch in self.patches]
+        frames, begin = (self.frames & 0xFFFFFFFF).astype("<u4"), 0
+        for at, action in (*sorted(between), (len(frames) - 1, struct.pack("<I", _END))):
+            pieces += [struct.pack("<I", at + 1 - begin), frames[begin : at + 1].tobytes(), action]
+            begin = at + 1
+        return b"".join(pieces)
+
+
+# What comes after frames.
+_END, _SILENCE, _PATCH = range(3)
+
+
+def _counted(data: bytes) -> bytes:
+    """Return the number of bytes, and the bytes, filled up to whole 32-bit numbers."""
+    return struct.pack("<I", len(data)) + data + bytes(-len(data) % 4)
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Number of frames, samples and answers streamed under one name."""
+
+    name: str
+    frames: int
+    samples: int
+    answers: int
+
+
+def counted(streams: Sequence[Vectors]) -> tuple[Counts, ...]:
+    """Return the total counts of the vectors of each name."""
+    return tuple(
+        Counts(name, sum(len(v.frames) for v in own), sum(v.samples for v in own), sum(len(v.answers) for v in own))
+        for name in dict.fromkeys(v.name for v in streams)
+        for own in [[v for v in streams if v.name == name]]
+    )

@@ -511,7 +511,7 @@ def run_export(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         also=spec.get("also", ()),
         warn=reporter.warn,
     )
-    return {**done.to_dict(), "profile": _profile(Path(spec["place"]), reporter)}
+    return {**done.to_json(), "profile": _profile(Path(spec["place"]), reporter)}
 
 
 _SAMPLES = 100_000

@@ -23,10 +23,10 @@ from plushsense.core.layouts import Layout, load_layout
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.deploy.golden import EVENT, FAULT, HEALTH, PATCH, TRACKING, answers_of, column
-from plushsense.deploy.package import ARDUINO, IDF, SKETCH, package
+from plushsense.deploy.package import ARDUINO, IDF, SKETCH
 from plushsense.deploy.profile import profile
 from plushsense.deploy.proof.mutants import RULES, Mutant, mutants_of, source_mutants
-from plushsense.deploy.proof.scenarios import all_outcomes, outcomes_of, scenarios_of
+from plushsense.deploy.proof.scenarios import scenarios_of
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.proof.verify import Setting, VerificationReport, verify
 from plushsense.deploy.quantize import integer_model
@@ -37,6 +37,7 @@ from plushsense.runtime.gate import JERK, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import HEAD_BYTES, image_head
 from support.exports import bundle_of, exported
+from support.outcomes import all_outcomes, outcomes_of
 from support.requirements import LONG
 
 EMULATED = [name for name in TARGETS if name != "host"]
@@ -308,7 +309,6 @@ def test_a_file_edited_by_hand_is_what_is_tested(
 )
 def test_code_that_nobody_compiles_here_is_refused_too(own: Path, path: str, content: str | None) -> None:
     """A folder is vouched for, and so is what others compile of it."""
-    package(own)
     assert Export(own).changed == Export(own).edited == ()
     (own / path).parent.mkdir(exist_ok=True)
     before = (own / path).read_text(encoding="utf-8") if content is None else content
@@ -322,12 +322,12 @@ def test_code_that_nobody_compiles_here_is_refused_too(own: Path, path: str, con
 def test_links_are_not_vouched_for_and_examples_are_there_to_be_edited(
     c_compiler: str, two_settings: None, own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    package(own)
+    original = (own / f"{SKETCH}/plush_reaction.c").read_bytes()
     reaction = f"{SKETCH}/plush_reaction.c"
     (own / reaction).write_text("/* mine */", encoding="utf-8")
     code, report, _ = run(capsys, str(own), "--target", "host")
     assert (code, report["passed"], report["own"], report["changed"]) == (0, True, False, [reaction])
-    package(own)
+    (own / reaction).write_bytes(original)
     shutil.move(own / "plushsense.c", tmp_path / "elsewhere.c")
     (own / "plushsense.c").symlink_to(tmp_path / "elsewhere.c")
     (own / "main.c").write_text("int main(void) { return 0; }", encoding="utf-8")  # no build file names it
@@ -338,10 +338,15 @@ def test_links_are_not_vouched_for_and_examples_are_there_to_be_edited(
 def test_facts_of_an_export_are_those_of_its_model(own: Path) -> None:
     """Also where `profile` reads them, which once took any that stood there."""
     facts = json.loads((own / "export.json").read_text(encoding="utf-8"))
-    (own / "export.json").write_text(json.dumps({**facts, "step_ms": "soon", "span": -1}), encoding="utf-8")
+    (own / "export.json").write_text(json.dumps({**facts, "step_ms": 1.0, "span": -1}), encoding="utf-8")
     export = Export(own)
-    assert export.changed == ("export.json",) and export.facts["step_ms"] == facts["step_ms"]
-    for text, why in (("[]", "holds no table"), ("[" * 100_000, "cannot be read"), ('"x"', "holds no table")):
+    assert export.changed == ("export.json",) and export.facts.step_ms == facts["step_ms"]
+    for text, why in (
+        (json.dumps({**facts, "step_ms": "soon"}), "step_ms is 'soon'"),
+        ("[]", "holds no table"),
+        ("[" * 100_000, "cannot be read"),
+        ('"x"', "holds no table"),
+    ):
         (own / "export.json").write_text(text, encoding="utf-8")
         with pytest.raises(BadInput, match=why):
             Export(own)

@@ -13,7 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from plushsense.core.errors import DeviceError
-from plushsense.deploy.proof.vectors import Export, RowComparison, Vectors, compare, counted
+from plushsense.deploy.golden import Vectors, counted
+from plushsense.deploy.proof.vectors import Export, RowComparison, compare
 from plushsense.deploy.proof.verify import CHIP, Cycles, Progress, SettingResult, VerificationReport
 from plushsense.devices.bytestreams import Link, open_link
 from plushsense.runtime.image import image_check

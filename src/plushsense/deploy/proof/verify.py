@@ -22,9 +22,10 @@ import numpy as np
 
 from plushsense.core.errors import BuildError, ProgramError, ToolError
 from plushsense.core.sentences import Sentence
-from plushsense.deploy.emit import IMAGE, LIBRARY, MODEL
+from plushsense.deploy.code import IMAGE, LIBRARY, MODEL
+from plushsense.deploy.golden import Counts, Vectors, counted
 from plushsense.deploy.proof.mutants import RULES, Mutant, mutants_of
-from plushsense.deploy.proof.vectors import Counts, Export, RowComparison, Vectors, compare, counted
+from plushsense.deploy.proof.vectors import Export, RowComparison, compare
 from plushsense.deploy.targets import C_FOLDER, TARGETS, build, missing_tools, require, target_named
 
 Progress = Callable[[int, int], None]
@@ -390,7 +391,7 @@ class _Runner:
         out = self._new_folder()
         copy = out / "export"
         copy.mkdir()
-        for name in (*LIBRARY, *MODEL, IMAGE):
+        for name in self.export.code_names:
             shutil.copyfile(self.code / name, copy / name)
         if mutant.image is not None:
             (copy / IMAGE).write_bytes(mutant.image)
