@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from plushsense.deploy.code import ConversionFacts
     from plushsense.deploy.paper_estimate import PaperComparison
     from plushsense.deploy.profile import Cost, Profile
-    from plushsense.deploy.proof.verify import VerificationReport
+    from plushsense.deploy.proof.verify import VerificationResult
 
 _SAMPLES = 100_000
 _STAGES = {
@@ -108,11 +108,11 @@ def run_verify(args: argparse.Namespace) -> int:
     else:
         mutants = (lambda mutant: True) if args.faults else None
         done = verify(export, listed(*args.target), vectors, mutants=mutants, trust=args.trust, progress=progress)
-    emit(args, {"export": args.export, **done.to_dict()}, verification_lines(done))
+    emit(args, {"export": args.export, **done.to_json()}, verification_lines(done))
     return 0 if done.passed else 1
 
 
-def verification_lines(done: VerificationReport) -> list[str]:
+def verification_lines(done: VerificationResult) -> list[str]:
     streams = [f"{v.name}: {v.samples:,} samples of {v.frames:,} frames, {v.answers:,} answers" for v in done.counts]
     rows = [
         (r.target, r.compiler, r.flags, f"{r.vectors}", f"{r.mismatches}", f"{r.max_abs_diff}", f"{r.seconds:.1f}")
@@ -171,12 +171,12 @@ def run_profile(args: argparse.Namespace) -> int:
     for name, packages in result.missing.items():
         say(f"left out: {name}, which needs Debian's {' '.join(packages)}")
     if not args.paper:
-        emit(args, result.to_dict(), format_profile(result))
+        emit(args, result.to_json(), format_profile(result))
         return 0
     from plushsense.deploy.paper_estimate import compare_with_paper
 
     paper = compare_with_paper(result)
-    emit(args, result.to_dict() | {"paper": paper.to_dict()}, format_profile(result) + format_paper(paper))
+    emit(args, result.to_json() | {"paper": paper.to_json()}, format_profile(result) + format_paper(paper))
     return 0
 
 

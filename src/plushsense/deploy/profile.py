@@ -106,7 +106,7 @@ class Estimate:
         """Verdict as text, with the rate of steps."""
         return f"fits {1000 / self.step_ms:g} Hz: {self.answer}"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the estimate as plain values for JSON."""
         core = self.core
         return {
@@ -228,7 +228,7 @@ class Cost:
         """Helper functions for floating point that the library requires; should be empty."""
         return tuple(s for s in self.needs if _FLOAT.match(s))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the cost as plain values for JSON."""
         return {
             "title": TARGETS[self.target].title,
@@ -465,7 +465,7 @@ class Profile:
         ratio = self.arch.macs_per_window / self.arch.macs_per_step
         return {name: round(c.stages["network"] * ratio) for name, c in self.costs.items() if c.stages}
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return plain values for JSON, as ``plushsense profile --json`` prints them."""
         counted = {name: c for name, c in self.costs.items() if c.step is not None}
         return {
@@ -482,9 +482,9 @@ class Profile:
             "macs_by_layer": self.macs_by_layer,
             "flash_bytes": {name: c.flash_bytes for name, c in self.costs.items()},
             "ram_bytes": {name: c.ram_bytes for name, c in self.costs.items()},
-            "estimated_ms": {name: e.to_dict() for name, e in self.estimates.items()},
+            "estimated_ms": {name: e.to_json() for name, e in self.estimates.items()},
             "estimated_window_instructions": self.window_instructions,
-            "targets": {name: c.to_dict() for name, c in self.costs.items()},
+            "targets": {name: c.to_json() for name, c in self.costs.items()},
             "missing": {name: list(packages) for name, packages in self.missing.items()},
         }
 

@@ -28,7 +28,7 @@ from plushsense.deploy.profile import profile
 from plushsense.deploy.proof.mutants import RULES, Mutant, mutants_of, source_mutants
 from plushsense.deploy.proof.scenarios import scenarios_of
 from plushsense.deploy.proof.vectors import Export
-from plushsense.deploy.proof.verify import Setting, VerificationReport, verify
+from plushsense.deploy.proof.verify import Setting, VerificationResult, verify
 from plushsense.deploy.quantize import integer_model
 from plushsense.deploy.targets import TARGETS
 from plushsense.runtime.decisions import DecideSpec
@@ -227,7 +227,7 @@ def test_a_fault_of_the_rules_that_no_scenario_shows_is_no_defect_of_the_c(
     export = Export(exported(tmp_path / "out", bundle_of("accel-3", gestures=two, seed=2)))
     seldom = "an affect stays at the share at which it begins"
 
-    def result() -> VerificationReport:
+    def result() -> VerificationResult:
         names = {seldom, "an event begins a step too soon"}
         return verify(export, ["host"], only=plainly, mutants=lambda mutant: mutant.name in names)
 
@@ -235,7 +235,7 @@ def test_a_fault_of_the_rules_that_no_scenario_shows_is_no_defect_of_the_c(
     monkeypatch.setattr("plushsense.deploy.proof.verify.MORE_SCENARIOS", 0)
     done = result()
     assert [f.name for f in done.mutants if not f.caught] == [seldom] == [f.name for f in done.mutants if f.silent]
-    assert done.passed and done.to_dict()["passed"]
+    assert done.passed and done.to_json()["passed"]
     assert "not shown: no test scenario of this network" in "\n".join(verification_lines(done))
 
 
