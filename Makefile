@@ -5,7 +5,7 @@
 #                make test-deploy, make test-training, make test-other
 #   make test-exhaustive   these: more pages, languages, chips, compilers, kills and trainings than in `make test`
 #   make test-quick   install, then the tests that need no browser, compiler, emulator or cluster
-#   make bench   measure the headline figures again, into docs/numbers.md: hours (ROWS=import,live: some rows)
+#   make bench   measure the headline figures again, into docs/measurements/numbers.md: hours (ROWS=import,live: some rows)
 #   make fuzz    hostile bundles, layouts, lines and models for the C, for some hours (FUZZ=10: some minutes)
 #   make soak    24 hours of toy time through recorder, live and C; an hour of the studio; long fault drills (about a day)
 #   make coverage   branch coverage of the base packages (tests of them, of deploy and of the command line; half an hour)

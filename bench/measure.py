@@ -1,4 +1,4 @@
-"""Measure the headline figures; keep them in docs/numbers.json, and write docs/numbers.md from it: `make bench`.
+"""Measure the headline figures, keep them in docs/measurements/numbers.json, and write numbers.md there: `make bench`.
 
     python bench/measure.py --list                       # the rows, how long each takes, and when it was measured
     python bench/measure.py                              # measure every row: hours
@@ -41,7 +41,8 @@ from plushsense.core.files import write_file
 from plushsense.reports.table import DASH, Table
 
 ROOT = Path(__file__).resolve().parents[1]
-FILE, PAGE = ROOT / "docs" / "numbers.json", ROOT / "docs" / "numbers.md"
+PAGE = ROOT / "docs" / "measurements" / "numbers.md"
+FILE = PAGE.with_suffix(".json")
 CHANGED = "+changes"  # after the commit, where `src` has changes that are not committed
 # A number, in groups of three or not, and the mark that says which figure it is.
 NUMBER = r"(?:\d{1,3}(?:[ ,\N{NO-BREAK SPACE}\N{NARROW NO-BREAK SPACE}]\d{3})+|\d+)(?:\.\d+)?(?: ?%)?"
@@ -190,7 +191,7 @@ def requoted(text: str, numbers: dict[str, Record]) -> str:
         lines = ROWS[match["row"]].lines if match["row"] in ROWS else ()
         line = next((line for line in lines if match["key"] in line.keys), None)
         if line is None or match["number"] is None:
-            what = "names no figure of docs/numbers.json" if line is None else "does not follow a number"
+            what = "names no figure of numbers.json" if line is None else "does not follow a number"
             raise ValueError(f"{match[0]}: the mark {what}.")
         found = text_of(numbers[match["row"]]["figures"][match["key"]]["value"], line)
         return match[0] if bare(found) == bare(match["number"]) else match[0].replace(match["number"], found, 1)
@@ -201,11 +202,11 @@ def requoted(text: str, numbers: dict[str, Record]) -> str:
 def quoting() -> list[Path]:
     """Return the files that may quote figures; this page and that of `peers.py` are written by programs."""
     others = {PAGE, PAGE.with_name("peers.md")}
-    return [ROOT / "README.md", *sorted(set(PAGE.parent.glob("*.md")) - others)]
+    return [ROOT / "README.md", *sorted(set((ROOT / "docs").rglob("*.md")) - others)]
 
 
 def page(numbers: dict[str, Record]) -> str:
-    """Return docs/numbers.md."""
+    """Return docs/measurements/numbers.md."""
     machines = list(dict.fromkeys(numbers[name]["machine"] for name in ROWS))
     letters = {one: chr(ord("A") + at) for at, one in enumerate(machines)}
     minutes = sum(row.minutes for row in ROWS.values())
@@ -224,7 +225,7 @@ def page(numbers: dict[str, Record]) -> str:
 
 
 HEAD = """\
-<!-- Written by bench/measure.py (make bench) from docs/numbers.json: do not edit. -->
+<!-- Written by bench/measure.py (make bench) from docs/measurements/numbers.json: do not edit. -->
 # Numbers
 
 The headline figures of PlushSense in one table, with what each was measured on. Other pages have more figures and say

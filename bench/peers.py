@@ -8,7 +8,7 @@ names its interpreter (default: the one that runs this program). `--onnx2c` is t
 github.com/kraiskil/onnx2c, `--cmsis-nn` a copy of github.com/ARM-software/CMSIS-NN. What is missing is listed with how
 to get it, and the rest is measured. gcc is required, valgrind with its headers to count instructions, and
 gcc-arm-none-eabi, libnewlib-arm-none-eabi and qemu-system-arm for the Cortex-M4. `--save` measures the two networks of
-docs/peers.md, and writes bench/peers.json and from it the tables of the page.
+docs/measurements/peers.md, and writes bench/peers.json and from it the tables of the page.
 
 Every runtime gets the same weights, with the normalisation folded in, quantized by its own tool on the same decisions,
 and two graphs. That of the `stream` is our algorithm: it computes the 5 new samples of a step, and has each layer's
@@ -53,7 +53,7 @@ from opponents.tables import OUR_ROW, lines, page_of
 
 WORKER = Path(__file__).resolve().parent / "opponents" / "worker.py"
 RESULTS = Path(__file__).resolve().with_suffix(".json")
-PAGE = RESULTS.parents[1] / "docs" / "peers.md"
+PAGE = RESULTS.parents[1] / "docs" / "measurements" / "peers.md"
 LITERT = "ai-edge-litert ai-edge-quantizer"
 # name: title, packages
 PEERS: dict[str, tuple[str, str]] = {

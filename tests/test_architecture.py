@@ -111,6 +111,21 @@ def test_a_short_module_with_a_single_importer_belongs_into_it() -> None:
     assert short == []
 
 
+def test_the_table_of_changes_names_what_exists() -> None:
+    rows = re.findall(r"^\| .*", (ROOT / "CONTRIBUTING.md").read_text("utf-8"), re.M)
+    named = {code for row in rows for code in re.findall(r"`([\w/.-]+/[\w.-]*)`", row)}
+
+    def exists(code: str) -> bool:
+        if (SRC / code).exists() or (ROOT / code).exists() or (SRC / f"{code}.py").exists():
+            return True
+        module, _, attribute = code.rpartition(".")
+        places = [path for path in (SRC / f"{module}.py", SRC / module / "__init__.py") if path.exists()]
+        return any(re.search(rf"^(class |def )?{attribute}\b", path.read_text("utf-8"), re.M) for path in places)
+
+    assert len(rows) <= 27, "25 rows and the head"
+    assert {code for code in named if not exists(code)} == set()
+
+
 def test_every_direct_dependency_is_explained() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     groups = {"": project["dependencies"], **project["optional-dependencies"]}

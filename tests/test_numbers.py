@@ -1,4 +1,4 @@
-"""The numbers page, and the figures that the README and other pages quote: those of docs/numbers.json."""
+"""The numbers page, and the figures that the README and other pages quote: those of docs/measurements/numbers.json."""
 
 from __future__ import annotations
 

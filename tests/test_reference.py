@@ -215,5 +215,6 @@ def test_links_of_the_reference_lead_somewhere_and_the_index_names_every_page() 
         headings = {REFERENCE["_anchor"](line.lstrip("# ")) for line in text.splitlines() if line.startswith("#")}
         assert set(re.findall(r"\]\(#([^)]*)\)", text)) <= headings, name
     index = (DOCS / "index.md").read_text(encoding="utf-8").split("```{toctree}")[0]
-    pages = {path.name for path in DOCS.glob("*.md")} | {"reference/README.md", "reference/cli.md"}
+    places = (*DOCS.glob("*.md"), *DOCS.glob("measurements/*.md"))
+    pages = {path.relative_to(DOCS).as_posix() for path in places} | {"reference/README.md", "reference/cli.md"}
     assert pages - {"index.md"} == set(re.findall(r"\]\(([^)#]*\.md)", index)), "each page has its reader"

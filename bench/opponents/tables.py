@@ -1,4 +1,4 @@
-"""Print what the bench measured, as Markdown: on the screen, and in docs/peers.md."""
+"""Print what the bench measured, as Markdown: on the screen, and in docs/measurements/peers.md."""
 
 from __future__ import annotations
 

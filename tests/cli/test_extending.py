@@ -1,4 +1,4 @@
-"""A layout and a gesture set are one TOML file each, and a verb is a module and a table in ``verbs.toml``."""
+"""A layout and a gesture set are one TOML file each; a verb or experiment is a module and a table in ``verbs.toml``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import plushsense.core
 from plushsense import cli as verbs
 from plushsense.cli.options import VERBS
 from plushsense.core import toml
+from plushsense.dataset.store import Dataset
 from support.small_dataset import Cli
 
 LAYOUT = """
@@ -36,6 +37,33 @@ import json
 
 def run(args):
     print(json.dumps({"hello": args.name}) if args.json else f"Hello {args.name}.")
+    return 0
+"""
+EXPERIMENT = """
+from plushsense.cli.output import emit
+from plushsense.cli.settings import report_jobs
+from plushsense.dataset.index import open_dataset
+from plushsense.jobs.pool import JobsSpec
+from plushsense.jobs.study import StudyPart, run_study
+from plushsense.workflow.reporting import journal_of
+
+
+def count(dataset, person, report):
+    return {"person": person, "recordings": sum(r.subject == person for r in dataset.used)}
+
+
+def summarise(study):
+    return {"people": study.results, "resumed": study.resumed}
+
+
+def run(args):
+    dataset = open_dataset(args.dataset)
+    parts = [StudyPart(person, {"person": person}, person) for person in dataset.subjects]
+    spec = JobsSpec(journal=journal_of(dataset, "counting"))
+    progress = report_jobs("counting", "people")
+    key = {"data": dataset.hash}
+    result = run_study(parts, count, summarise, key=key, shared=dataset, spec=spec, progress=progress)
+    emit(args, result, [f"{row['person']}: {row['recordings']}" for row in result["people"]])
     return 0
 """
 
@@ -82,3 +110,17 @@ def test_a_verb_is_a_module_and_a_table(cli: Cli, tmp_path: Path, monkeypatch: p
     assert cli("hello", "Ana").out == "Hello Ana.\n"
     assert cli("hello", "Ana", "--json").json == {"hello": "Ana"}
     assert "helo" in (refused := cli("helo", "Ana").err) and "Did you mean 'hello'?" in refused
+
+
+def test_an_experiment_is_a_module_and_a_table(
+    cli: Cli, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "counting_extension.py").write_text(EXPERIMENT)
+    monkeypatch.setattr(verbs, "__path__", [*verbs.__path__, str(tmp_path)])
+    table = {"summary": "count recordings", "module": "counting_extension", "dataset": {"help": "a data set"}}
+    monkeypatch.setitem(VERBS, "count", table)
+    people = [{"person": p, "recordings": sum(r.subject == p for r in dataset.used)} for p in dataset.subjects]
+    assert cli("count", dataset.path, "--json").json == {"people": people, "resumed": 0}
+    again = cli("count", dataset.path, "--json")
+    assert again.json == {"people": people, "resumed": len(people)}
+    assert f"counting: {len(people)} of {len(people)} people ({len(people)} from before)" in again.err

@@ -18,7 +18,7 @@ import work
 
 from plushsense.core.errors import ConfigError, PlushSenseError, TrainingError
 from plushsense.jobs.journal import Journal
-from plushsense.jobs.pool import Job, run_jobs
+from plushsense.jobs.pool import Job, JobCallbacks, JobsSpec, run_jobs
 
 SMALL = 80 * 2**20
 
@@ -33,7 +33,7 @@ def test_a_lost_node_changes_nothing(two_nodes: Any, tmp_path: Path, capfd: pyte
     jobs = [Job(f"job{n}", n) for n in range(8)]
     nodes = list(two_nodes.worker_nodes)
     shared = {"data": np.arange(1000.0), "folder": str(tmp_path), "doomed": nodes[0].node_id}
-    undisturbed = run_jobs(jobs, work.walk, shared=shared, workers=1)
+    undisturbed = run_jobs(jobs, work.walk, shared=shared)
     for mark in tmp_path.glob("started-*"):
         mark.unlink()
 
@@ -58,7 +58,11 @@ def test_a_lost_node_changes_nothing(two_nodes: Any, tmp_path: Path, capfd: pyte
             resumed.append(job.id)
 
     got = run_jobs(
-        jobs, work.walk, shared=shared, journal=journal, cluster=two_nodes.address, on_report=on_report, on_done=on_done
+        jobs,
+        work.walk,
+        shared=shared,
+        spec=JobsSpec(journal=journal, cluster=two_nodes.address),
+        callbacks=JobCallbacks(on_report=on_report, on_done=on_done),
     )
     assert removed, "no job ever said that it is at work on the second node"
     removed[0].join()
@@ -72,7 +76,7 @@ def test_a_lost_node_changes_nothing(two_nodes: Any, tmp_path: Path, capfd: pyte
     assert sum(starts.values()) > 7
     assert all(0 <= message[0] < 10 for _, message in said)
     # The same again costs nothing: everything is there.
-    again = run_jobs(jobs, work.walk, shared=shared, journal=journal, cluster="nowhere:1")
+    again = run_jobs(jobs, work.walk, shared=shared, spec=JobsSpec(journal=journal, cluster="nowhere:1"))
     assert same(again, undisturbed)
     two_nodes.add_node(num_cpus=1, object_store_memory=SMALL)
 
@@ -85,17 +89,18 @@ def test_what_a_job_raises_comes_through(two_nodes: Any, tmp_path: Path) -> None
         jobs,
         work.diverge,
         shared=100,
-        journal=journal,
-        cluster=two_nodes.address,
-        on_failed=lambda job, error: failed.append((job.id, f"{type(error).__name__}: {error}")),
+        spec=JobsSpec(journal=journal, cluster=two_nodes.address),
+        callbacks=JobCallbacks(
+            on_failed=lambda job, error: failed.append((job.id, f"{type(error).__name__}: {error}"))
+        ),
     )
     assert sorted(got) == ["job0", "job1", "job3"] and failed == [("job2", "TrainingError: no more")]
     assert all(result["threads"] == "1" for result in got.values())
     assert not journal.has("job2") and journal.has("job3")
     with pytest.raises(TrainingError, match="^no more$"):
-        run_jobs(jobs, work.diverge, shared=100, journal=journal, cluster=two_nodes.address)
+        run_jobs(jobs, work.diverge, shared=100, spec=JobsSpec(journal=journal, cluster=two_nodes.address))
     with pytest.raises(ConfigError, match="No node of the cluster has 3 processors"):
-        run_jobs(jobs, work.diverge, shared=100, journal=journal, cluster=two_nodes.address, threads=3)
+        run_jobs(jobs, work.diverge, shared=100, spec=JobsSpec(threads=3, journal=journal, cluster=two_nodes.address))
     # A package that only this process has.
     only_here = types.ModuleType("only_here")
     exec("def square(shared, task, report): return {'value': task}", only_here.__dict__)
@@ -103,7 +108,7 @@ def test_what_a_job_raises_comes_through(two_nodes: Any, tmp_path: Path) -> None
     sys.modules["only_here"] = only_here
     try:
         with pytest.raises(PlushSenseError, match="lacks the package 'only_here'"):
-            run_jobs(jobs, only_here.square, cluster=two_nodes.address)
+            run_jobs(jobs, only_here.square, spec=JobsSpec(cluster=two_nodes.address))
     finally:
         del sys.modules["only_here"]
 
@@ -113,13 +118,13 @@ def test_an_address_where_no_cluster_is(cluster_possible: None) -> None:
     jobs = [Job("a", 1)]
     for address in ("nonsense", "host:99999", "ray://", "http://x:1"):
         with pytest.raises(ConfigError, match="is not the address of a cluster: accepted are"):
-            run_jobs(jobs, work.square, shared=0, cluster=address)
+            run_jobs(jobs, work.square, shared=0, spec=JobsSpec(cluster=address))
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         # Takes the connection and says nothing.
         with pytest.raises(ConfigError, match=rf"127.0.0.1:{port}' \(no answer\)"):
-            run_jobs(jobs, work.square, shared=0, cluster=f"127.0.0.1:{port}")
+            run_jobs(jobs, work.square, shared=0, spec=JobsSpec(cluster=f"127.0.0.1:{port}"))
     with pytest.raises(ConfigError, match=r"refused.*ray start --head"):
-        run_jobs(jobs, work.square, shared=0, cluster=f"ray://127.0.0.1:{port}")
+        run_jobs(jobs, work.square, shared=0, spec=JobsSpec(cluster=f"ray://127.0.0.1:{port}"))
     assert time.monotonic() - began < 30
     assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"

@@ -16,7 +16,7 @@ import work
 
 from plushsense.core.errors import ConfigError, PlushSenseError, TrainingError
 from plushsense.jobs.journal import Journal
-from plushsense.jobs.pool import Job, run_jobs
+from plushsense.jobs.pool import Job, JobCallbacks, JobsSpec, run_jobs
 
 HERE = Path(__file__).parent
 
@@ -36,10 +36,11 @@ def test_results_reports_and_resuming(tmp_path: Path, workers: int, monkeypatch:
         JOBS,
         work.square,
         shared=100,
-        workers=workers,
-        journal=journal,
-        on_done=lambda job, result, resumed: done.append((job.id, resumed)),
-        on_report=lambda job, message: said.append((job.id, *message)),
+        spec=JobsSpec(workers, journal=journal),
+        callbacks=JobCallbacks(
+            on_done=lambda job, result, resumed: done.append((job.id, resumed)),
+            on_report=lambda job, message: said.append((job.id, *message)),
+        ),
     )
     assert {job: r["value"] for job, r in results.items()} == {
         "job0": 100, "job1": 101, "job2": 104, "job3": -1, "job4": 116,
@@ -59,7 +60,7 @@ def test_workers_import_nothing_from_the_working_folder(tmp_path: Path, monkeypa
     for name in ("re", "random", "multiprocessing"):
         (tmp_path / f"{name}.py").write_text("import pathlib; pathlib.Path('ran').touch(); raise SystemExit(1)")
     monkeypatch.chdir(tmp_path)
-    assert run_jobs(JOBS[:1], work.square, shared=1, workers=2)["job0"]["value"] == 1
+    assert run_jobs(JOBS[:1], work.square, shared=1, spec=JobsSpec(2))["job0"]["value"] == 1
     assert not (tmp_path / "ran").exists()
 
 
@@ -67,16 +68,16 @@ def test_workers_import_nothing_from_the_working_folder(tmp_path: Path, monkeypa
 def test_an_error_of_the_work_comes_through_as_itself(tmp_path: Path, workers: int) -> None:
     journal = Journal(tmp_path)
     with pytest.raises(TrainingError, match="^no more$"):
-        run_jobs(JOBS, work.refuse, shared=str(tmp_path), workers=workers, journal=journal)
+        run_jobs(JOBS, work.refuse, shared=str(tmp_path), spec=JobsSpec(workers, journal=journal))
     assert journal.has("job0") and not journal.has("job2")
     with pytest.raises(ZeroDivisionError, match="in the work"):
-        run_jobs(JOBS, work.stumble, workers=workers)
+        run_jobs(JOBS, work.stumble, spec=JobsSpec(workers))
 
 
 def test_a_worker_that_dies_is_said_and_finished_jobs_are_kept(tmp_path: Path) -> None:
     journal = Journal(tmp_path)
     with pytest.raises(PlushSenseError, match=r"exit code 9.*finished jobs are kept"):
-        run_jobs(JOBS, work.die, shared=str(tmp_path), workers=2, journal=journal)
+        run_jobs(JOBS, work.die, shared=str(tmp_path), spec=JobsSpec(2, journal=journal))
     assert not journal.has("job2") and journal.has("job0")
 
 
@@ -89,11 +90,12 @@ def test_a_killed_worker_is_replaced_and_one_job_that_kills_is_given_up(tmp_path
         JOBS,
         work.killed_once,
         shared=str(tmp_path),
-        workers=2,
-        journal=journal,
-        on_start=lambda job: began.append(job.id),
-        on_report=lambda job, process: os.kill(process, signal.SIGKILL),
-        on_failed=lambda job, error: failed.append((job.id, str(error))),
+        spec=JobsSpec(2, journal=journal),
+        callbacks=JobCallbacks(
+            on_start=lambda job: began.append(job.id),
+            on_report=lambda job, process: os.kill(process, signal.SIGKILL),
+            on_failed=lambda job, error: failed.append((job.id, str(error))),
+        ),
     )
     assert sorted(results) == ["job0", "job1", "job2", "job4"]
     assert [job for job, _ in failed] == ["job3"]
@@ -111,10 +113,8 @@ def test_a_failed_job_is_told_and_the_others_go_on(tmp_path: Path, workers: int)
     results = run_jobs(
         JOBS,
         work.diverge,
-        workers=workers,
-        threads=2,
-        journal=journal,
-        on_failed=lambda job, error: failed.append((job.id, type(error))),
+        spec=JobsSpec(workers, threads=2, journal=journal),
+        callbacks=JobCallbacks(on_failed=lambda job, error: failed.append((job.id, type(error)))),
     )
     assert sorted(results) == ["job0", "job1", "job3", "job4"] and failed == [("job2", TrainingError)]
     assert not journal.has("job2") and journal.has("job4")
@@ -129,9 +129,8 @@ def test_a_journal_where_no_folder_can_be_ends_the_run(tmp_path: Path) -> None:
             run_jobs(
                 JOBS[:2],
                 work.diverge,
-                workers=workers,
-                journal=Journal(tmp_path / "journal"),
-                on_failed=lambda job, error: None,
+                spec=JobsSpec(workers, journal=Journal(tmp_path / "journal")),
+                callbacks=JobCallbacks(on_failed=lambda job, error: None),
             )
 
 
@@ -150,9 +149,9 @@ def test_two_runs_on_one_journal_share_the_work(tmp_path: Path) -> None:
 
 def test_no_workers_are_refused() -> None:
     with pytest.raises(ConfigError, match="0 workers"):
-        run_jobs(JOBS, work.square, workers=0)
+        JobsSpec(workers=0)
     with pytest.raises(ConfigError, match="0 threads"):
-        run_jobs(JOBS, work.square, threads=0)
+        JobsSpec(threads=0)
 
 
 SCRIPT = """
@@ -160,11 +159,11 @@ import sys
 sys.path.insert(0, {here!r})
 import work
 from plushsense.jobs.journal import Journal
-from plushsense.jobs.pool import Job, run_jobs
+from plushsense.jobs.pool import Job, JobsSpec, run_jobs
 
 if __name__ == "__main__":
-    run_jobs([Job(f"job{{n}}", n) for n in range(6)], work.tick, shared={folder!r}, workers={workers},
-             journal=Journal({folder!r} + "/journal"))
+    run_jobs([Job(f"job{{n}}", n) for n in range(6)], work.tick, shared={folder!r},
+             spec=JobsSpec({workers}, journal=Journal({folder!r} + "/journal")))
 """
 
 
@@ -243,8 +242,8 @@ def test_a_script_without_a_guard_is_told_so(tmp_path: Path) -> None:
     script = tmp_path / "bare.py"
     script.write_text(
         f"import sys; sys.path.insert(0, {str(HERE)!r})\n"
-        "import work\nfrom plushsense.jobs.pool import Job, run_jobs\n"
-        "run_jobs([Job('a', 1), Job('b', 2)], work.square, shared=0, workers=2)\n"
+        "import work\nfrom plushsense.jobs.pool import Job, JobsSpec, run_jobs\n"
+        "run_jobs([Job('a', 1), Job('b', 2)], work.square, shared=0, spec=JobsSpec(2))\n"
     )
     ended = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60)
     assert ended.returncode != 0

@@ -18,6 +18,11 @@ def square(shared: Any, task: Any, report: Any) -> dict[str, Any]:
     return {"value": task * task + shared, "process": os.getpid(), "threads": os.environ.get("OPENBLAS_NUM_THREADS")}
 
 
+def number(shared: Any, task: Any, report: Any) -> dict[str, Any]:
+    report((1, 1))
+    return {"value": task + shared}
+
+
 def wait_for(file: Path) -> None:
     until = time.monotonic() + 30
     while not file.exists() and time.monotonic() < until:

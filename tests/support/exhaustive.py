@@ -167,7 +167,7 @@ EXHAUSTIVE = {
             "personal",
             "questions",
             "record",
-            "results",
+            "measurements/results",
             "streams",
             "sweep",
             "trim",

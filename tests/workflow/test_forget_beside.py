@@ -20,7 +20,7 @@ from plushsense.dataset.privacy.forget import forget
 from plushsense.dataset.store import Dataset
 from plushsense.experiments.abstention import abstaining
 from plushsense.experiments.adaptation import evaluate_adapting
-from plushsense.experiments.baselines.run import baselines
+from plushsense.experiments.baselines.run import ComparisonSpec, baselines
 from plushsense.experiments.search.run import search
 from plushsense.experiments.streams.run import stream_benchmark
 from plushsense.experiments.sweep.run import sweep
@@ -64,9 +64,8 @@ def run_evaluate_in_processes(ds: Dataset, out: Path, hook: Hook) -> None:
 
 
 def run_baselines(ds: Dataset, out: Path, hook: Hook) -> None:
-    baselines(
-        ds, splits=("by-subject:2",), models="knn,tree", pca="no", out=out, progress=hook, context="loop", workers=1
-    )
+    spec = ComparisonSpec(("by-subject:2",), "knn,tree", pca="no")
+    baselines(ds, spec=spec, out=out, progress=hook, context="loop", workers=1)
 
 
 def run_sweep(ds: Dataset, out: Path, hook: Hook) -> None:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from plushsense.cli.output import emit, figure, say, spread, table, warn
 from plushsense.cli.settings import SIMULATION, listed, marks, report_jobs, settings
 from plushsense.core.errors import ConfigError
 from plushsense.core.sentences import plural
 from plushsense.workflow.reporting import name_of
+
+if TYPE_CHECKING:
+    from plushsense.experiments.baselines.score import BaselinesResult
 
 
 def run(args: argparse.Namespace) -> int:
@@ -142,31 +145,29 @@ def _sweep_report(args: argparse.Namespace) -> int:
 
 def run_baselines(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
-    from plushsense.experiments.baselines.run import PAGE, baselines, comparison_id
+    from plushsense.experiments.baselines.run import PAGE, ComparisonSpec, baselines, comparison_id
 
     config = settings(args, workers=args.workers)
     dataset = open_dataset(args.dataset)
-    choice: dict[str, Any] = {"splits": listed(args.split), "pca": args.pca}
-    choice |= {"models": listed(args.models), "features": listed(args.features)}
-    name = f"baselines_{comparison_id(dataset, config, **choice)[:8]}"
+    spec = ComparisonSpec(listed(args.split), listed(args.models), listed(args.features), args.pca)
+    name = f"baselines_{comparison_id(dataset, config, spec)[:8]}"
     out = Path(args.out) if args.out else dataset.path / "evaluations" / name
     result = baselines(
         dataset,
         config,
-        **choice,
+        spec,
         out=out,
         overwrite=args.force,
         cluster=args.cluster,
         progress=report_jobs("comparing", "fits"),
         warn=warn,
     )
-    result |= {"out": str(out), "report": str(out / PAGE)}
     say(f"written: {out}")
-    emit(args, result, _baseline_lines(result))
+    emit(args, {**result.to_json(), "out": str(out), "report": str(out / PAGE)}, _baseline_lines(result))
     return 0
 
 
-def _baseline_lines(result: dict[str, Any]) -> list[str]:
+def _baseline_lines(result: BaselinesResult) -> list[str]:
     """Format the comparison as text: a table with one line per model, with explanations."""
     from plushsense.experiments.baselines.report import (
         COUNTS,
@@ -176,8 +177,8 @@ def _baseline_lines(result: dict[str, Any]) -> list[str]:
         program_table,
     )
 
-    out = [SIMULATION, ""] if result["simulated"] else []
+    out = [SIMULATION, ""] if result.simulated else []
     out += [describe_data(result), "", program_table(result).text(), "", describe_costs(result)]
-    if any(split["leaky"] for split in result["splits"]):
-        out += ["", COUNTS if result["gaps"] else LEAKY]
+    if any(split.leaky for split in result.splits):
+        out += ["", COUNTS if result.gaps else LEAKY]
     return out

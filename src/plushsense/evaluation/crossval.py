@@ -26,9 +26,10 @@ from plushsense.evaluation.scores import (
     with_accuracy,
     write_predictions,
 )
-from plushsense.jobs.journal import Journal, Result, job_id
-from plushsense.jobs.pool import Job, Report, run_jobs
-from plushsense.jobs.progress import JobInfo, JobProgress, JobsReporter
+from plushsense.jobs.journal import Journal, Result
+from plushsense.jobs.pool import JobsSpec, Report
+from plushsense.jobs.progress import JobProgress
+from plushsense.jobs.study import StudyPart, run_study
 from plushsense.scoring import metrics
 from plushsense.scoring.splits import Fold, Index, Split, make_folds, parse_split, purge
 from plushsense.windows.cut import WindowSet
@@ -242,20 +243,15 @@ def evaluate(
     folds = folds if validation else train_on_validation(folds)
     hashes = [windows_fingerprint(train_windows)]
     hashes.append(hashes[0] if score_windows is train_windows else windows_fingerprint(score_windows))
-    base = {"version": _VERSION, "key": dict(key or {}), "windows": hashes}
-    jobs = [Job(job_id({**base, "fold": fold_fingerprint(fold)}), fold) for fold in folds]
-    reporter = JobsReporter({job.id: JobInfo(job.task.name, 1.0) for job in jobs}, progress=progress)
-    results = run_jobs(
-        jobs,
+    outcomes = run_study(
+        [StudyPart(fold.name, {"fold": fold_fingerprint(fold)}, fold) for fold in folds],
         _FoldWork(fit_predict),
+        lambda study: study.results,
+        key={"version": _VERSION, "key": dict(key or {}), "windows": hashes},
         shared=(train_windows, None if score_windows is train_windows else score_windows),
-        workers=workers,
-        cluster=cluster,
-        journal=journal,
-        on_done=reporter.on_done,
-        on_report=reporter.on_report,
+        spec=JobsSpec(workers, journal=journal, cluster=cluster),
+        progress=progress,
     )
-    outcomes = [results[job.id] for job in jobs]
     records = [
         FoldRecord(
             fold.name,

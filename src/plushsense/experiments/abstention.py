@@ -24,7 +24,7 @@ from plushsense.dataset.index import as_dataset, open_dataset
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.evaluation.crossval import fold_fingerprint, fold_windows, windows_fingerprint
 from plushsense.jobs.journal import Job, Report, Result, job_id
-from plushsense.jobs.pool import run_jobs
+from plushsense.jobs.pool import JobCallbacks, JobsSpec, run_jobs
 from plushsense.jobs.progress import JobInfo, JobProgress, JobsReporter
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
@@ -446,9 +446,8 @@ def abstaining(
         jobs,
         _AnswerWork(str(dataset.path), arch, config.training, gestures, dataset.layout, coverage, known_share),
         shared=windows,
-        workers=config.evaluation.processes,
-        journal=journal_of(dataset, "abstaining"),
-        on_done=reporter.on_done,
+        spec=JobsSpec(config.evaluation.processes, journal=journal_of(dataset, "abstaining")),
+        callbacks=JobCallbacks(on_done=reporter.on_done),
     )
     answers = [
         FoldAnswers(

@@ -36,10 +36,52 @@ from plushsense.jobs.journal import (
     thread_settings,
 )
 
-__all__ = ["Job", "JobWork", "Report", "run_jobs"]
+__all__ = ["Job", "JobCallbacks", "JobWork", "JobsSpec", "Report", "run_jobs"]
 
 # Number of times that a job is started in all if its worker dies.
 _TRIES = 2
+
+
+@dataclass(frozen=True)
+class JobsSpec:
+    """Where jobs run, and where their results are stored.
+
+    Attributes:
+        workers: number of processes; 1 runs the jobs in this process. A cluster uses all of its processors instead.
+        threads: number of threads of each process; has no effect on this one (``workers=1``).
+        journal: stores the results; jobs that are in it are not run.
+        cluster: run the jobs as Ray tasks: "auto", "host:6379", "ray://host:10001", or "local" to start Ray here.
+        gpus: number of graphics processors for each job of a cluster, which may be a fraction.
+    """
+
+    workers: int = 1
+    threads: int = 1
+    journal: Journal | None = None
+    cluster: str | None = None
+    gpus: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, number in (("workers", self.workers), ("threads", self.threads)):
+            if number < 1:
+                raise ConfigError(f"{number} {name} cannot do anything: give 1 or more.")
+
+
+@dataclass(frozen=True)
+class JobCallbacks:
+    """Functions that `run_jobs` calls in the caller's thread.
+
+    Attributes:
+        on_start: called with each job that starts; twice if its process or node was lost.
+        on_report: called with (job, message of its work); a cluster may leave out messages.
+        on_done: called with (job, result, whether it came from the journal), in the order of completion.
+        on_failed: called with (job, its exception), and the other jobs continue; the job is in neither the journal nor
+            the returned results. By default the first failure ends the run.
+    """
+
+    on_start: Callable[[Job], None] | None = None
+    on_report: Callable[[Job, Any], None] | None = None
+    on_done: Callable[[Job, Result, bool], None] | None = None
+    on_failed: Callable[[Job, Exception], None] | None = None
 
 
 def run_jobs(
@@ -47,31 +89,14 @@ def run_jobs(
     work: JobWork,
     *,
     shared: Any = None,
-    workers: int = 1,
-    threads: int = 1,
-    journal: Journal | None = None,
-    cluster: str | None = None,
-    gpus: float = 0.0,
-    on_start: Callable[[Job], None] | None = None,
-    on_report: Callable[[Job, Any], None] | None = None,
-    on_done: Callable[[Job, Result, bool], None] | None = None,
-    on_failed: Callable[[Job, Exception], None] | None = None,
+    spec: JobsSpec | None = None,
+    callbacks: JobCallbacks | None = None,
 ) -> dict[str, Result]:
-    """Run all jobs whose results are not in the journal yet. All callbacks are called in the caller's thread.
+    """Run all jobs whose results are not in the journal yet.
 
     Args:
         work: called as ``work(shared, task, report)`` for each job; picklable unless it runs in this process.
         shared: passed to every job, and sent to each process once. A job must not change it.
-        workers: number of processes; 1 runs the jobs in this process. A cluster uses all of its processors instead.
-        threads: number of threads of each process; has no effect on this one (``workers=1``).
-        journal: stores the results; jobs that are in it are not run.
-        cluster: run the jobs as Ray tasks: "auto", "host:6379", "ray://host:10001", or "local" to start Ray here.
-        gpus: number of graphics processors for each job of a cluster, which may be a fraction.
-        on_start: called with each job that starts; twice if its process or node was lost.
-        on_report: called with (job, message of its work); a cluster may leave out messages.
-        on_done: called with (job, result, whether it came from the journal), in the order of completion.
-        on_failed: called with (job, its exception), and the other jobs continue; the job is in neither the journal nor
-            the returned results. By default the first failure ends the run.
 
     Returns:
         the result of each job by its id.
@@ -81,51 +106,50 @@ def run_jobs(
             saved; a cluster that does not answer. Finished jobs are kept.
         KeyboardInterrupt: on Ctrl-C, after the workers have ended. Finished jobs are kept.
     """
-    if workers < 1:
-        raise ConfigError(f"{workers} workers cannot do anything: give 1 or more.")
-    if threads < 1:
-        raise ConfigError(f"{threads} threads cannot do anything: give 1 or more.")
+    spec, on = spec or JobsSpec(), callbacks or JobCallbacks()
     results: dict[str, Result] = {}
 
     def done(job: Job, result: Result, resumed: bool) -> None:
         results[job.id] = result
-        if on_done is not None:
-            on_done(job, result, resumed)
+        if on.on_done is not None:
+            on.on_done(job, result, resumed)
 
     with ExitStack() as stack:
-        left = _Left(jobs, journal, done, stack)
-        engine: Engine
+        left = _Left(jobs, spec.journal, done, stack)
         if not left.jobs:
             return results
-        if cluster is not None:
-            from plushsense.jobs.cluster import on_cluster
-
-            engine = on_cluster(left.take, (work, shared), cluster, threads=threads, gpus=gpus)
-        elif workers == 1:
-            engine = _here(left.take, work, shared, on_report)
-        else:
-            # Use a process even for a single job, as its result may depend on the number of threads.
-            setup = pickle.dumps((work, shared, journal))
-            engine = in_processes(left.take, setup, min(workers, len(left.jobs)), threads)
-        saved = cluster is None and workers > 1
+        saved = spec.cluster is None and spec.workers > 1
         # Close the engine explicitly, which ends its processes.
-        with closing(engine):  # type: ignore[type-var]
+        with closing(_engine(left, work, shared, spec, on)) as engine:  # type: ignore[type-var]
             for job, kind, payload in engine:
-                if kind == "started" and on_start is not None:
-                    on_start(job)
-                elif kind == "report" and on_report is not None:
-                    on_report(job, payload)
+                if kind == "started" and on.on_start is not None:
+                    on.on_start(job)
+                elif kind == "report" and on.on_report is not None:
+                    on.on_report(job, payload)
                 elif kind == "done":
-                    if journal is not None and not saved:
-                        journal.save(job.id, payload)
+                    if spec.journal is not None and not saved:
+                        spec.journal.save(job.id, payload)
                     left.release(job)
                     done(job, payload, False)
                 elif kind == "failed":
                     left.release(job)
-                    if on_failed is None:
+                    if on.on_failed is None:
                         raise payload
-                    on_failed(job, payload)
+                    on.on_failed(job, payload)
     return results
+
+
+def _engine(left: _Left, work: JobWork, shared: Any, spec: JobsSpec, on: JobCallbacks) -> Engine:
+    """Return the iterator that runs the jobs, in this process, in several, or on a cluster, and yields their events."""
+    if spec.cluster is not None:
+        from plushsense.jobs.cluster import on_cluster
+
+        return on_cluster(left.take, (work, shared), spec.cluster, threads=spec.threads, gpus=spec.gpus)
+    if spec.workers == 1:
+        return _here(left.take, work, shared, on.on_report)
+    # Use a process even for a single job, as its result may depend on the number of threads.
+    setup = pickle.dumps((work, shared, spec.journal))
+    return in_processes(left.take, setup, min(spec.workers, len(left.jobs)), spec.threads)
 
 
 def _here(take: Take, work: JobWork, shared: Any, on_report: Callable[[Job, Any], None] | None) -> Engine:

@@ -23,7 +23,7 @@ from plushsense.core.sentences import Sentence
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.crossval import fold_fingerprint, fold_windows, windows_fingerprint
 from plushsense.jobs.journal import JOURNAL, UNFINISHED, Journal, Result, job_id, keep_if_possible
-from plushsense.jobs.pool import Job, Report, run_jobs
+from plushsense.jobs.pool import Job, JobCallbacks, JobsSpec, Report, run_jobs
 from plushsense.models.arch import VECTOR, Arch
 from plushsense.scoring import metrics
 from plushsense.scoring.metrics import Counts
@@ -307,15 +307,14 @@ def train_all(
         # Nodes of a cluster may not share a disk, so they do not save unfinished states.
         TrainAndScore(unfinished if cluster is None else None),
         shared=(planned.sets, planned.folds),
-        workers=workers,
-        threads=planned.grid.threads,
-        journal=journal_of(dataset, JOURNAL),
-        cluster=cluster,
-        gpus=1.0 if cluster is not None and planned.grid.device == "cuda" else 0.0,
-        on_start=on_start,
-        on_report=on_report,
-        on_done=done,
-        on_failed=on_failed,
+        spec=JobsSpec(
+            workers,
+            planned.grid.threads,
+            journal_of(dataset, JOURNAL),
+            cluster,
+            1.0 if cluster is not None and planned.grid.device == "cuda" else 0.0,
+        ),
+        callbacks=JobCallbacks(on_start, on_report, done, on_failed),
     )
 
 

@@ -7,30 +7,30 @@ from typing import Any
 import pytest
 
 from plushsense.experiments.baselines.report import COUNTS, LEAKY, figure, milliseconds, page, program_table, size
+from plushsense.experiments.baselines.score import BaselinesResult, ProgramGap, ProgramScores, SplitFolds
 
 SPLITS = (("leave-one-subject-out", False), ("windows:5", True))
 
 
-def comparison(*splits: tuple[str, bool], simulated: bool = False) -> dict[str, Any]:
-    programs = {("tree", "statistics", True): (0.3, 0.7), ("network", "windows", False): (0.6, 0.75)}
+def comparison(*splits: tuple[str, bool], simulated: bool = False) -> BaselinesResult:
     models, gaps = [], []
-    for (name, features, pca), at in programs.items():
-        own = {"name": name, "title": f"the {name} <b>", "features": features, "pca": pca, "span_s": 2.46}
+    for program, at in {("tree", "statistics", True): (0.3, 0.7), ("network", "windows", False): (0.6, 0.75)}.items():
+        name, features, pca = program
+        own: tuple[Any, ...] = (name, f"the {name} <b>", features, pca)
         for split, leaky in splits:
             score = {"mean": at[leaky], "sd": 0.1, "ci95": [0.1, 0.9]}
-            costs = {"size_bytes": 12_345, "predict_ms": 0.5, "predict_batch_ms": 0.01, "train_s": 12.3}
+            scores = {"accuracy": score, "macro_f1": score}, {"accuracy": 0.5, "macro_f1": 0.4}, dict[str, float]()
             models.append(
-                {**own, "split": split, "leaky": leaky, "apart": not leaky, "over": "subjects", "folds": 5}
-                | {"accuracy": score, "macro_f1": score, "pooled": {"accuracy": 0.5, "macro_f1": 0.4}, **costs}
+                ProgramScores(
+                    *own, 2.46, split, leaky, not leaky, "subjects", 5, *scores, 12_345, 0.5, 0.01, 12.3, 61.5
+                )
             )
         if len(splits) == 2:
-            gaps.append({**own, "split": splits[0][0], "leaky_split": splits[1][0], "accuracy": at[1] - at[0]})
-    return {
-        "dataset": "study $1", "simulated": simulated,
-        "splits": [{"split": split, "leaky": leaky, "folds": 5} for split, leaky in splits],
-        "models": models, "gaps": gaps, "windows": 1890, "recordings": 300, "subjects": 9, "labels": ["a", "b"],
-        "window_s": 2.5, "context": "stream", "seed": 0, "machine": "a processor",
-    }  # fmt: skip
+            gaps.append(ProgramGap(*own, splits[0][0], splits[1][0], {"accuracy": at[1] - at[0]}))
+    return BaselinesResult(
+        "stream", tuple(SplitFolds(split, leaky, 5) for split, leaky in splits), 1890, 300, 9, ("a", "b"), 0, 10, 0,
+        tuple(models), tuple(gaps), "study $1", "0", simulated, "ours", {}, 2.5, "1", "a processor", "1",
+    )  # fmt: skip
 
 
 def test_rows_are_sorted_by_the_first_split_and_hold_the_gap() -> None:

@@ -6,7 +6,7 @@ import json
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import pytest
 from plushsense.core.errors import BadInput, ConfigError
 from plushsense.experiments.baselines.score import Contender, compare
 from plushsense.jobs.journal import Journal
+from plushsense.jobs.pool import JobsSpec
 from plushsense.jobs.progress import JobProgress
 from plushsense.windows.cut import WindowSet
 
@@ -77,34 +78,34 @@ def test_side_by_side_with_the_gap(tmp_path: Path) -> None:
     windows = study(windows=4)
     said: list[JobProgress] = []
     table = compare(windows, [known(tmp_path), known(tmp_path, "other")], SPLITS, progress=said.append)
-    json.dumps(table, allow_nan=False)
-    assert [(r["name"], r["split"]) for r in table["models"]] == [
+    json.dumps(table.to_json(), allow_nan=False)
+    assert [(r.name, r.split) for r in table.models] == [
         (name, split) for name in ("known", "other") for split in SPLITS
     ]
-    honest, leaky = table["models"][:2]
-    assert (honest["leaky"], honest["over"], honest["folds"]) == (False, "subjects", 6)
-    assert (leaky["leaky"], leaky["over"], leaky["folds"]) == (True, "folds", 4)
-    assert honest["accuracy"]["mean"] == 0.0 and leaky["accuracy"]["mean"] > 0.9
-    assert leaky["pooled"]["accuracy"] > 0.9 and leaky["macro_f1"]["mean"] > 0.9
-    gap = table["gaps"][0]
-    assert (gap["name"], gap["split"], gap["leaky_split"]) == ("known", *SPLITS)
-    assert gap["accuracy"] == pytest.approx(leaky["accuracy"]["mean"]) and len(table["gaps"]) == 2
-    assert all(r["predict_ms"] > 0 and r["predict_batch_ms"] > 0 and r["train_s"] > 0 for r in table["models"])
-    assert honest["size_bytes"] % 8 == 0 and honest["size_bytes"] > 0
-    assert (table["windows"], table["subjects"], table["recordings"]) == (len(windows), 6, 30)
+    honest, leaky = table.models[:2]
+    assert (honest.leaky, honest.over, honest.folds) == (False, "subjects", 6)
+    assert (leaky.leaky, leaky.over, leaky.folds) == (True, "folds", 4)
+    assert honest.metrics["accuracy"]["mean"] == 0.0 and leaky.metrics["accuracy"]["mean"] > 0.9
+    assert leaky.pooled["accuracy"] > 0.9 and leaky.metrics["macro_f1"]["mean"] > 0.9
+    gap = table.gaps[0]
+    assert (gap.name, gap.split, gap.leaky_split) == ("known", *SPLITS)
+    assert gap.metrics["accuracy"] == pytest.approx(leaky.metrics["accuracy"]["mean"]) and len(table.gaps) == 2
+    assert all(r.predict_ms > 0 and r.predict_batch_ms > 0 and r.train_s > 0 for r in table.models)
+    assert honest.size_bytes % 8 == 0 and honest.size_bytes > 0
+    assert (table.windows, table.subjects, table.recordings) == (len(windows), 6, 30)
     assert [s.done for s in said] == list(range(1, 21)) and fits(tmp_path) == 20 == said[-1].total
 
 
 def test_finished_fits_are_kept_and_a_changed_key_is_another_job(tmp_path: Path) -> None:
     windows, journal = study(), Journal(tmp_path / "journal")
-    first = compare(windows, [known(tmp_path, depth=1)], ["by-subject:3"], journal=journal)
-    again = compare(windows, [known(tmp_path, depth=1)], ["by-subject:3"], journal=journal)
-    assert fits(tmp_path) == 3 and again["resumed"] == 3
+    first = compare(windows, [known(tmp_path, depth=1)], ["by-subject:3"], spec=JobsSpec(journal=journal))
+    again = compare(windows, [known(tmp_path, depth=1)], ["by-subject:3"], spec=JobsSpec(journal=journal))
+    assert fits(tmp_path) == 3 and again.resumed == 3
     # Times too are those of the first run: the journal holds what was measured.
-    assert {**again, "resumed": 0} == first
-    compare(windows, [known(tmp_path, depth=2)], ["by-subject:3"], journal=journal)
+    assert replace(again, resumed=0) == first
+    compare(windows, [known(tmp_path, depth=2)], ["by-subject:3"], spec=JobsSpec(journal=journal))
     assert fits(tmp_path) == 6
-    compare(windows, [known(tmp_path, depth=1)], ["by-subject:3"], journal=journal, seed=4)
+    compare(windows, [known(tmp_path, depth=1)], ["by-subject:3"], spec=JobsSpec(journal=journal), seed=4)
     assert fits(tmp_path) == 9
 
 
@@ -116,7 +117,9 @@ def test_a_killed_comparison_goes_on_and_ends_the_same(tmp_path: Path) -> None:
         "from test_score import known, SPLITS\n"
         "from plushsense.experiments.baselines.score import compare\n"
         "from plushsense.jobs.journal import Journal\n"
-        "compare(study(windows=4), [known(Path({folder!r}), pause=0.3)], SPLITS, journal=Journal({journal!r}))\n"
+        "from plushsense.jobs.pool import JobsSpec\n"
+        "spec = JobsSpec(journal=Journal({journal!r}))\n"
+        "compare(study(windows=4), [known(Path({folder!r}), pause=0.3)], SPLITS, spec=spec)\n"
     ).format(here=[str(HERE), str(Path(__file__).parent)], folder=str(tmp_path), journal=str(tmp_path / "journal"))
     process = subprocess.Popen([sys.executable, "-c", program])
     until = time.monotonic() + 30
@@ -127,15 +130,11 @@ def test_a_killed_comparison_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     kept = len(list((tmp_path / "journal").glob("*.npz")))
     assert 2 <= kept < 10
     before = fits(tmp_path)
-    table = compare(study(windows=4), [known(tmp_path)], SPLITS, journal=Journal(tmp_path / "journal"))
-    assert table["resumed"] == kept and fits(tmp_path) == before + 10 - kept
+    table = compare(study(windows=4), [known(tmp_path)], SPLITS, spec=JobsSpec(journal=Journal(tmp_path / "journal")))
+    assert table.resumed == kept and fits(tmp_path) == before + 10 - kept
     whole = compare(study(windows=4), [known(tmp_path)], SPLITS)
-    for one, other in zip(table["models"], whole["models"], strict=True):
-        assert (one["accuracy"], one["macro_f1"], one["pooled"]) == (
-            other["accuracy"],
-            other["macro_f1"],
-            other["pooled"],
-        )
+    for one, other in zip(table.models, whole.models, strict=True):
+        assert (one.metrics, one.pooled) == (other.metrics, other.pooled)
 
 
 def test_what_is_refused(tmp_path: Path) -> None:

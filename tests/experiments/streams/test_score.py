@@ -54,6 +54,7 @@ from plushsense.experiments.streams.systems import (
     tried,
 )
 from plushsense.jobs.journal import Journal
+from plushsense.jobs.pool import JobsSpec
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import random_weights
@@ -408,10 +409,10 @@ class Remembering:
 def test_folds_keep_people_apart_and_are_resumed(dataset: Dataset, tmp_path: Path) -> None:
     fit = Remembering(tmp_path / "notes")
     settings = Settings(("argmax", "hybrid", "full"), targets=(0.3, 0.9))
-    journal = Journal(tmp_path / "journal")
+    spec = JobsSpec(journal=Journal(tmp_path / "journal"))
     seen: list[tuple[int, int]] = []
     folds = crossvalidated_streams(
-        dataset, "by-subject:3", fit, settings=settings, journal=journal, key={"fit": 1},
+        dataset, "by-subject:3", fit, settings=settings, spec=spec, key={"fit": 1},
         progress=lambda at: seen.append((at.done, at.resumed)),
     )  # fmt: skip
     notes = fit.notes.read_text().splitlines()
@@ -425,11 +426,11 @@ def test_folds_keep_people_apart_and_are_resumed(dataset: Dataset, tmp_path: Pat
     # No network was trained anywhere in the stream, so that the system that needs one is left out.
     assert [list(fold["systems"]) for fold in folds] == [["argmax", "hybrid"]] * 3
     again = crossvalidated_streams(
-        dataset, "by-subject:3", fit, settings=settings, journal=journal, key={"fit": 1},
+        dataset, "by-subject:3", fit, settings=settings, spec=spec, key={"fit": 1},
         progress=lambda at: seen.append((at.done, at.resumed)),
     )  # fmt: skip
     assert again == folds and len(fit.notes.read_text().splitlines()) == 3 and seen[-1] == (3, 3)
-    crossvalidated_streams(dataset, "by-subject:3", fit, settings=settings, journal=journal, key={"fit": 2})
+    crossvalidated_streams(dataset, "by-subject:3", fit, settings=settings, spec=spec, key={"fit": 2})
     assert len(fit.notes.read_text().splitlines()) == 6
 
     table = summed(folds)
@@ -451,11 +452,9 @@ def test_a_reference_beside_itself_is_one(dataset: Dataset, tmp_path: Path) -> N
     assert {r for r in ratios if r is not None} <= {1.0} and any(r is not None for r in ratios)
 
 
-def test_what_cannot_be_split_is_refused(dataset: Dataset, tmp_path: Path) -> None:
+def test_what_cannot_be_split_is_refused(dataset: Dataset) -> None:
     with pytest.raises(ConfigError, match="does not keep people apart"):
         people_folds(dataset, "by-recording:5")
-    with pytest.raises(ConfigError, match="needs a key"):
-        crossvalidated_streams(dataset, "by-subject:3", Remembering(tmp_path / "n"), journal=Journal(tmp_path / "j"))
     for path in (dataset.path / "streams").rglob("*.csv"):
         path.unlink()
     (dataset.path / "index.json").unlink()

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from plushsense.experiments.baselines.score import Pca, reads
+from plushsense.experiments.baselines.score import (
+    BaselinesResult,
+    ComparisonResult,
+    Program,
+    ProgramScores,
+    flat,
+    reads,
+)
 from plushsense.reports.figures import data_uri, new_figure
 from plushsense.reports.page import render_page
 from plushsense.reports.table import Column, Table, count, mean_sd, number
@@ -26,53 +32,32 @@ LEAKY = (
 )
 # Okabe and Ito's blue and vermillion; filled and open markers show the same difference without colour.
 _HONEST, _LEAKY = "#0072b2", "#d55e00"
-Program = tuple[str, str, Pca]
-"""Name, features, and whether and how PCA reduces them."""
 
 
-def program_table(result: Mapping[str, Any]) -> Table:
+def program_table(result: ComparisonResult) -> Table:
     """Return one row for each program, ordered by accuracy under the first split, the best first.
 
     A row has the span that it reads, in seconds; accuracy and macro-F1 of each split, with those pooled over all
     windows as a note; the gap in accuracy between the first leaky split and the first split by person; and the costs
     measured under the first split.
     """
-    splits = [split["split"] for split in result["splits"]]
-    by_program: dict[Program, dict[str, Mapping[str, Any]]] = {}
-    for row in result["models"]:
-        by_program.setdefault(_program(row), {})[row["split"]] = row
+    by_program: dict[Program, dict[str, ProgramScores]] = {}
+    for row in result.models:
+        by_program.setdefault(row.program, {})[row.split] = row
     gaps: dict[Program, float] = {}
-    for gap in result["gaps"]:
-        gaps.setdefault(_program(gap), gap["accuracy"])
-    ranked = sorted(by_program.items(), key=lambda item: -float(item[1][splits[0]]["accuracy"]["mean"]))
-    rows = []
-    for program, by_split in ranked:
-        first = by_split[splits[0]]
-        row = {
-            "title": first["title"],
-            "reads": reads(first["features"], first["pca"]),
-            "span": f"{first['span_s']:.2f}",
-            "gap": f"{gaps[program]:+.3f}" if program in gaps else "",
-            "size": size(first["size_bytes"]),
-            "predict": milliseconds(first["predict_ms"]),
-            "batch": milliseconds(first["predict_batch_ms"]),
-            "train": f"{first['train_s']:.2f}" if first["train_s"] < 10 else f"{first['train_s']:.0f}",
-            "class": "ours" if first["name"] == "network" else "",
-        }
-        for split, scores in by_split.items():
-            pooled = scores["pooled"]
-            row |= {f"{key} {split}": mean_sd(scores[key]) for key in column_metrics()}
-            note = "pooled " + " / ".join(number(pooled[key]) for key in column_metrics())
-            row[f"accuracy {split}"] = (mean_sd(scores["accuracy"]), note)
-        rows.append(row)
+    for gap in result.gaps:
+        gaps.setdefault(gap.program, gap.metrics["accuracy"])
+    first = result.splits[0].split
+    ranked = sorted(by_program.items(), key=lambda item: -float(item[1][first].metrics["accuracy"]["mean"]))
     columns = [Column("title", "Program", plain="program"), Column("reads", "Reads", plain="reads")]
     columns.append(Column("span", "Span, s", "right", plain="span s"))
-    for split in result["splits"]:
-        name, leaky, group = split["split"], split["leaky"], f"{split['split']}, {split['folds']} folds"
+    for split in result.splits:
+        group = f"{split.split}, {split.folds} folds"
         for key, metric in column_metrics().items():
-            plain = f"{metric.name}, {name}" if key == "accuracy" else metric.name
-            columns.append(Column(f"{key} {name}", metric.title, "right", group=group, leaky=leaky, plain=plain))
-    if result["gaps"]:
+            plain = f"{metric.name}, {split.split}" if key == "accuracy" else metric.name
+            name = f"{key} {split.split}"
+            columns.append(Column(name, metric.title, "right", group=group, leaky=split.leaky, plain=plain))
+    if result.gaps:
         columns.append(Column("gap", "Gap in accuracy", "right", plain="gap"))
     columns += [
         Column("size", "Size", "right", plain="size"),
@@ -80,23 +65,40 @@ def program_table(result: Mapping[str, Any]) -> Table:
         Column("batch", "in a batch", "right", group="ms a window", plain="ms batch"),
         Column("train", "Training, s", "right", plain="train s"),
     ]
-    return Table("programs", "Every program", tuple(columns), tuple(rows))
+    rows = tuple(_program_row(by_split, first, gaps.get(program)) for program, by_split in ranked)
+    return Table("programs", "Every program", tuple(columns), rows)
 
 
-def score_table(result: Mapping[str, Any]) -> Table:
+def _program_row(by_split: dict[str, ProgramScores], first_split: str, gap: float | None) -> dict[str, object]:
+    first = by_split[first_split]
+    row: dict[str, object] = {
+        "title": first.title,
+        "reads": reads(first.features, first.pca),
+        "span": f"{first.span_s:.2f}",
+        "gap": "" if gap is None else f"{gap:+.3f}",
+        "size": size(first.size_bytes),
+        "predict": milliseconds(first.predict_ms),
+        "batch": milliseconds(first.predict_batch_ms),
+        "train": f"{first.train_s:.2f}" if first.train_s < 10 else f"{first.train_s:.0f}",
+        "class": "ours" if first.name == "network" else "",
+    }
+    for split, scores in by_split.items():
+        row |= {f"{key} {split}": mean_sd(scores.metrics[key]) for key in column_metrics()}
+        note = "pooled " + " / ".join(number(scores.pooled[key]) for key in column_metrics())
+        row[f"accuracy {split}"] = (mean_sd(scores.metrics["accuracy"]), note)
+    return row
+
+
+def score_table(result: ComparisonResult) -> Table:
     """Return one row for each program and split as numbers, for CSV."""
     rows = []
-    for row in result["models"]:
-        scores = {f"{m}_{part}": row[m][part] for m in column_metrics() for part in ("mean", "sd")}
-        rows.append(row | scores | {f"{m}_pooled": row["pooled"][m] for m in column_metrics()})
+    for row in result.models:
+        scores = {f"{m}_{part}": row.metrics[m][part] for m in column_metrics() for part in ("mean", "sd")}
+        rows.append(flat(row) | scores | {f"{m}_pooled": row.pooled[m] for m in column_metrics()})
     names = ["name", "title", "features", "pca", "span_s", "split", "leaky", "over", "folds"]
     names += [f"{m}_{part}" for m in column_metrics() for part in ("mean", "sd", "pooled")]
     names += ["size_bytes", "predict_ms", "predict_batch_ms", "train_s", "train_s_in_all"]
     return Table("baselines", "Every program and split", tuple(Column(name, name) for name in names), tuple(rows))
-
-
-def _program(row: Mapping[str, Any]) -> Program:
-    return row["name"], row["features"], row["pca"]
 
 
 def size(n: int) -> str:
@@ -109,36 +111,34 @@ def milliseconds(value: float) -> str:
     return f"{value:.3f}" if value < 1 else f"{value:.1f}" if value < 100 else f"{value:.0f}"
 
 
-def describe_costs(result: Mapping[str, Any]) -> str:
+def describe_costs(result: BaselinesResult) -> str:
     """Return a note on how sizes and times were measured."""
     return (
         "Size: classical programs as they are pickled in memory, our network as its bundle, recurrent ones as their "
         "float32 weights. Processor time in milliseconds a window, read alone (median) or many at once, and seconds of "
         "training (median over folds), with everything from raw samples to probabilities, on this machine: "
-        f"{result['machine']}."
+        f"{result.machine}."
     )
 
 
-def describe_data(result: Mapping[str, Any]) -> str:
+def describe_data(result: BaselinesResult) -> str:
     """Return a sentence that describes the data of the comparison."""
     return (
-        f"{result['dataset']}: {count(result['windows'])} windows of {count(result['recordings'])} recordings, "
-        f"{result['subjects']} people, {len(result['labels'])} gestures; {result['window_s']:g} s windows, "
-        f"{CONTEXT_SHORT.get(result['context'], result['context'])}; seed {result['seed']}."
+        f"{result.dataset}: {count(result.windows)} windows of {count(result.recordings)} recordings, "
+        f"{result.subjects} people, {len(result.labels)} gestures; {result.window_s:g} s windows, "
+        f"{CONTEXT_SHORT.get(result.context, result.context)}; seed {result.seed}."
     )
 
 
-def figure(result: Mapping[str, Any]) -> Figure:
+def figure(result: BaselinesResult) -> Figure:
     """Draw a line for each program between its accuracies under the first split by person and the first leaky split."""
-    splits: Sequence[Mapping[str, Any]] = result["splits"]
-    honest = next((s["split"] for s in splits if not s["leaky"]), None)
-    leaky = next((s["split"] for s in splits if s["leaky"]), None)
+    honest = next((s.split for s in result.splits if not s.leaky), None)
+    leaky = next((s.split for s in result.splits if s.leaky), None)
     at: dict[Program, dict[str, float]] = {}
     named: dict[Program, str] = {}
-    for row in result["models"]:
-        key = _program(row)
-        at.setdefault(key, {})[row["split"]] = row["accuracy"]["mean"]
-        named[key] = f"{row['title']}, {reads(row['features'], row['pca'])}"
+    for row in result.models:
+        at.setdefault(row.program, {})[row.split] = row.metrics["accuracy"]["mean"]
+        named[row.program] = f"{row.title}, {reads(row.features, row.pca)}"
     main = honest or leaky or ""
     order = sorted(at, key=lambda key: at[key][main])
     picture = new_figure(9.0, 1.5 + 0.24 * len(order))
@@ -168,22 +168,22 @@ def figure(result: Mapping[str, Any]) -> Figure:
     axes.grid(axis="x", color="#dddddd", linewidth=0.5)
     axes.spines[["top", "right"]].set_visible(False)
     picture.legend(loc="outside upper right", ncols=2, fontsize=8, frameon=False)
-    title = f"{result['dataset']}, {result['subjects']} people"
-    axes.set_title(title + (": SIMULATION" if result["simulated"] else ""), fontsize=10, loc="left", parse_math=False)
+    title = f"{result.dataset}, {result.subjects} people"
+    axes.set_title(title + (": SIMULATION" if result.simulated else ""), fontsize=10, loc="left", parse_math=False)
     return picture
 
 
-def page(result: Mapping[str, Any]) -> str:
+def page(result: BaselinesResult) -> str:
     """Return the comparison as one self-contained HTML page."""
     return render_page(
         "baselines.html.j2",
-        title=f"PlushSense baselines: {result['dataset']}",
-        simulated=result["simulated"],
+        title=f"PlushSense baselines: {result.dataset}",
+        simulated=result.simulated,
         about=describe_data(result),
         table=program_table(result),
         metrics=column_metrics(),
-        counts=COUNTS if result["gaps"] else LEAKY,
-        any_leaky=any(s["leaky"] for s in result["splits"]),
+        counts=COUNTS if result.gaps else LEAKY,
+        any_leaky=any(s.leaky for s in result.splits),
         costs=describe_costs(result),
         picture=data_uri(figure(result)),
     )

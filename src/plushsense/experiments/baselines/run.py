@@ -6,7 +6,7 @@ import json
 import os
 import platform
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,9 +30,10 @@ from plushsense.experiments.baselines.models import (
     parse_recurrent,
     recurrent,
 )
-from plushsense.experiments.baselines.score import UNSCALED, Contender, Fit, Pca, Reader, compare
+from plushsense.experiments.baselines.score import UNSCALED, BaselinesResult, Contender, Fit, Pca, Reader, compare
 from plushsense.jobs.journal import job_id
-from plushsense.jobs.progress import JobProgress
+from plushsense.jobs.pool import JobsSpec
+from plushsense.jobs.study import Progress
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.models.reference import Network
@@ -150,37 +151,60 @@ def _kind(model: str) -> str:
     return model.partition(":")[0]
 
 
+@dataclass(frozen=True)
+class ComparisonSpec:
+    """Which programs to compare under which splits.
+
+    Attributes:
+        splits: such as "leave-one-subject-out", "by-subject:5", "windows:5" (leaky); the gap between them is reported.
+        models: names of `MODELS` and `SETS`, or such as "lstm:units=128:dropout=0.5" (see `chosen`).
+        features: names of `FEATURES`, for the classical programs.
+        pca: key of `PCA`, for the classical programs.
+    """
+
+    splits: Sequence[str] = SPLITS
+    models: str | Sequence[str] = "all"
+    features: Sequence[str] = DEFAULT_FEATURES
+    pca: str = "both"
+
+    def __post_init__(self) -> None:
+        if self.pca not in PCA:
+            raise ConfigError(
+                f"Unknown choice '{self.pca}' for PCA: accepted are {', '.join(PCA)}.{nearest(self.pca, PCA)}"
+            )
+
+    def too_long(self, names: Sequence[str]) -> Iterator[str]:
+        """Yield a sentence for each program of ``names`` that is left out because it takes too long."""
+        for name, view, reduced in TOO_LONG:
+            if name in names and view in self.features and reduced in PCA[self.pca]:
+                how = "with" if reduced else "without"
+                yield f"left out: {BASELINES[name].title} on {view} windows {how} PCA, which takes too long"
+
+
 def contenders(
-    models: Sequence[str],
-    features: Sequence[str],
-    pca: Sequence[Pca],
-    config: RunConfig,
-    arch: Arch,
-    layout: Layout,
-    gestures: GestureSet,
-    windows: WindowSet,
-    inputs: Sequence[str],
+    spec: ComparisonSpec, config: RunConfig, arch: Arch, dataset: Dataset, windows: WindowSet, inputs: Sequence[str]
 ) -> list[Contender]:
     """Return the requested programs for `compare`; all use the seed of ``config.training``.
 
     All read as many samples as our network; only it reads inputs that are not in ``inputs``.
     """
-    spec, samples = config.training, arch.span
-    made = classical([m for m in models if m in BASELINES], features, pca, samples, spec.seed)
+    models, training, samples = chosen(spec.models), config.training, arch.span
+    made = classical([m for m in models if m in BASELINES], spec.features, PCA[spec.pca], samples, training.seed)
     recurrent_names = [m for m in models if _kind(m) in RECURRENT]
     if NETWORK in models or recurrent_names:
         need("torch", extra="train")
         from plushsense.training.fit import resolve_device
 
-        spec = resolve_device(spec)
+        training = resolve_device(training)
     vectors = [list(v) for v in windows.vectors]
-    made += recurrent(recurrent_names, samples, spec, vectors)
+    made += recurrent(recurrent_names, samples, training, vectors)
     if tuple(inputs) != windows.inputs:
         made = [replace(one, fit=OnInputs(one.fit, tuple(inputs))) for one in made]
     if NETWORK in models:
-        key = {"arch": arch.to_dict(), "training": spec.key(), "vectors": vectors}
+        key = {"arch": arch.to_dict(), "training": training.key(), "vectors": vectors}
         title = f"{arch.title} {arch.padding} (ours)"
-        network = NetworkFit(arch, spec, layout, gestures)
+        gestures = dataset.gestures.subset(windows.labels)
+        network = NetworkFit(arch, training, dataset.layout, gestures)
         made.append(Contender(NETWORK, title, "windows", False, network, key, samples))
     return made
 
@@ -188,18 +212,15 @@ def contenders(
 def baselines(
     dataset: Dataset | str | os.PathLike[str],
     config: RunConfig | None = None,
+    spec: ComparisonSpec | None = None,
     *,
-    splits: Sequence[str] = SPLITS,
-    models: str | Sequence[str] = "all",
-    features: Sequence[str] = DEFAULT_FEATURES,
-    pca: str = "both",
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     cluster: str | None = None,
-    progress: Callable[[JobProgress], None] | None = None,
+    progress: Progress | None = None,
     warn: Warn = python_warning,
     **settings: Any,
-) -> dict[str, Any]:
+) -> BaselinesResult:
     """Compare classical programs, recurrent networks and our own network on the same windows, under several splits.
 
     Windows are cut as for the network, and every program reads the span that the network reads: ``window_s`` seconds or
@@ -208,26 +229,16 @@ def baselines(
 
     Args:
         config, settings: as for `evaluate`; its split is not used.
-        splits: such as "leave-one-subject-out", "by-subject:5", "windows:5" (leaky); the gap between them is reported.
-        models: names of `MODELS` and `SETS`, or such as "lstm:units=128:dropout=0.5" (see `chosen`).
-        features: names of `FEATURES`, for the classical programs.
-        pca: key of `PCA`, for the classical programs.
         cluster: address of a Ray cluster that does the work instead of this machine's processes.
         out: a folder for the table as JSON and CSV, a page and a figure. If it holds a comparison of other settings or
             data, an error is raised unless ``overwrite``.
-
-    Returns:
-        what `plushsense.experiments.baselines.score.compare` returns, with ``dataset``, ``dataset_hash``,
-        ``simulated``, ``preset``, ``training``, ``window_s``, ``id``, ``code_version`` and ``machine``.
     """
-    dataset = as_dataset(dataset)
+    spec, dataset = spec or ComparisonSpec(), as_dataset(dataset)
     inputs = dataset.layout.inputs
     dataset, config = network_inputs_of(dataset, config or from_settings(**settings))
     if config.windows.context == ANYWHERE:
         raise ConfigError("Programs are compared on windows of gestures: choose the context stream or loop.")
-    names = chosen(models)
-    identity = comparison_id(dataset, config, splits, models, features, pca)
-    asked = [parse_split(text).text for text in splits]
+    identity = comparison_id(dataset, config, spec)
     if out is not None:
         need("matplotlib", extra="reports")
         need("jinja2", extra="reports")
@@ -235,66 +246,54 @@ def baselines(
     gestures = choose_classes(dataset, config.evaluation.classes, warn)
     network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     windows = windows_for(dataset, network, config.windows, gestures, warn)
-    for name, view, reduced in TOO_LONG:
-        if name in names and view in features and reduced in PCA[pca]:
-            how = "with" if reduced else "without"
-            warn(f"left out: {BASELINES[name].title} on {view} windows {how} PCA, which takes too long")
-    table = compare(
+    for sentence in spec.too_long(chosen(spec.models)):
+        warn(sentence)
+    compared = compare(
         windows,
-        contenders(names, features, PCA[pca], config, network, dataset.layout, gestures, windows, inputs),
-        asked,
-        journal=journal_of(dataset, "baselines"),
-        workers=config.evaluation.processes,
-        cluster=cluster,
+        contenders(spec, config, network, dataset, windows, inputs),
+        spec.splits,
+        spec=JobsSpec(config.evaluation.processes, journal=journal_of(dataset, "baselines"), cluster=cluster),
         seed=config.evaluation.seed,
         progress=progress,
     )
-    table |= {
-        "dataset": dataset.head.name,
-        "dataset_hash": dataset.hash,
-        "simulated": dataset.head.simulated,
-        "preset": config.preset,
-        "training": config.training.to_dict(),
-        "window_s": config.windows.window_s,
-        "id": identity,
-        "machine": machine("one thread a program", f"Python {platform.python_version()}"),
-        "code_version": __version__,
-    }
+    result = BaselinesResult(
+        **vars(compared),
+        dataset=dataset.head.name,
+        dataset_hash=dataset.hash,
+        simulated=dataset.head.simulated,
+        preset=config.preset,
+        training=config.training.to_dict(),
+        window_s=config.windows.window_s,
+        id=identity,
+        machine=machine("one thread a program", f"Python {platform.python_version()}"),
+        code_version=__version__,
+    )
     if out is not None:
         with dataset.generation.writing():
-            save_baselines(table, Path(out))
-    return table
+            save_baselines(result, Path(out))
+    return result
 
 
-def comparison_id(
-    dataset: Dataset,
-    config: RunConfig,
-    splits: Sequence[str] = SPLITS,
-    models: str | Sequence[str] = "all",
-    features: Sequence[str] = DEFAULT_FEATURES,
-    pca: str = "both",
-) -> str:
+def comparison_id(dataset: Dataset, config: RunConfig, spec: ComparisonSpec) -> str:
     """Return an identifier of 20 hexadecimal digits, equal for equal settings and data.
 
     Raises:
         ConfigError: for an unknown setting.
     """
-    if pca not in PCA:
-        raise ConfigError(f"Unknown choice '{pca}' for PCA: accepted are {', '.join(PCA)}.{nearest(pca, PCA)}")
     outcome = {key: value for key, value in config.for_layout(dataset.layout).outcome().items() if key != "evaluation"}
     outcome |= {"seed": config.evaluation.seed, "classes": config.evaluation.classes}
-    outcome |= {"splits": [parse_split(text).text for text in splits], "models": chosen(models)}
-    outcome |= {"features": list(features), "pca": pca}
+    outcome |= {"splits": [parse_split(text).text for text in spec.splits], "models": chosen(spec.models)}
+    outcome |= {"features": list(spec.features), "pca": spec.pca}
     return job_id({"settings": outcome, "data": dataset.hash})
 
 
-def save_baselines(table: dict[str, Any], out: Path) -> None:
+def save_baselines(result: BaselinesResult, out: Path) -> None:
     """Write the comparison to a folder: JSON, CSV with a row for each program and split, a page and the figure."""
     from plushsense.experiments.baselines.report import figure, page, score_table
     from plushsense.reports.figures import png
 
     out.mkdir(parents=True, exist_ok=True)
-    write_file(out / SHEET, score_table(table).csv())
-    (out / PICTURE).write_bytes(png(figure(table), dpi=130))
-    write_file(out / PAGE, page(table))
-    write_file(out / TABLE, json.dumps(table, ensure_ascii=False, indent=1))
+    write_file(out / SHEET, score_table(result).csv())
+    (out / PICTURE).write_bytes(png(figure(result), dpi=130))
+    write_file(out / PAGE, page(result))
+    write_file(out / TABLE, json.dumps(result.to_json(), ensure_ascii=False, indent=1))

@@ -7,6 +7,7 @@ here in the same way.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,9 +21,9 @@ from plushsense.core.errors import ConfigError, need
 from plushsense.core.gestures import NOBODY
 from plushsense.evaluation.crossval import context_of, fold_fingerprint, fold_windows, windows_fingerprint
 from plushsense.evaluation.scores import FoldRecord, compute_scores, gather_predictions
-from plushsense.jobs.journal import Journal, Result, job_id
-from plushsense.jobs.pool import Job, Report, run_jobs
-from plushsense.jobs.progress import JobInfo, JobProgress, JobsReporter
+from plushsense.jobs.journal import Result
+from plushsense.jobs.pool import JobsSpec, Report
+from plushsense.jobs.study import Progress, StudyPart, StudyResults, run_study
 from plushsense.scoring.metrics import column_metrics
 from plushsense.scoring.splits import Fold, Split, parse_split
 from plushsense.windows.cut import WindowSet
@@ -83,9 +84,122 @@ class Contender:
         return f"{self.title}, {reads(self.features, self.pca)}"
 
 
+Program = tuple[str, str, Pca]
+"""Name, features, and whether and how PCA reduces them."""
+
+
+@dataclass(frozen=True)
+class ProgramScores:
+    """Scores and costs of one program under one split.
+
+    ``metrics`` holds mean, sd and interval of each of `column_metrics` over people or folds (``over``), and ``pooled``
+    those of all windows. Sizes and times are medians over the folds.
+    """
+
+    name: str
+    title: str
+    features: str
+    pca: Pca
+    span_s: float
+    split: str
+    leaky: bool
+    apart: bool
+    over: str
+    folds: int
+    metrics: Mapping[str, Any]
+    pooled: Mapping[str, Any]
+    by_recording: Mapping[str, Any]
+    size_bytes: int
+    predict_ms: float
+    predict_batch_ms: float
+    train_s: float
+    train_s_in_all: float
+
+    @property
+    def program(self) -> Program:
+        return self.name, self.features, self.pca
+
+
+@dataclass(frozen=True)
+class ProgramGap:
+    """How much higher a program scores under a leaky split than under one by person: the difference of each metric."""
+
+    name: str
+    title: str
+    features: str
+    pca: Pca
+    split: str
+    leaky_split: str
+    metrics: Mapping[str, float]
+
+    @property
+    def program(self) -> Program:
+        return self.name, self.features, self.pca
+
+
+@dataclass(frozen=True)
+class SplitFolds:
+    """A split of the comparison, and its number of folds."""
+
+    split: str
+    leaky: bool
+    folds: int
+
+
+@dataclass(frozen=True)
+class ComparisonResult:
+    """The result of `compare`; ``models`` has one row for each contender and split."""
+
+    context: str
+    splits: tuple[SplitFolds, ...]
+    windows: int
+    recordings: int
+    subjects: int
+    labels: tuple[str, ...]
+    seed: int
+    jobs: int
+    resumed: int
+    models: tuple[ProgramScores, ...]
+    gaps: tuple[ProgramGap, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values; the metrics of a row stand beside its other keys."""
+        rows = {
+            "splits": [dict(vars(split)) for split in self.splits],
+            "labels": list(self.labels),
+            "models": [flat(row) for row in self.models],
+            "gaps": [flat(gap) for gap in self.gaps],
+        }
+        return {**vars(self), **rows}
+
+
+@dataclass(frozen=True)
+class BaselinesResult(ComparisonResult):
+    """The result of `plushsense.experiments.baselines.run.baselines`: that of `compare`, and what it was made of."""
+
+    dataset: str
+    dataset_hash: str
+    simulated: bool
+    preset: str
+    training: Mapping[str, Any]
+    window_s: float
+    id: str
+    machine: str
+    code_version: str
+
+
+def flat(row: ProgramScores | ProgramGap) -> dict[str, Any]:
+    """Return the values of a row by name, with its metrics among them."""
+    values: dict[str, Any] = {}
+    for name, value in vars(row).items():
+        values |= value if name == "metrics" else {name: value}
+    return values
+
+
 @dataclass(frozen=True)
 class _Task:
     contender: Contender
+    split: Split
     fold: Fold
 
 
@@ -94,19 +208,13 @@ def compare(
     contenders: Sequence[Contender],
     splits: Sequence[str],
     *,
-    journal: Journal | None = None,
-    workers: int = 1,
-    cluster: str | None = None,
+    spec: JobsSpec | None = None,
     seed: int = 0,
-    progress: Callable[[JobProgress], None] | None = None,
-) -> dict[str, Any]:
+    progress: Progress | None = None,
+) -> ComparisonResult:
     """Fit and score every contender in every fold of every split, all on the same windows.
 
     Programs are fitted to the training windows of a fold; its validation windows are for early stopping only.
-
-    Returns:
-        ``context``, ``splits``, ``windows``, ``recordings``, ``subjects``, ``labels``, ``seed``, ``jobs``,
-        ``resumed``; ``models``, one row for each contender and split; ``gaps`` (see `gaps`).
 
     Raises:
         ConfigError: for a contender or split that is given twice, an unknown split, or none of either.
@@ -116,63 +224,54 @@ def compare(
     need("threadpoolctl", extra="baselines")
     if not contenders:
         raise ConfigError("No program is left to compare: give one or more, such as  --models forest,knn")
-    parsed = _parsed(splits)
-    folds = {split.text: fold_windows(windows, windows, split, seed) for split in parsed}
-    base = {"version": _VERSION, "windows": windows_fingerprint(windows), "rate_hz": windows.rate_hz}
     names = [(c.name, c.features, c.pca) for c in contenders]
     if len(set(names)) < len(names):
         raise ConfigError("A program is given twice: name each once.")
-    prints = {text: [fold_fingerprint(fold) for fold in made] for text, made in folds.items()}
-    jobs: dict[tuple[int, str], list[Job]] = {}
-    for i, contender in enumerate(contenders):
-        key = {**base, "model": names[i], "key": dict(contender.key)}
-        for text, made in folds.items():
-            jobs[i, text] = [
-                Job(job_id({**key, "fold": mark}), _Task(contender, fold))
-                for fold, mark in zip(made, prints[text], strict=True)
-            ]
-    everything = [job for some in jobs.values() for job in some]
-    infos = {job.id: JobInfo(f"{job.task.contender.words}, {job.task.fold.name}", 1.0) for job in everything}
-    reporter = JobsReporter(infos, progress=progress)
-    results = run_jobs(
-        everything, _work, shared=windows, workers=workers, journal=journal, cluster=cluster, on_done=reporter.on_done
-    )
-    rows = [
-        _row(contenders[i], split, folds[split.text], [results[job.id] for job in jobs[i, split.text]], windows)
-        for i in range(len(contenders))
-        for split in parsed
+    folds = {split: fold_windows(windows, windows, split, seed) for split in _parsed(splits)}
+    marks = {split: [fold_fingerprint(fold) for fold in made] for split, made in folds.items()}
+    parts = [
+        StudyPart(
+            f"{contender.words}, {fold.name}",
+            {"model": name, "key": dict(contender.key), "fold": mark},
+            _Task(contender, split, fold),
+        )
+        for name, contender in zip(names, contenders, strict=True)
+        for split, made in folds.items()
+        for fold, mark in zip(made, marks[split], strict=True)
     ]
-    return {
-        "context": context_of(windows),
-        "splits": [{"split": split.text, "leaky": split.leaky, "folds": len(folds[split.text])} for split in parsed],
-        "windows": len(windows),
-        "recordings": len(np.unique(windows.recording)),
-        "subjects": len(set(windows.subject.tolist()) - {NOBODY}),
-        "labels": list(windows.labels),
-        "seed": seed,
-        "jobs": len(everything),
-        "resumed": len(reporter.state.resumed),
-        "models": rows,
-        "gaps": gaps(rows),
-    }
+
+    def summarise(study: StudyResults) -> ComparisonResult:
+        together = itertools.groupby(study.done, key=lambda done: (done[0].task.contender, done[0].task.split))
+        rows = tuple(_row(windows, list(done)) for _, done in together)
+        return ComparisonResult(
+            context_of(windows),
+            tuple(SplitFolds(split.text, split.leaky, len(made)) for split, made in folds.items()),
+            len(windows),
+            len(np.unique(windows.recording)),
+            len(set(windows.subject.tolist()) - {NOBODY}),
+            tuple(windows.labels),
+            seed,
+            len(parts),
+            study.resumed,
+            rows,
+            gaps(rows),
+        )
+
+    key = {"version": _VERSION, "windows": windows_fingerprint(windows), "rate_hz": windows.rate_hz}
+    return run_study(parts, _work, summarise, key=key, shared=windows, spec=spec, progress=progress)
 
 
-def gaps(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def gaps(rows: Sequence[ProgramScores]) -> tuple[ProgramGap, ...]:
     """Return how much higher each program scores under each leaky split than under each split by person."""
-    found = []
-    for honest in (row for row in rows if row["apart"]):
-        for leaky in (row for row in rows if row["leaky"]):
-            if any(honest[name] != leaky[name] for name in ("name", "features", "pca")):
-                continue
-            found.append(
-                {
-                    **{name: honest[name] for name in ("name", "title", "features", "pca")},
-                    "split": honest["split"],
-                    "leaky_split": leaky["split"],
-                    **{m: leaky[m]["mean"] - honest[m]["mean"] for m in column_metrics()},
-                }
-            )
-    return found
+    return tuple(
+        ProgramGap(
+            *(honest.name, honest.title, honest.features, honest.pca, honest.split, leaky.split),
+            {m: leaky.metrics[m]["mean"] - honest.metrics[m]["mean"] for m in column_metrics()},
+        )
+        for honest in rows
+        for leaky in rows
+        if honest.apart and leaky.leaky and honest.program == leaky.program
+    )
 
 
 def _parsed(splits: Sequence[str]) -> list[Split]:
@@ -230,9 +329,10 @@ def _one_thread() -> Iterator[None]:
         yield
 
 
-def _row(
-    contender: Contender, split: Split, folds: list[Fold], outcomes: list[Result], windows: WindowSet
-) -> dict[str, Any]:
+def _row(windows: WindowSet, done: Sequence[tuple[StudyPart, Result]]) -> ProgramScores:
+    """Return the scores of one program under one split; ``done`` are its folds with their results."""
+    tasks, outcomes = [part.task for part, _ in done], [outcome for _, outcome in done]
+    contender, split, folds = tasks[0].contender, tasks[0].split, [task.fold for task in tasks]
     records = [
         FoldRecord(f.name, f.subjects, (len(f.train), len(f.validation), len(f.test)), 0, float(o["train_s"]))
         for f, o in zip(folds, outcomes, strict=True)
@@ -243,22 +343,23 @@ def _row(
     def middle(name: str) -> float:
         return float(np.median([o[name] for o in outcomes]))
 
-    return {
-        "name": contender.name,
-        "title": contender.title,
-        "features": contender.features,
-        "pca": contender.pca,
-        "span_s": (contender.samples or windows.integers.shape[2]) / windows.rate_hz,
-        "split": split.text,
-        "leaky": split.leaky,
-        "apart": split.separates_people,
-        "over": table["over"],
-        "folds": len(folds),
-        **{name: table[name] for name in (*column_metrics(), "pooled")},
-        "by_recording": table["by_recording"],
-        "size_bytes": round(middle("size_bytes")),
-        "predict_ms": middle("predict_ms"),
-        "predict_batch_ms": middle("predict_batch_ms"),
-        "train_s": middle("train_s"),
-        "train_s_in_all": float(sum(o["train_s"] for o in outcomes)),
-    }
+    return ProgramScores(
+        contender.name,
+        contender.title,
+        contender.features,
+        contender.pca,
+        (contender.samples or windows.integers.shape[2]) / windows.rate_hz,
+        split.text,
+        split.leaky,
+        split.separates_people,
+        table["over"],
+        len(folds),
+        {name: table[name] for name in column_metrics()},
+        table["pooled"],
+        table["by_recording"],
+        round(middle("size_bytes")),
+        middle("predict_ms"),
+        middle("predict_batch_ms"),
+        middle("train_s"),
+        float(sum(o["train_s"] for o in outcomes)),
+    )

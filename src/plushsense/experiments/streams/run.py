@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -54,7 +54,8 @@ from plushsense.experiments.streams.score import (
 )
 from plushsense.experiments.streams.systems import ANYWHERE, SYSTEMS, WINDOWS
 from plushsense.jobs.journal import job_id
-from plushsense.jobs.progress import JobProgress
+from plushsense.jobs.pool import JobsSpec
+from plushsense.jobs.study import Progress
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle, known_people, trained_people
 from plushsense.runtime.decisions import DecideSpec
@@ -430,7 +431,7 @@ def stream_benchmark(
     late_s: float = LATE_S,
     labels: bool = True,
     anywhere_pool_s: float | None = None,
-    progress: Callable[[JobProgress], None] | None = None,
+    progress: Progress | None = None,
     warn: Warn = python_warning,
     **settings: Any,
 ) -> dict[str, Any]:
@@ -467,9 +468,8 @@ def stream_benchmark(
         split,
         fit,
         settings=Settings(names, late_s=late_s),
-        journal=journal_of(dataset, "streams"),
+        spec=JobsSpec(config.evaluation.processes, journal=journal_of(dataset, "streams")),
         key=fit.key(),
-        workers=config.evaluation.processes,
         seed=config.evaluation.seed,
         progress=progress,
     )

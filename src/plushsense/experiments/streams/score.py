@@ -42,9 +42,9 @@ from plushsense.experiments.streams.systems import (
     searched,
     total,
 )
-from plushsense.jobs.journal import Journal, Result, job_id
-from plushsense.jobs.pool import Job, Report, run_jobs
-from plushsense.jobs.progress import JobInfo, JobProgress, JobsReporter
+from plushsense.jobs.journal import Result
+from plushsense.jobs.pool import JobsSpec, Report
+from plushsense.jobs.study import Progress, StudyPart, run_study
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.decisions import DecideSpec, argmax_spec
 from plushsense.runtime.gate import GateSettings
@@ -147,48 +147,36 @@ def crossvalidated_streams(
     fit: FitStreams,
     *,
     settings: Settings | None = None,
-    journal: Journal | None = None,
+    spec: JobsSpec | None = None,
     key: Mapping[str, Any] | None = None,
-    workers: int = 1,
     seed: int = 0,
-    progress: Callable[[JobProgress], None] | None = None,
-) -> list[dict[str, Any]]:
+    progress: Progress | None = None,
+) -> list[Result]:
     """Fit, tune and score each fold; return the counts of each, from which `summed` makes the table.
 
     Args:
         split: "by-subject:5", "leave-one-subject-out".
-        journal: stores finished folds, which are then not computed again.
-        key: required with a journal: everything that ``fit`` depends on besides data, folds and settings.
-        workers: number of folds at a time, each in its own process.
+        key: everything that ``fit`` depends on besides data, folds and settings.
 
     Raises:
         ConfigError, BadInput: for a split that cannot be made; PlushSenseError: what ``fit`` raises.
     """
-    if journal is not None and key is None:
-        raise ConfigError(
-            "A journal needs a key that identifies what is fitted: give crossvalidated_streams(..., key={...})."
-        )
     settings = settings or Settings(tuple(SYSTEMS))
-    folds = people_folds(dataset, split, seed)
-    base = {
-        "streams": _VERSION,
-        "key": dict(key or {}),
-        "data": dataset.hash,
-        "gestures": dataset.gestures.to_dict(),
-        "asked": settings.key(dataset.gestures),
-    }
-    jobs = [Job(job_id({**base, "fold": vars(fold)}), fold) for fold in folds]
-    reporter = JobsReporter({job.id: JobInfo(job.task.name, 1.0) for job in jobs}, progress=progress)
-    results = run_jobs(
-        jobs,
+    return run_study(
+        [StudyPart(fold.name, {"fold": vars(fold)}, fold) for fold in people_folds(dataset, split, seed)],
         _FoldWork(fit, settings),
+        lambda study: study.results,
+        key={
+            "streams": _VERSION,
+            "key": dict(key or {}),
+            "data": dataset.hash,
+            "gestures": dataset.gestures.to_dict(),
+            "asked": settings.key(dataset.gestures),
+        },
         shared=dataset,
-        workers=workers,
-        journal=journal,
-        on_done=reporter.on_done,
-        on_report=reporter.on_report,
+        spec=spec,
+        progress=progress,
     )
-    return [dict(results[job.id]) for job in jobs]
 
 
 @dataclass(frozen=True)
