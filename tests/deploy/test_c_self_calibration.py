@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,13 @@ from hypothesis import strategies as st
 from plushsense.core.layouts import MOST_CALIBRATED_OTHER, Channel
 from plushsense.deploy.code import CALIBRATE, LIBRARY, library_files
 from plushsense.deploy.golden import answers_of
+from plushsense.deploy.package import ARDUINO, IDF
+from plushsense.deploy.proof.vectors import Export
+from plushsense.deploy.proof.verify import verify
 from plushsense.deploy.quantize import integer_model
 from plushsense.runtime.image import IntegerModel, image_head, memory_bytes
 from support.c_toy import Seat, seat
-from support.exports import bundle_of
+from support.exports import bundle_of, exported
 from support.integers import any_frames, models, vector_model
 
 OK, OTHER_VERSION, DAMAGED = 0, 2, 3
@@ -60,6 +64,16 @@ def test_each_library_takes_its_own_models(c_library: Any, calibrated_library: A
     assert plain[LIBRARY[1]] == calibrating[LIBRARY[1]], "one line of the header chooses"
     defined = "#define PLUSH_CALIBRATE\n"
     assert defined in calibrating[LIBRARY[0]] and defined not in plain[LIBRARY[0]]
+
+
+def test_only_an_export_of_such_a_model_has_the_file(c_compiler: str, tmp_path: Path) -> None:
+    plain = bundle_of("accel-3", "3d1_2d2", "3,4", window=40)
+    themselves = replace(plain, layout=replace(plain.layout, self_calibration=plain.layout.names))
+    for bundle, where in ((plain, set()), (themselves, {"", f"{ARDUINO}/src/", f"{IDF}/include/"})):
+        out = exported(tmp_path / str(len(where)), bundle)
+        assert {p.relative_to(out).as_posix() for p in out.rglob(CALIBRATE)} == {f"{w}{CALIBRATE}" for w in where}
+    done = verify(Export(out), ["host"], only=lambda s: s.optimise == "-O2" and s.compiler == "gcc")
+    assert done.passed and done.own and len(done.runs) == 3, "compiled in, from a file, and called from C++"
 
 
 def test_ten_touch_channels_and_an_accelerometer(calibrated_library: Any) -> None:

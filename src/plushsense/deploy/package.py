@@ -182,6 +182,7 @@ def handbook(bundle: Bundle, facts: ModelFacts) -> str:
         samples_of_gap=samples_of_gap,
         answers_of_gap=-(-samples_of_gap // facts.step),
         bundle=BUNDLE,
+        calibrate=bool(layout.self_calibration),
         image=IMAGE,
         facts_file=FACTS,
     )

@@ -224,7 +224,7 @@ def test_a_fault_of_the_rules_that_no_scenario_shows_is_no_defect_of_the_c(
 ) -> None:
     """Two classes, one of them idle in the scenarios: a mutant needs more scenarios, or is reported as not shown."""
     two = GestureSet("two", (Gesture("pat", "positive"), Gesture("rest", "none")))
-    export = Export(exported(tmp_path / "out", bundle_of("accel-3", gestures=two, seed=2)))
+    export = Export(exported(tmp_path / "out", bundle_of("accel-3", gestures=two, seed=5)))
     seldom = "an affect stays at the share at which it begins"
 
     def result() -> VerificationResult:
@@ -406,14 +406,15 @@ def test_an_edited_model_that_agrees_with_its_golden_vectors_is_not_vouched_for(
     (own / "plush_model.bin").write_bytes(whole)
     edit(own / "export.json", '"smoothing": ', '"smoothing": 1')
     assert main(["verify", str(own), "--target", "host"]) == 2
-    assert "plush_model.bin, export.json in " in capsys.readouterr().err
+    assert "plush_model.bin, " in capsys.readouterr().err
     assert main(["verify", str(own), "--target", "host", "--trust"]) == 0
     # The header holds the checksum of the image.
-    named = "plush_model.h, plush_model.c, plush_model.bin, export.json"
-    assert f"NOT OURS: {named} are not what this PlushSense writes" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "NOT OURS: plush_model.h, plush_model.c, plush_model.bin, " in out
+    assert "plush_model.h, export.json are not what this PlushSense writes" in " ".join(out.split())
     edit(own / "export.json", '"smoothing": ', '"smoothing": true, "was": ')
     assert main(["verify", str(own), "--target", "host"]) == 2
-    assert "has the smoothing True" in capsys.readouterr().err
+    assert "smoothing is True" in capsys.readouterr().err
 
 
 def test_c_that_warns_or_writes_past_its_memory(c_compiler: str, own: Path, capsys: pytest.CaptureFixture[str]) -> None:
