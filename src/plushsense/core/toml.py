@@ -259,6 +259,14 @@ def _structure_exact(value: Any, kind: type[T]) -> T:
     return value
 
 
+def _is_tuple(kind: Any) -> bool:
+    return get_origin(kind) is tuple
+
+
+def _is_union(kind: Any) -> bool:
+    return get_origin(kind) in _UNIONS
+
+
 @functools.cache
 def _converter() -> Converter:
     """Return a converter that coerces nothing. cattrs is imported here because importing it is slow."""
@@ -296,7 +304,13 @@ def _converter() -> Converter:
 
     def tables_of(kind: Any) -> Any:
         structure = make_dict_structure_fn(kind, converter, _cattrs_forbid_extra_keys=True)
-        return lambda value, _: structure(_structure_exact(value, Mapping), kind)
+
+        def structure_table(value: Any, _: Any) -> Any:
+            if not isinstance(value, Mapping):
+                raise TypeError(kind)
+            return structure(value, kind)
+
+        return structure_table
 
     for kind, hook in {
         int: _structure_number,
@@ -305,7 +319,7 @@ def _converter() -> Converter:
         bool: _structure_exact,
     }.items():
         converter.register_structure_hook(kind, hook)
-    converter.register_structure_hook_factory(lambda kind: get_origin(kind) is tuple, tuples_of)
-    converter.register_structure_hook_factory(lambda kind: get_origin(kind) in _UNIONS, one_of)
+    converter.register_structure_hook_factory(_is_tuple, tuples_of)
+    converter.register_structure_hook_factory(_is_union, one_of)
     converter.register_structure_hook_factory(is_dataclass, tables_of)
     return converter

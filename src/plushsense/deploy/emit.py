@@ -32,17 +32,29 @@ from plushsense.runtime.image import IntegerModel
 
 @dataclass(frozen=True)
 class ExportResult:
-    """Result of an export; the files in ``facts`` are relative to ``folder``."""
+    """Result of an export; ``files`` are relative to ``folder``, the sizes as in `ModelFacts`."""
 
     folder: Path
     facts: ModelFacts
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        return self.facts.files
+
+    @property
+    def flash_bytes(self) -> int:
+        return self.facts.flash_bytes
+
+    @property
+    def ram_bytes(self) -> int:
+        return self.facts.ram_bytes
 
     def to_json(self) -> dict[str, Any]:
         """Return the object that ``plushsense export --json`` prints."""
         facts = self.facts.to_json()
         del facts["files"]
-        sizes = {"flash_bytes": self.facts.flash_bytes, "ram_bytes": self.facts.ram_bytes}
-        return {**facts, "folder": str(self.folder), "files": list(self.facts.files), **sizes}
+        sizes = {"flash_bytes": self.flash_bytes, "ram_bytes": self.ram_bytes}
+        return {**facts, "folder": str(self.folder), "files": list(self.files), **sizes}
 
 
 def emit(

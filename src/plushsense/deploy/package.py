@@ -100,14 +100,11 @@ def export_files(bundle: Bundle, facts: ModelFacts, code: Mapping[str, bytes]) -
         texts |= {f"{ARDUINO}/src/{file}": rendered[file], f"{IDF}/{_component_path(file)}": rendered[file]}
     for file in _EXAMPLE:
         texts |= {f"{SKETCH}/{file}": rendered[file], f"{IDF_EXAMPLE}/main/{file}": rendered[file]}
-    contents = {_named_path(file, name): prefixed(text, name).encode() for file, text in texts.items()}
-    for file, text in code.items():
-        if file == IMAGE:
-            contents[file] = text
-            continue
-        for path in (file, f"{ARDUINO}/src/{file}", f"{IDF}/{_component_path(file)}"):
-            contents[_named_path(path, name)] = prefixed(text.decode(), name).encode()
-    return contents
+    own = {file: content.decode() for file, content in code.items() if file != IMAGE}
+    texts |= {f"{ARDUINO}/src/{file}": text for file, text in own.items()}
+    texts |= {f"{IDF}/{_component_path(file)}": text for file, text in own.items()}
+    contents = {file: prefixed(text, name).encode() for file, text in (own | {IMAGE: ""} | texts).items()}
+    return {_named_path(file, name): content for file, content in (contents | {IMAGE: code[IMAGE]}).items()}
 
 
 def _component_path(name: str) -> str:
