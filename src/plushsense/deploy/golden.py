@@ -6,7 +6,7 @@ No recordings are used, because exports are given to others and must not contain
 from __future__ import annotations
 
 import struct
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from plushsense.runtime.events import AFFECT_CODES
 from plushsense.runtime.fixed import InputScale, Ints
 from plushsense.runtime.health import HealthSettings
 from plushsense.runtime.image import IntegerModel, memory_bytes
-from plushsense.runtime.integer import IntegerDense, IntegerStepper
+from plushsense.runtime.integer import IntegerDense
 from plushsense.runtime.machine import Moment, ToyMachine
 from plushsense.windows.clock import resample
 from plushsense.windows.features import Scaler
@@ -330,42 +330,7 @@ def answers_of(model: IntegerModel, frames: Ints, silences: Container[int] = ())
     Args:
         silences: indices of the frames after which a silence is reported (``plush_silence``).
     """
-    toy = _toy(model)
-    table = _RowTable(toy, model)
-    table.read(frames, silences)
-    return table.array()
-
-
-def answers_by_block(model: IntegerModel, blocks: Iterable[Ints]) -> Iterator[NDArray[np.int32]]:
-    """Yield the rows of `answers_of` for each block of frames of one long stream; earlier ones are not kept."""
-    toy, frame = _toy(model), 0
-    for frames in blocks:
-        table = _RowTable(toy, model, frame)
-        table.read(frames)
-        frame = table.frame
-        yield table.array()
-
-
-def answers_over_swaps(parts: Sequence[tuple[IntegerModel, Ints]]) -> list[NDArray[np.int32]]:
-    """Compute the toy's rows when models with the same channels are swapped during a stream (``plush_swap``).
-
-    Args:
-        parts: each model with the frames (n, 1 + C) that it reads.
-
-    Returns:
-        The rows of each part, as from `answers_of`. A swap ends an open event: its row is the last one of the part and
-        has the index of the next frame. Frame indices and counts continue, and the toy is warming again.
-    """
-    toy, frame, tables = _toy(parts[0][0]), 0, []
-    for n, (model, frames) in enumerate(parts, 1):
-        table = _RowTable(toy, model, frame)
-        table.read(frames)
-        if n < len(parts):
-            following = _toy(parts[n][0])
-            table.add(following.continue_from(toy))
-            toy, frame = following, table.frame
-        tables.append(table.array())
-    return tables
+    return ToyRows(model).read(frames, silences)
 
 
 def answers_over_patches(
@@ -381,33 +346,32 @@ def answers_over_patches(
     Returns:
         The rows of each part, as from `answers_of`. The state is kept, so that the next step uses the new layer.
     """
-    network = model.network.stepper()
-    toy, frame, tables = _toy(model, network), 0, list[NDArray[np.int32]]()
-    for (dense, frames), status in zip(parts, [*statuses, *[None] * (len(parts) - len(statuses))], strict=True):
-        network.patch(dense)
-        table = _RowTable(toy, model, frame)
-        table.read(frames)
-        if status is not None:
-            table.add_patch(int(frames[-1, 0]), status)
-        frame = table.frame
-        tables.append(table.array())
+    rows, tables = ToyRows(model), list[NDArray[np.int32]]()
+    for n, (dense, frames) in enumerate(parts):
+        rows.network.patch(dense)
+        rows.feed(frames)
+        if n < len(statuses):
+            rows.add_patch(int(frames[-1, 0]), statuses[n])
+        tables.append(rows.take())
     return tables
 
 
-def _toy(model: IntegerModel, network: IntegerStepper | None = None) -> ToyMachine:
-    stepper = network or model.network.stepper()
-    return ToyMachine(stepper, model.layout, model.gestures, model.rules, model.smoothing)
+class ToyRows:
+    """The rows of `answers_of` for one stream, piece by piece; ``frame`` is the index of the current frame."""
 
+    def __init__(self, model: IntegerModel, frame: int = 0) -> None:
+        self.network = model.network.stepper()
+        self.toy = ToyMachine(self.network, model.layout, model.gestures, model.rules, model.smoothing)
+        self.frame = frame
+        self._affects = [AFFECT_CODES[a] for a in model.gestures.affects]
+        self._rows: list[list[int]] = []
 
-class _RowTable:
-    """Collects rows of the output of a toy; ``frame`` is the index of the current frame."""
+    def read(self, frames: Ints, silences: Container[int] = ()) -> NDArray[np.int32]:
+        """Return the rows for further frames."""
+        self.feed(frames, silences)
+        return self.take()
 
-    def __init__(self, toy: ToyMachine, model: IntegerModel, frame: int = 0) -> None:
-        self.toy, self.frame = toy, frame
-        self.affects = [AFFECT_CODES[a] for a in model.gestures.affects]
-        self.rows: list[list[int]] = []
-
-    def read(self, frames: Ints, silences: Container[int] = ()) -> None:
+    def feed(self, frames: Ints, silences: Container[int] = ()) -> None:
         """Feed frames to the toy and add the resulting rows."""
         health = self.toy.frames.health
         for ms, *values in frames.tolist():
@@ -415,14 +379,16 @@ class _RowTable:
             for moment in self.toy.push(ms, values):
                 self.add(moment)
             if (health.fault, health.suspect) != before:
-                self.add_health(ms)
+                state = FAULT if health.fault else WARMING if self.toy.samples.warming else TRACKING
+                self._add(HEALTH, ms, health.faults, state, int(health.suspect))
             if self.frame in silences:
                 self.add(self.toy.silence())
             self.frame += 1
 
-    def array(self) -> NDArray[np.int32]:
-        """Return the rows as 32-bit integers."""
-        rows = np.array(self.rows, dtype=np.int64).reshape(len(self.rows), HEAD + 2 * len(self.affects))
+    def take(self) -> NDArray[np.int32]:
+        """Return the rows since the last call as 32-bit integers."""
+        made, self._rows = self._rows, []
+        rows = np.array(made, dtype=np.int64).reshape(len(made), HEAD + 2 * len(self._affects))
         return (rows & 0xFFFFFFFF).astype(np.uint32).view(np.int32)
 
     def add(self, moment: Moment) -> None:
@@ -435,15 +401,9 @@ class _RowTable:
         if answer is None or moment.logits is None or moment.smoothed is None:
             self._add(ANSWER, ms, count, WARMING)
             return
-        values = answer.best, self.affects[answer.best], answer.share, answer.kind, answer.known
+        values = answer.best, self._affects[answer.best], answer.share, answer.kind, answer.known
         numbers = [*moment.logits.tolist(), *moment.smoothed.tolist()]
         self._add(ANSWER, ms, count, TRACKING, *values, numbers=numbers)
-
-    def add_health(self, ms: int) -> None:
-        """Add the current state of the health check."""
-        health = self.toy.frames.health
-        state = FAULT if health.fault else WARMING if self.toy.samples.warming else TRACKING
-        self._add(HEALTH, ms, health.faults, state, int(health.suspect))
 
     def add_patch(self, ms: int, status: int) -> None:
         """Add what ``plush_patch`` returned after the last frame, of time ``ms``."""
@@ -457,7 +417,7 @@ class _RowTable:
     def _add(self, kind: int, ms: int, *values: int, numbers: Sequence[int] = ()) -> None:
         counts = self.toy.frames.clock.restarts, self.toy.frames.clock.invalid
         row = [kind, self.frame, ms, *values, *[0] * (HEAD - 5 - len(values)), *counts, *numbers]
-        self.rows.append(row + [0] * (HEAD + 2 * len(self.affects) - len(row)))
+        self._rows.append(row + [0] * (HEAD + 2 * len(self._affects) - len(row)))
 
 
 def write_golden(model: IntegerModel, scaler: Scaler, folder: Path) -> list[Path]:
