@@ -152,7 +152,7 @@ def phone_streams(place: Workplace, seed: int | None) -> Figures:
 
 def training(*options: object) -> Callable[[Workplace, int | None], Figures]:
     def measure(place: Workplace, seed: int | None) -> Figures:
-        found = place.bench("sweep.py", "steps", *options)
+        found = place.bench("training.py", *options)
         ratios = [row["plain_s"] / row["ours_s"] for row in found["rows"]]
         return {
             "step": {"value": found["step_ratio"], "range": [min(ratios), max(ratios)]},

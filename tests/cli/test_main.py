@@ -207,7 +207,6 @@ BAD = [
     (["merge", "{ds}", "{ds}", "--out", "{tmp}/set.toml"], "give --merges or --groups"),
     (["train", "{ds}", "--seed", "4294967296"], "accepted are whole numbers from 0 to 4294967295"),
     (["sweep", "{ds}", "--seeds", "1001", "--dry-run"], "accepted are 1 to 1000"),
-    (["abstain", "{ds}", "--coverage", "nan"], "accepted is between 0 and 1"),
     (["trian"], "Did you mean 'train'?"),
     (["import", "{recordings}", "{tmp}/x", "--layout", "plush-15"], "has 5 columns, but a file of layout 'plush-15'"),
     (["import", "{recordings}", "{tmp}/x", "--layout", "accel3"], "Did you mean 'accel-3'?"),
@@ -264,7 +263,7 @@ def test_bad_input_is_one_sentence_and_status_2(
         ),
         (
             ["merge", "DS", "DS", "--merges", "1", "--out", "FILE"],
-            "experiments.people.merging.load_evaluation",
+            "experiments.analysis.merging.load_evaluation",
             "is not a gesture set",
         ),
         (["toy", "--tcp", "0", "--truth", "FILE"], "devices.virtual.server.ToyServer", "is not a file of truth"),
@@ -330,7 +329,7 @@ def test_evaluations_of_other_settings_stand_side_by_side(cli: Cli, dataset: Dat
 
 def test_a_name_depends_on_every_setting_and_on_the_data(dataset: Dataset) -> None:
     from plushsense.workflow.config import resolve
-    from plushsense.workflow.reporting import name_of
+    from plushsense.workflow.preparation import prepare
 
     given: list[dict[str, dict[str, Any]]] = [
         {},
@@ -351,14 +350,14 @@ def test_a_name_depends_on_every_setting_and_on_the_data(dataset: Dataset) -> No
         {"model": {"pool_s": 0.5}},
         {"model": {"step_s": 0.1}},
     ]
-    names = [name_of(resolve(None, **tables), dataset) for tables in given]
+    names = [prepare(dataset, resolve(None, **tables)).name for tables in given]
     assert len(set(names)) == len(names)
     same = resolve(None, evaluation={"workers": 2, "train_context": "stream"}, training={"threads": 2})
-    assert name_of(same, dataset) == names[0]
+    assert prepare(dataset, same).name == names[0]
     unused = resolve(None, anywhere={"idle_share": 0.4})
-    assert name_of(unused, dataset) == names[0], "nothing is trained anywhere"
+    assert prepare(dataset, unused).name == names[0], "nothing is trained anywhere"
     fewer = Dataset(dataset.path, dataset.head, dataset.recordings[:-1], dataset.streams)
-    assert name_of(resolve(None), fewer) != names[0]
+    assert prepare(fewer, resolve(None)).name != names[0]
 
 
 def test_train_for_work_in_a_stream(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from plushsense.core.errors import ConfigError, TrainingError
 from plushsense.evaluation.crossval import evaluate
 from plushsense.jobs.journal import Journal
 from plushsense.jobs.progress import JobProgress
+from plushsense.scoring.splits import parse_split
 
 HERE = Path(__file__).parents[1]
 
@@ -35,7 +36,7 @@ def trainings(folder: Path) -> dict[str, int]:
 
 def test_every_figure_of_a_subject_wise_evaluation(tmp_path: Path) -> None:
     windows, loops = study(), study(context="loop")
-    found = evaluate(loops, windows, "leave-one-subject-out", Oracle(str(tmp_path), ("P01",)), seed=3)
+    found = evaluate(loops, windows, parse_split("leave-one-subject-out"), Oracle(str(tmp_path), ("P01",)), seed=3)
     table = found.to_dict()
     assert table.keys() == KEYS
     json.dumps(table, allow_nan=False)
@@ -73,16 +74,16 @@ def test_every_figure_of_a_subject_wise_evaluation(tmp_path: Path) -> None:
 
 def test_a_leak_shows_and_is_marked() -> None:
     windows = study(repetitions=4, windows=4)
-    by_window = evaluate(windows, windows, "windows:4", Memory()).to_dict()
+    by_window = evaluate(windows, windows, parse_split("windows:4"), Memory()).to_dict()
     assert by_window["leaky"] is True and by_window["accuracy"]["mean"] > 0.9
     assert by_window["over"] == "folds" and len(by_window["folds"]) == 4
     for text in ("by-recording:4", "by-subject:3"):
-        assert evaluate(windows, windows, text, Memory()).to_dict()["accuracy"]["mean"] == 0.0
+        assert evaluate(windows, windows, parse_split(text), Memory()).to_dict()["accuracy"]["mean"] == 0.0
 
 
 def test_a_holdout_scores_what_it_tested_only() -> None:
     windows = study(repetitions=5, windows=4)
-    found = evaluate(windows, windows, "windows:holdout", Memory())
+    found = evaluate(windows, windows, parse_split("windows:holdout"), Memory())
     table = found.to_dict()
     assert len(found.predictions) == table["folds"][0]["test_windows"] == round(0.15 * len(windows))
     assert table["accuracy"]["sd"] is None and table["accuracy"]["ci95"] is None
@@ -93,7 +94,9 @@ def test_a_holdout_scores_what_it_tested_only() -> None:
 def test_progress_and_the_same_result_from_several_processes(tmp_path: Path, workers: int) -> None:
     said: list[JobProgress] = []
     windows = study()
-    found = evaluate(windows, windows, "by-subject:3", Oracle(str(tmp_path)), workers=workers, progress=said.append)
+    found = evaluate(
+        windows, windows, parse_split("by-subject:3"), Oracle(str(tmp_path)), workers=workers, progress=said.append
+    )
     assert [s.done for s in said if s.epoch == 0] == [1, 2, 3]
     assert sorted((s.name, s.epoch) for s in said if s.epoch) == [
         (f"fold {f}", e) for f in (1, 2, 3) for e in (1, 2, 3)
@@ -106,25 +109,25 @@ def test_progress_and_the_same_result_from_several_processes(tmp_path: Path, wor
 def test_finished_folds_are_not_trained_again_and_changed_ones_are(tmp_path: Path) -> None:
     windows, journal, oracle = study(), Journal(tmp_path / "journal"), Oracle(str(tmp_path))
     ask: dict[str, Any] = {"journal": journal, "key": {"arch": "a", "seed": 1}}
-    first = evaluate(windows, windows, "by-subject:3", oracle, **ask)
+    first = evaluate(windows, windows, parse_split("by-subject:3"), oracle, **ask)
     said: list[JobProgress] = []
-    again = evaluate(windows, windows, "by-subject:3", oracle, progress=said.append, **ask)
+    again = evaluate(windows, windows, parse_split("by-subject:3"), oracle, progress=said.append, **ask)
     assert sum(trainings(tmp_path).values()) == 3 and said[-1].resumed == 3
     assert again.to_dict() == first.to_dict()
     next(journal.folder.iterdir()).write_bytes(b"damaged")
-    evaluate(windows, windows, "by-subject:3", oracle, **ask)
+    evaluate(windows, windows, parse_split("by-subject:3"), oracle, **ask)
     assert sum(trainings(tmp_path).values()) == 4
     changed = replace(windows, integers=windows.integers + 1)
     for other, key, seed in ((windows, {"arch": "b"}, 0), (changed, ask["key"], 0), (windows, ask["key"], 5)):
         before = sum(trainings(tmp_path).values())
-        evaluate(other, other, "by-subject:3", oracle, journal=journal, key=key, seed=seed)
+        evaluate(other, other, parse_split("by-subject:3"), oracle, journal=journal, key=key, seed=seed)
         assert sum(trainings(tmp_path).values()) > before
 
 
 def test_the_figures_come_from_the_kept_predictions(tmp_path: Path) -> None:
     polars = pytest.importorskip("polars", reason="polars is not installed (extra train)")
     windows = study()
-    found = evaluate(windows, windows, "by-subject:3", Oracle(str(tmp_path), ("P02",)))
+    found = evaluate(windows, windows, parse_split("by-subject:3"), Oracle(str(tmp_path), ("P02",)))
     path = found.write_predictions(tmp_path / "deep" / "predictions.parquet")
     assert found.to_dict()["predictions"] == str(path)
     table = polars.read_parquet(path)
@@ -141,11 +144,11 @@ def test_the_figures_come_from_the_kept_predictions(tmp_path: Path) -> None:
 def test_what_goes_wrong_is_said() -> None:
     windows = study()
     with pytest.raises(TrainingError, match="no longer a number"):
-        evaluate(windows, windows, "by-subject:3", refuses)
+        evaluate(windows, windows, parse_split("by-subject:3"), refuses)
     with pytest.raises(ConfigError, match=r"shape \(1, 3\).*\(20, 3\)"):
-        evaluate(windows, windows, "by-subject:3", misshapen)
+        evaluate(windows, windows, parse_split("by-subject:3"), misshapen)
     with pytest.raises(ConfigError, match="journal needs a key"):
-        evaluate(windows, windows, "by-subject:3", refuses, journal=Journal("nowhere"))
+        evaluate(windows, windows, parse_split("by-subject:3"), refuses, journal=Journal("nowhere"))
 
 
 SCRIPT = """
@@ -153,11 +156,12 @@ import sys
 sys.path.insert(0, {here!r})
 from support.fakes import Oracle, study
 from plushsense.evaluation.crossval import evaluate
+from plushsense.scoring.splits import parse_split
 from plushsense.jobs.journal import Journal
 
 if __name__ == "__main__":
     windows = study()
-    evaluate(windows, windows, "leave-one-subject-out", Oracle({folder!r}, pause=0.05), workers={workers},
+    evaluate(windows, windows, parse_split("leave-one-subject-out"), Oracle({folder!r}, pause=0.05), workers={workers},
              journal=Journal({folder!r} + "/journal"), key={{"arch": "a"}})
 """
 

@@ -11,11 +11,14 @@ import pytest
 from plushsense.core.errors import ConfigError
 from plushsense.evaluation.crossval import FoldOutput, evaluate
 from plushsense.jobs.journal import Journal
+from plushsense.scoring.splits import parse_split
 from support.fakes import Deploying, Oracle, study
 
 
 def test_what_deploying_costs_each_person(tmp_path: Path) -> None:
-    found = evaluate(study(), study(), "leave-one-subject-out", Deploying(str(tmp_path), ("P01",))).to_dict()
+    found = evaluate(
+        study(), study(), parse_split("leave-one-subject-out"), Deploying(str(tmp_path), ("P01",))
+    ).to_dict()
     assert found["accuracy"]["mean"] == 1.0, "the float figures stay what they are"
     int8 = found["int8"]
     json.dumps(int8, allow_nan=False)
@@ -36,7 +39,9 @@ def test_what_deploying_costs_each_person(tmp_path: Path) -> None:
 
 
 def test_folds_where_people_are_not_kept_apart(tmp_path: Path) -> None:
-    found = evaluate(study(), study(), "by-recording:3", Deploying(str(tmp_path), ("P01",))).to_dict()["int8"]
+    found = evaluate(study(), study(), parse_split("by-recording:3"), Deploying(str(tmp_path), ("P01",))).to_dict()[
+        "int8"
+    ]
     assert found["over"] == "folds" and len(found["rows"]) == 3
     assert sum(r["windows"] for r in found["rows"]) == 60
     assert found["agreement"] == pytest.approx(52 / 60)
@@ -45,12 +50,13 @@ def test_folds_where_people_are_not_kept_apart(tmp_path: Path) -> None:
 def test_it_comes_back_from_the_journal_and_is_not_made_up_without(tmp_path: Path) -> None:
     journal, work = Journal(tmp_path / "folds"), Deploying(str(tmp_path), ("P02",))
     first, second = (
-        evaluate(study(), study(), "by-subject:3", work, journal=journal, key={"int8": 1}).to_dict() for _ in range(2)
+        evaluate(study(), study(), parse_split("by-subject:3"), work, journal=journal, key={"int8": 1}).to_dict()
+        for _ in range(2)
     )
     assert first == second and "int8" in first
     trained = sum(len(path.read_text()) for path in tmp_path.glob("trained-*"))
     assert trained == 2 * 3, "a second run trains nothing"
-    assert "int8" not in evaluate(study(), study(), "by-subject:3", Oracle(str(tmp_path))).to_dict()
+    assert "int8" not in evaluate(study(), study(), parse_split("by-subject:3"), Oracle(str(tmp_path))).to_dict()
 
 
 def too_few(train, validation, test, progress, /):
@@ -60,4 +66,4 @@ def too_few(train, validation, test, progress, /):
 
 def test_deployed_probabilities_of_another_shape_are_refused() -> None:
     with pytest.raises(ConfigError, match="deployed of the shape"):
-        evaluate(study(), study(), "by-subject:3", too_few)
+        evaluate(study(), study(), parse_split("by-subject:3"), too_few)

@@ -53,10 +53,10 @@ def test_pairs_and_cliques() -> None:
     base = rng.uniform(0.3, 0.9, 20)
     scores = np.stack([base + 0.1, base + 0.1 + rng.normal(0, 0.02, 20), base], axis=1)
     pairs = compare_pairs(("A", "B", "C"), scores)
-    assert [(row["first"], row["second"]) for row in pairs] == [("A", "B"), ("A", "C"), ("B", "C")]
-    assert pairs[1]["difference"]["mean"] == pytest.approx(0.1) and pairs[1]["better"] == 20
-    assert pairs[1]["effect"] == 1.0 and pairs[1]["p_holm"] < 0.001
-    assert pairs[0]["p_holm"] > 0.05
+    assert [(row.first, row.second) for row in pairs] == [("A", "B"), ("A", "C"), ("B", "C")]
+    assert pairs[1].difference["mean"] == pytest.approx(0.1) and pairs[1].better == 20
+    assert pairs[1].effect == 1.0 and pairs[1].p_holm < 0.001
+    assert pairs[0].p_holm > 0.05
     assert cliques(("A", "B", "C"), pairs) == [("A", "B")]
     with pytest.raises(BadInput, match="at least 2 models on 2 people"):
         compare_pairs(("A",), scores[:, :1])
@@ -64,4 +64,4 @@ def test_pairs_and_cliques() -> None:
 
 def test_people_without_a_difference_are_neither_better_nor_worse() -> None:
     (row,) = compare_pairs(["a", "b"], np.array([[0.5, 0.5], [0.7, 0.6], [0.8, 0.6], [0.1, 0.4]]))
-    assert (row["better"], row["worse"]) == (2, 1)
+    assert (row.better, row.worse) == (2, 1)

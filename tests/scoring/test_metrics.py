@@ -89,6 +89,14 @@ def test_accuracy_over_people_counts_each_person_alike_and_nobody_not() -> None:
     assert metrics.accuracy_over_people(truth, read, np.full(6, "none")) is None
 
 
+def test_calibration_error_by_hand() -> None:
+    p = np.array([[0.95, 0.05], [0.95, 0.05], [0.65, 0.35], [0.35, 0.65], [1.0, 0.0]])
+    # Of the highest bin, two predictions at 0.95 and one at 1.0, two are right; of two at 0.65, both.
+    error = metrics.calibration_error(p, np.array([0, 1, 0, 1, 0]))
+    assert error == pytest.approx((abs(2.9 - 2) + 2 * 0.35) / 5)
+    assert np.isnan(metrics.calibration_error(p[:0], np.zeros(0, np.int64)))
+
+
 def test_a_class_index_below_0_is_refused_and_the_highest_accepted() -> None:
     top, low = np.array([2]), np.array([-1])
     assert metrics.confusion(top, top, 3)[2, 2] == 1

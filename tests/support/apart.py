@@ -54,11 +54,11 @@ GROUPS = tuple(
         # Trainings in the process of the tests, 100 MB each time one is under way and afterwards.
         "cli/test_adapt.py cli/test_extending.py cli/test_live.py cli/test_main.py cli/test_paper_page.py"
         " cli/test_protocol.py cli/test_stream_eval.py cli/test_trim.py"
-        " experiments/people/test_explanation.py experiments/people/test_merging.py"
-        " experiments/people/test_people.py experiments/search/test_run.py"
-        " experiments/streams/test_training.py experiments/test_abstention_run.py faults/test_interrupted.py"
+        " experiments/analysis/test_comparison.py experiments/analysis/test_merging.py experiments/search/test_run.py"
+        " experiments/streams/test_training.py faults/test_interrupted.py"
         " models/test_net.py training/fast/test_net.py training/test_fit.py trials/test_budget.py"
-        " trials/test_estimate.py workflow/test_api.py workflow/test_calibration.py workflow/test_forget_beside.py"
+        " trials/test_estimate.py workflow/test_api.py workflow/test_calibration.py workflow/test_fitting_decisions.py"
+        " workflow/test_forget_beside.py"
         " workflow/test_reporting.py workflow/test_resuming.py",
     )
 )

@@ -11,7 +11,7 @@ from plushsense.experiments.sweep.run import preview
 from plushsense.trials.estimate import preview_evaluation, preview_training
 from plushsense.trials.plan import PASSES
 from plushsense.workflow.config import from_settings
-from plushsense.workflow.preparation import network_inputs_of
+from plushsense.workflow.preparation import prepare
 
 CONFIG = from_settings(filters=(4, 4, 4), context="loop", epochs=2)
 
@@ -37,8 +37,7 @@ def test_an_evaluation_is_told_as_it_then_is(dataset: Dataset) -> None:
     done = ps.evaluate(dataset, config)
     sizes = [fold["train_windows"] for fold in done.table["folds"]]
     assert (told["split"], told["leaky"], told["folds"]) == ("windows:3", True, len(sizes))
-    read, resolved = network_inputs_of(dataset, config)
-    arch = resolved.model.build(read.layout, told["classes"], 2.5, config.padding)
+    arch = prepare(dataset, config).network
     assert told["macs"] == PASSES * arch.macs_per_window * sum(sizes) * 2
 
 

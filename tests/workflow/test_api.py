@@ -231,12 +231,12 @@ def long_recordings(folder: Path, people: int, recordings: int) -> Dataset:
 )
 def test_nothing_that_is_scored_was_trained_on(people: int, kind: str, tmp_path: Path) -> None:
     from plushsense.workflow.config import resolve
-    from plushsense.workflow.preparation import split_validation
+    from plushsense.workflow.preparation import prepare, split_validation
 
     dataset = long_recordings(tmp_path, people, 4)
     windows = ps.cut_windows(dataset)
     assert len(windows) == 6 * len(dataset.recordings), "several windows a recording"
-    division = split_validation(windows, resolve(None))
+    division = split_validation(windows, prepare(dataset, resolve(None)))
     trained, scored = (set(windows.recording[i].tolist()) for i in (division.train, division.fold.test))
     assert trained
     assert scored

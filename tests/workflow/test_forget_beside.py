@@ -18,7 +18,6 @@ from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.privacy.forget import forget
 from plushsense.dataset.store import Dataset
-from plushsense.experiments.abstention import abstaining
 from plushsense.experiments.adaptation import evaluate_adapting
 from plushsense.experiments.baselines.run import ComparisonSpec, baselines
 from plushsense.experiments.search.run import search
@@ -80,10 +79,6 @@ def run_streams(ds: Dataset, out: Path, hook: Hook) -> None:
     stream_benchmark(ds, split="by-subject:2", systems=("argmax", "hysteresis"), out=out, progress=hook, **SMALL)
 
 
-def run_abstaining(ds: Dataset, out: Path, hook: Hook) -> None:
-    abstaining(ds, split="by-subject:2", out=out, progress=hook, **SMALL)
-
-
 def run_adapting(ds: Dataset, out: Path, hook: Hook) -> None:
     evaluate_adapting(ds, split="by-subject:2", progress=hook, **SMALL)
 
@@ -94,7 +89,7 @@ def run_train(ds: Dataset, out: Path, hook: Hook) -> None:
 
 
 RUNS = (
-    run_evaluate, run_evaluate_in_processes, run_baselines, run_sweep, run_search, run_streams, run_abstaining,
+    run_evaluate, run_evaluate_in_processes, run_baselines, run_sweep, run_search, run_streams,
 )  # fmt: skip
 
 

@@ -10,7 +10,6 @@ from plushsense.cli.output import emit, figure, say, spread, table, warn
 from plushsense.cli.settings import SIMULATION, listed, marks, report_jobs, settings
 from plushsense.core.errors import ConfigError
 from plushsense.core.sentences import plural
-from plushsense.workflow.reporting import name_of
 
 if TYPE_CHECKING:
     from plushsense.experiments.baselines.score import BaselinesResult
@@ -18,23 +17,24 @@ if TYPE_CHECKING:
 
 def run(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
-    from plushsense.workflow.api import evaluate
+    from plushsense.workflow.api import evaluate_run
+    from plushsense.workflow.preparation import prepare
     from plushsense.workflow.reporting import PAGE, write_report
 
     config = settings(args, split=args.split, train_context=args.train_context, workers=args.workers)
-    dataset = open_dataset(args.dataset)
     if args.save_windows:
         from plushsense.core.sentences import join_names
         from plushsense.workflow.export import save_windows
 
-        saved = save_windows(dataset, args.save_windows, config, overwrite=args.force, warn=warn)
+        saved = save_windows(args.dataset, args.save_windows, config, overwrite=args.force, warn=warn)
         sizes = join_names(f"{n} {name}" for name, n in saved.windows.items())
         emit(args, saved.to_dict(), [f"{saved.path}: windows: {sizes}; {saved.bytes:,} bytes"])
         return 0
-    out = Path(args.out) if args.out else dataset.path / "evaluations" / name_of(config, dataset)
-    result = evaluate(
-        dataset,
-        config,
+    dataset = open_dataset(args.dataset)
+    made = prepare(dataset, config, warn)
+    out = Path(args.out) if args.out else dataset.path / "evaluations" / made.name
+    result = evaluate_run(
+        made,
         out=out,
         overwrite=args.force,
         cluster=args.cluster,
@@ -146,11 +146,12 @@ def _sweep_report(args: argparse.Namespace) -> int:
 def run_baselines(args: argparse.Namespace) -> int:
     from plushsense.dataset.index import open_dataset
     from plushsense.experiments.baselines.run import PAGE, ComparisonSpec, baselines, comparison_id
+    from plushsense.workflow.preparation import prepare
 
     config = settings(args, workers=args.workers)
     dataset = open_dataset(args.dataset)
     spec = ComparisonSpec(listed(args.split), listed(args.models), listed(args.features), args.pca)
-    name = f"baselines_{comparison_id(dataset, config, spec)[:8]}"
+    name = f"baselines_{comparison_id(prepare(dataset, config), spec)[:8]}"
     out = Path(args.out) if args.out else dataset.path / "evaluations" / name
     result = baselines(
         dataset,

@@ -22,7 +22,7 @@ HOST_MS = "host_ms"
 MAGNITUDE_FRACTION_BITS = 4
 GRAVITY_FRACTION_BITS = 4
 GRAVITY_STATE_BITS = 10  # fraction bits of the running mean itself
-GRAVITY_S = 0.64  # time constant of the running mean; chosen on 14 people (bench/people.py)
+GRAVITY_S = 0.64  # time constant of the running mean; chosen on 14 people (docs/measurements/people.md)
 CALIBRATION_BLOCK_S = 0.32
 MOST_CALIBRATED_SENSORS = 64
 # Size of a reading in steps, so that the sums of a self-calibration fit 64 bits: of accelerometers, of other channels.

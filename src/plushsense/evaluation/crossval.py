@@ -31,7 +31,7 @@ from plushsense.jobs.pool import JobsSpec, Report
 from plushsense.jobs.progress import JobProgress
 from plushsense.jobs.study import StudyPart, run_study
 from plushsense.scoring import metrics
-from plushsense.scoring.splits import Fold, Index, Split, make_folds, parse_split, purge
+from plushsense.scoring.splits import Fold, Index, Split, make_folds, purge
 from plushsense.windows.cut import WindowSet
 
 # Part of every job's id: raise it when the meaning of a stored fold changes.
@@ -204,7 +204,7 @@ class Evaluation:
 def evaluate(
     train_windows: WindowSet,
     score_windows: WindowSet,
-    split: str,
+    split: Split,
     fit_predict: FitPredict,
     *,
     journal: Journal | None = None,
@@ -220,8 +220,7 @@ def evaluate(
 
     Args:
         train_windows, score_windows: the same recordings, possibly cut with another context; one set for both is fine.
-        split: "leave-one-subject-out", "by-subject:5", "by-recording:5", "windows:5",
-            "recordings:holdout", "recordings:random", "windows:holdout", "windows:file-order", "saved".
+        split: how the recordings or windows are divided (see `plushsense.scoring.splits.parse_split`).
         journal: where finished folds are stored, and looked up first.
         key: with a journal, everything that ``fit_predict`` depends on besides windows and folds (network, schedule,
             its seed).
@@ -238,8 +237,7 @@ def evaluate(
     """
     if journal is not None and key is None:
         raise ConfigError("A journal needs a key that identifies what is trained: give evaluate(..., key={...}).")
-    parsed = parse_split(split)
-    folds = fold_windows(train_windows, score_windows, parsed, seed)
+    folds = fold_windows(train_windows, score_windows, split, seed)
     folds = folds if validation else train_on_validation(folds)
     hashes = [windows_fingerprint(train_windows)]
     hashes.append(hashes[0] if score_windows is train_windows else windows_fingerprint(score_windows))
@@ -264,21 +262,21 @@ def evaluate(
     ]
     tested = [(fold.name, fold.test) for fold in folds]
     predictions = gather_predictions(score_windows, tested, [outcome["probabilities"] for outcome in outcomes])
-    table = compute_scores(predictions, records, score_windows.affects, parsed.separates_people)
-    table["leakage"] = audit_leakage(train_windows, score_windows, folds, shared_rows)
+    table = compute_scores(predictions, records, score_windows.affects, split.separates_people)
+    table["leakage"] = audit_leakage(train_windows, score_windows, folds, shared_rows).to_json()
     if score_windows.self_calibration:
         table["self_calibration"] = score_windows.self_calibration
     if all("deployed" in outcome for outcome in outcomes):
         deployed = gather_predictions(score_windows, tested, [outcome["deployed"] for outcome in outcomes])
-        after = compute_scores(deployed, records, score_windows.affects, parsed.separates_people)
+        after = compute_scores(deployed, records, score_windows.affects, split.separates_people)
         table["int8"] = compare_deployed(table, after, predictions, deployed)
     return Evaluation(
-        split=parsed,
+        split=split,
         context=context_of(score_windows),
         train_context=context_of(train_windows),
         seeds=[seed],
         table=table,
-        histories=[with_accuracy(outcome["history"], parsed.separates_people) for outcome in outcomes],
+        histories=[with_accuracy(outcome["history"], split.separates_people) for outcome in outcomes],
         predictions=predictions,
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,21 +30,58 @@ _CHANGING = 0.25
 _LISTED = 10
 _BLOCK = 64
 
-KINDS = {
-    "same_recording": "recording also trained on",
-    "overlapping": "samples in common with a training window",
-    "same_person": "person also trained on",
-    "copies": "equal to a training window of another recording",
-    "near_duplicates": "nearly equal to a training window of another recording",
-    "shared_rows": "of a recording that has rows of one trained on",
-}
+KINDS = ("same_recording", "overlapping", "same_person", "copies", "near_duplicates", "shared_rows")
 
 Mask = NDArray[np.bool_]
 
 
+@dataclass(frozen=True)
+class CopiedRecording:
+    """A scored recording with ``windows`` that are copies or near-duplicates of a trained one, or of its rows."""
+
+    scored: str
+    trained: str
+    windows: int
+
+
+@dataclass(frozen=True)
+class LeakageResult:
+    """The number of scored windows, and of those of each of `KINDS` that a model has been trained on.
+
+    Attributes:
+        same_recording, same_person: whose recording, or person, was also trained on.
+        overlapping: that have samples in common with a training window.
+        copies, near_duplicates: that are equal, or nearly, to a training window of another recording.
+        shared_rows: of a recording that has rows of one trained on.
+        pairs: the recordings with most copies, near-duplicates or shared rows.
+    """
+
+    windows: int
+    same_recording: int
+    overlapping: int
+    same_person: int
+    copies: int
+    near_duplicates: int
+    shared_rows: int
+    pairs: tuple[CopiedRecording, ...]
+
+    def share(self, kind: str) -> float:
+        """Return the share of the scored windows that one of `KINDS` has."""
+        return int(getattr(self, kind)) / max(self.windows, 1)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, ready for JSON."""
+        return {**vars(self), "pairs": [vars(pair) for pair in self.pairs]}
+
+    @classmethod
+    def from_json(cls, table: Mapping[str, Any]) -> LeakageResult:
+        """Return the result that `to_json` has written; a KeyError or TypeError for another table."""
+        return cls(**{**table, "pairs": tuple(CopiedRecording(**pair) for pair in table["pairs"])})
+
+
 def audit_leakage(
     train: WindowSet, score: WindowSet, folds: Sequence[Fold], shared_rows: Collection[tuple[str, str]] = ()
-) -> dict[str, Any]:
+) -> LeakageResult:
     """Count the scored windows of all folds that have something in common with the windows trained on in their fold.
 
     Validation windows count as trained on. Nobody (recordings at rest) is no person. Windows that rarely change are
@@ -56,10 +93,6 @@ def audit_leakage(
         train, score: the windows that the indices of ``folds`` refer to.
         shared_rows: pairs of recordings, in both orders, of which one has rows of the other
             (`plushsense.dataset.quality.copies`).
-
-    Returns:
-        ``windows``, the number of scored windows; a count for each of `KINDS`; ``pairs``, the recordings with most
-        copies, near-duplicates or shared rows, as {scored, trained, windows}.
     """
     partners: dict[str, list[str]] = {}
     for one, twin in sorted(shared_rows):
@@ -89,8 +122,8 @@ def audit_leakage(
             pairs[str(one), str(twin)] += 1
         for one in mine[found["shared_rows"] & ~near].tolist():
             pairs[one, copied[one]] += 1
-    listed = [{"scored": a, "trained": b, "windows": n} for (a, b), n in pairs.most_common(_LISTED)]
-    return {**totals, "pairs": listed}
+    listed = tuple(CopiedRecording(a, b, n) for (a, b), n in pairs.most_common(_LISTED))
+    return LeakageResult(**totals, pairs=listed)
 
 
 def _without_far(windows: WindowSet) -> WindowSet:
@@ -104,19 +137,18 @@ def _without_far(windows: WindowSet) -> WindowSet:
     return replace(windows, integers=x)
 
 
-def warn_of_copies(audit: Mapping[str, Any], warn: Callable[[str], None]) -> None:
+def warn_of_copies(audit: LeakageResult, warn: Callable[[str], None]) -> None:
     """Warn of scored windows with copies of what another recording trained on, naming two recordings."""
-    if audit["pairs"]:
-        first = audit["pairs"][0]
-        n = audit["near_duplicates"]
+    if audit.pairs:
+        first, n = audit.pairs[0], audit.near_duplicates
         what = "are copies, or nearly, of training windows of another recording"
-        if audit["shared_rows"] > n:
-            n, what = audit["shared_rows"], "are of recordings that have rows of one trained on"
+        if audit.shared_rows > n:
+            n, what = audit.shared_rows, "are of recordings that have rows of one trained on"
         sentence = (
-            f"{n} of {audit['windows']} scored windows {what} (as {first['scored']} of {first['trained']}), so the "
+            f"{n} of {audit.windows} scored windows {what} (as {first.scored} of {first.trained}), so the "
             "scores are too high: exclude one of the two recordings"
         )
-        warn(Sentence(sentence, "near_copies", first=first["scored"], second=first["trained"]))
+        warn(Sentence(sentence, "near_copies", first=first.scored, second=first.trained))
 
 
 def _ids(windows: WindowSet, index: Index) -> NDArray[np.str_]:

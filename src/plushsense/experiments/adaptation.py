@@ -37,7 +37,7 @@ from plushsense.scoring import metrics
 from plushsense.scoring.splits import Fold, parse_split, purge
 from plushsense.windows.cut import WindowSet, whole_gestures
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, windows_for
+from plushsense.workflow.preparation import Warn, prepare, windows_for
 from plushsense.workflow.reporting import keep_bundle
 
 Predictor = Callable[[WindowSet], NDArray[np.floating[Any]]]
@@ -445,31 +445,30 @@ def evaluate_adapting(
     Returns:
         What `score_adaptation` returns, and ``split``, ``simulated``, ``spec``.
     """
-    dataset, config = network_inputs_of(as_dataset(dataset), config or from_settings(**settings))
+    run = prepare(dataset, config or from_settings(**settings), warn)
+    dataset, gestures, arch = run.dataset, run.gestures, run.network
     spec = spec or PersonalSpec()
     if use < spec.least or random < 0:
         raise ConfigError(f"--use {use}, --choices {random}: accepted are {spec.least} and more, 0 and more.")
     division = parse_split(split)
     if not division.separates_people:
         raise ConfigError(f"The split {split} does not keep people apart: use leave-one-subject-out or by-subject:5.")
-    gestures = choose_classes(dataset, config.evaluation.classes, warn)
-    arch = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
     if int8:
         refuse_undeployable(arch)
-    windows = windows_for(dataset, arch, config.windows, gestures, warn)
-    folds = fold_windows(windows, windows, division, config.evaluation.seed)
+    windows = windows_for(dataset, arch, run.windows, gestures, warn)
+    folds = fold_windows(windows, windows, division, run.evaluation.seed)
     key = {"windows": windows_fingerprint(windows), "arch": arch.to_dict(), "layout": dataset.layout.to_dict()}
     tell = progress or (lambda _: None)
 
     def bundle_of(fold: Fold) -> Bundle:
-        made = json.dumps({**key, "fold": fold_fingerprint(fold), "training": config.training.key()}, sort_keys=True)
+        made = json.dumps({**key, "fold": fold_fingerprint(fold), "training": run.training.key()}, sort_keys=True)
         path = dataset.path / CACHE / "adapting" / f"{hashlib.sha256(made.encode()).hexdigest()[:32]}.plush"
         if path.exists():
             return Bundle.load(path)
         from plushsense.training.fit import fit
 
         mine = windows.take(fold.train)
-        fitted = fit(mine, windows.take(fold.validation), arch, config.training)
+        fitted = fit(mine, windows.take(fold.validation), arch, run.training)
         kept = calibration(arch, fitted.weights, fitted.scaler, mine.integers)
         bundle = Bundle(
             arch,
@@ -477,8 +476,8 @@ def evaluate_adapting(
             dataset.layout,
             fitted.scaler,
             gestures,
-            config.to_dict()["windows"],
-            config.live.to_dict(),
+            asdict(run.windows),
+            run.live.to_dict(),
             {
                 "dataset": dataset.head.name,
                 "dataset_hash": dataset.hash,
@@ -505,7 +504,7 @@ def evaluate_adapting(
         {r.id: r.epoch_ms for r in dataset.recordings},
         use=use,
         random=random,
-        seed=config.evaluation.seed,
+        seed=run.evaluation.seed,
         progress=lambda person: tell(f"adapted to {person}"),
     )
     return {"split": division.text, "simulated": dataset.head.simulated, "spec": asdict(spec), **result}

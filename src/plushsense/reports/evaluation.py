@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from plushsense.reports.figures import data_uri, row_shares, shade, training_cur
 from plushsense.reports.page import check_page_path, render_page, write_page
 from plushsense.reports.table import DASH, Column, Table, count, interval, mean_sd, number, text
 from plushsense.scoring.metrics import METRICS, column_metrics
+
+if TYPE_CHECKING:
+    from plushsense.reports.quality import RecordingPictures
 
 # With more labels, a list of the most frequent confusions takes the place of the matrix, whose cells are their square.
 _MOST_LABELS = 60
@@ -44,7 +47,7 @@ def render(
     evaluations: Sequence[Mapping[str, Any]],
     models: Sequence[Mapping[str, Any]],
     simulated: bool,
-    recordings: Mapping[str, Any] | None = None,
+    recordings: RecordingPictures | None = None,
 ) -> str:
     """Return the report as HTML. Any key of the mappings may be missing; the report then shows a dash.
 

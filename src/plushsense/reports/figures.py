@@ -20,6 +20,7 @@ from plushsense.core.errors import ConfigError, need
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.text import Annotation
     from matplotlib.transforms import Bbox
 
 # Okabe and Ito's blue and vermillion, which colour-blind readers can distinguish; line styles differ as well.
@@ -173,27 +174,16 @@ def _saved(figure: Figure, **options: Any) -> bytes:
 
 
 # The ends of a single-hue scale (ColorBrewer "Blues"), whose order is that of lightness, so that it works in grey and
-# with any colour vision. Cells also show the count.
+# with any colour vision. Cells also show the count. White text has the higher contrast from a share of 0.7 on.
 _LIGHT, _DARK = (247, 251, 255), (8, 64, 129)
+_WHITE_TEXT_FROM = 0.7
 
 
 def shade(share: float) -> tuple[str, str]:
     """Return background and text colour (CSS) for a share from 0 to 1, with a contrast of at least 4.5 : 1."""
     share = min(max(share, 0.0), 1.0)
     rgb = tuple(round(a + (b - a) * share) for a, b in zip(_LIGHT, _DARK, strict=True))
-    ink = "#ffffff" if _contrast(rgb, (255, 255, 255)) > _contrast(rgb, (0, 0, 0)) else "#000000"
-    return "#{:02x}{:02x}{:02x}".format(*rgb), ink
-
-
-def _contrast(one: Sequence[int], other: Sequence[int]) -> float:
-    """Return the contrast ratio of two colours, 1 to 21 (WCAG 2.1)."""
-    low, high = sorted((_luminance(one), _luminance(other)))
-    return (high + 0.05) / (low + 0.05)
-
-
-def _luminance(rgb: Sequence[int]) -> float:
-    linear = [c / 12.92 if c <= 0.03928 else ((c + 0.055) / 1.055) ** 2.4 for c in (v / 255 for v in rgb)]
-    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+    return "#{:02x}{:02x}{:02x}".format(*rgb), "#ffffff" if share > _WHITE_TEXT_FROM else "#000000"
 
 
 def row_shares(counts: NDArray[Any]) -> NDArray[np.float64]:
@@ -251,11 +241,9 @@ def place_labels(
     for (x, y), point in zip(at, points, strict=True):
         if not point.label:
             continue
-        text = axes.annotate(
-            point.label,
-            (point.x, point.y),
-            xytext=(0, 0),
-            textcoords="offset points",
+        text = _annotation(
+            axes,
+            point,
             fontsize=size,
             ha="center",
             va="center",
@@ -264,29 +252,27 @@ def place_labels(
             parse_math=False,
             bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.75},
         )
-        text.set_in_layout(False)
         extent = text.get_window_extent()
         width, height = extent.width + 2 * _GAP_PT * pixel, extent.height
-        for distance in _DISTANCES_PT:
-            box = _free_box(x, y, width, height, distance * pixel, taken, inside)
-            if box is not None:
-                break
-        else:
+        boxes = ((d, _free_box(x, y, width, height, d * pixel, taken, inside)) for d in _DISTANCES_PT)
+        distance, box = next(((d, free) for d, free in boxes if free is not None), (0.0, None))
+        if box is None:
             text.remove()
             continue
         taken.append(box)
         text.set_position((((box.x0 + box.x1) / 2 - x) / pixel, ((box.y0 + box.y1) / 2 - y) / pixel))
         if distance > _NEAR_PT:
             nearest = np.clip((x, y), box.min, box.max)
-            line = axes.annotate(
-                "",
-                (point.x, point.y),
-                xytext=((nearest[0] - x) / pixel, (nearest[1] - y) / pixel),
-                textcoords="offset points",
-                arrowprops={"arrowstyle": "-", "color": "#777777", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3},
-                zorder=4,
-            )
-            line.set_in_layout(False)
+            arrow = {"arrowstyle": "-", "color": "#777777", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3}
+            line = _annotation(axes, LabelledPoint(point.x, point.y, ""), arrowprops=arrow, zorder=4)
+            line.set_position(((nearest[0] - x) / pixel, (nearest[1] - y) / pixel))
+
+
+def _annotation(axes: Axes, point: LabelledPoint, **style: Any) -> Annotation:
+    """Write a label on its point, which `constrained` layout does not make room for."""
+    text = axes.annotate(point.label, (point.x, point.y), xytext=(0, 0), textcoords="offset points", **style)
+    text.set_in_layout(False)
+    return text
 
 
 def _free_box(

@@ -155,8 +155,25 @@ def example_recordings(dataset: Dataset, spec: WindowSpec) -> list[RecordingInfo
     return [r for r in (short, long) if r is not None]
 
 
-def describe_recordings(dataset: Dataset, recording: str | None = None) -> dict[str, Any]:
-    """Return pictures of the durations and of how recordings are cut, for the template of a report.
+@dataclass(frozen=True)
+class RecordingPictures:
+    """Pictures of a data set's recordings as data URIs, for the template of a report.
+
+    Attributes:
+        durations: of the recordings of each gesture; None without a recording.
+        table: their numbers.
+        windows: for each example of how a recording is cut into windows, the picture and a sentence.
+    """
+
+    durations: str | None
+    table: Table
+    window_s: float
+    step_s: float
+    windows: tuple[tuple[str, str], ...]
+
+
+def describe_recordings(dataset: Dataset, recording: str | None = None) -> RecordingPictures:
+    """Draw the durations of recordings, and how examples are cut into windows.
 
     Args:
         recording: id of the recording to show cut into windows (default: `example_recordings`).
@@ -168,13 +185,13 @@ def describe_recordings(dataset: Dataset, recording: str | None = None) -> dict[
     shown = example_recordings(dataset, spec) if recording is None else find_recordings(dataset, recording)[:1]
     bands = duration_bands(dataset)
     cut = [figures.windows(dataset, info, spec) for info in shown]
-    return {
-        "durations": data_uri(figures.durations(bands)) if bands else None,
-        "table": duration_rows(bands),
-        "window_s": spec.window_s,
-        "step_s": spec.step_s,
-        "windows": [{"src": data_uri(figure), "alt": sentence} for figure, sentence in cut],
-    }
+    return RecordingPictures(
+        durations=data_uri(figures.durations(bands)) if bands else None,
+        table=duration_rows(bands),
+        window_s=spec.window_s,
+        step_s=spec.step_s,
+        windows=tuple((data_uri(figure), sentence) for figure, sentence in cut),
+    )
 
 
 def write_report(path: Path, result: CheckReport, progress: Progress | None = None) -> Path:

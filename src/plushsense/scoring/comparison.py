@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
 
@@ -71,12 +72,29 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return [float(p) for p in adjusted]
 
 
-def compare_pairs(names: Sequence[str], scores: ArrayLike) -> list[dict[str, Any]]:
-    """Compare all pairs of models on scores (people, models), person by person.
+@dataclass(frozen=True)
+class PairResult:
+    """Two models compared on the same people; differences are first minus second.
 
-    Returns:
-        for each pair {first, second, difference {mean, sd, ci95}, better, worse, p, p_holm, effect}; differences are
-        first minus second, ``better`` and ``worse`` count people, ``effect`` is the rank-biserial correlation.
+    Attributes:
+        difference: the summary {mean, sd, ci95} over people.
+        better, worse: the numbers of people for whom the first is better, or worse.
+        p, p_holm: of the paired permutation test, and corrected for all pairs.
+        effect: the rank-biserial correlation; None without a difference.
+    """
+
+    first: str
+    second: str
+    difference: dict[str, Any]
+    better: int
+    worse: int
+    p: float
+    p_holm: float
+    effect: float | None
+
+
+def compare_pairs(names: Sequence[str], scores: ArrayLike) -> list[PairResult]:
+    """Compare all pairs of models on scores (people, models), person by person.
 
     Raises:
         BadInput: for fewer than two models or people.
@@ -84,28 +102,27 @@ def compare_pairs(names: Sequence[str], scores: ArrayLike) -> list[dict[str, Any
     table = np.asarray(scores, dtype=np.float64)
     if table.ndim != 2 or min(table.shape) < 2 or table.shape[1] != len(names):
         raise BadInput(f"A comparison needs the scores of at least 2 models on 2 people; got {table.shape}.")
-    rows: list[dict[str, Any]] = []
-    for i, j in combinations(range(len(names)), 2):
-        d = table[:, i] - table[:, j]
-        rows.append(
-            {
-                "first": names[i],
-                "second": names[j],
-                "difference": summary(d),
-                "better": int((d > 0).sum()),
-                "worse": int((d < 0).sum()),
-                "p": paired_permutation_test(d),
-                "effect": rank_biserial(d),
-            }
+    pairs = list(combinations(range(len(names)), 2))
+    differences = [table[:, i] - table[:, j] for i, j in pairs]
+    p_values = [paired_permutation_test(d) for d in differences]
+    return [
+        PairResult(
+            first=names[i],
+            second=names[j],
+            difference=summary(d),
+            better=int((d > 0).sum()),
+            worse=int((d < 0).sum()),
+            p=p,
+            p_holm=p_holm,
+            effect=rank_biserial(d),
         )
-    for row, p in zip(rows, holm([float(row["p"]) for row in rows]), strict=True):
-        row["p_holm"] = p
-    return rows
+        for (i, j), d, p, p_holm in zip(pairs, differences, p_values, holm(p_values), strict=True)
+    ]
 
 
-def cliques(names: Sequence[str], pairs: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
+def cliques(names: Sequence[str], pairs: Sequence[PairResult]) -> list[tuple[str, ...]]:
     """Return the longest runs of neighbours in ``names`` (ordered by rank) in which no two differ significantly."""
-    differ = {frozenset((row["first"], row["second"])) for row in pairs if row["p_holm"] < LEVEL}
+    differ = {frozenset((pair.first, pair.second)) for pair in pairs if pair.p_holm < LEVEL}
     runs: list[tuple[str, ...]] = []
     for start in range(len(names)):
         end = start + 1

@@ -184,6 +184,19 @@ def vote(
     return ids, np.argmax(total / np.maximum(windows, 1), axis=1).astype(np.int64)
 
 
+def calibration_error(probabilities: NDArray[np.floating[Any]], truth: NDArray[np.int64]) -> float:
+    """Return the expected calibration error (ECE) of predictions (N, K); NaN without any.
+
+    It is the difference between highest probability and accuracy, averaged over ten bins of equal width by their
+    numbers of predictions (Guo et al. 2017).
+    """
+    confidence = probabilities.max(axis=1).astype(np.float64)
+    right = probabilities.argmax(axis=1) == truth
+    place = np.minimum((confidence * 10).astype(np.int64), 9)
+    gaps = np.abs(np.bincount(place, weights=confidence - right, minlength=10))
+    return float(gaps.sum() / len(truth)) if len(truth) else float("nan")
+
+
 def summary(values: Sequence[float] | NDArray[np.float64]) -> dict[str, Any]:
     """Return ``{mean, sd, ci95}`` of values, one for each person (or fold).
 

@@ -412,18 +412,20 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
     """Evaluate; return the output folder, the report and the main scores, or the estimate for a dry run."""
     config = from_settings(**spec.get("settings", {}))
     if spec.get("split"):
-        config = replace(config, evaluation=replace(config.evaluation, split=spec["split"]))
+        config = config.for_split(spec["split"])
     if spec.get("dry"):
         from plushsense.trials.estimate import preview_evaluation
 
         return preview_evaluation(spec["dataset"], config, warn=reporter.warn)
     reporter.progress(stage="reading", share=0.0)
 
-    from plushsense.workflow.api import evaluate
-    from plushsense.workflow.reporting import PAGE, load_evaluation, name_of, write_report
+    from plushsense.workflow.api import evaluate_run
+    from plushsense.workflow.preparation import prepare
+    from plushsense.workflow.reporting import PAGE, load_evaluation, write_report
 
     dataset = open_dataset(spec["dataset"])
-    out = dataset.path / "evaluations" / name_of(config, dataset)
+    made = prepare(dataset, config, reporter.warn)
+    out = dataset.path / "evaluations" / made.name
     clock = Clock()
 
     def fold(at: JobProgress) -> None:
@@ -432,7 +434,7 @@ def run_evaluate(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]
         loss = {"train_loss": row.get("train_loss")}
         reporter.progress(stage="training", epoch=at.epoch, epochs=at.epochs, **counts, **loss, **clock.at(at.share))
 
-    evaluate(dataset, config, out=out, int8=bool(spec.get("int8")), progress=fold, warn=reporter.warn)
+    evaluate_run(made, out=out, int8=bool(spec.get("int8")), progress=fold, warn=reporter.warn)
     report = write_report(out / PAGE, dataset, [out])
     return {"out": str(out), "report": str(report), **_evaluation(load_evaluation(out))}
 

@@ -29,17 +29,18 @@ from plushsense.models.bundle import Bundle
 from plushsense.scoring.metrics import summary
 from plushsense.trials.estimate import preview_evaluation
 from plushsense.windows.cut import ANYWHERE
-from plushsense.workflow.api import evaluate, train, unfinished
+from plushsense.workflow.api import evaluate_run, train, unfinished
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.networks import REFIT
 from plushsense.workflow.preparation import (
     Warn,
     count_people,
+    prepare,
     refits,
     refuse_hard_negatives,
     silent,
 )
-from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, evaluation_id, journal_of, name_of, write_report
+from plushsense.workflow.reporting import LEARNING, PAGE, check_folder, journal_of, write_report
 
 TRAINING, DECIDING, EVALUATING, LEARNING_CURVE = "training", "deciding", "evaluating", "learning"
 MORE_PEOPLE = 2
@@ -223,12 +224,13 @@ def make_network(
     if config is None:
         streams = any(recording.stream_row >= 0 for recording in dataset.used)
         config = from_settings(context=ANYWHERE) if streams else from_settings()
-    refuse_hard_negatives(config)
+    run = prepare(dataset, config)
+    refuse_hard_negatives(run)
     again = refits(config, count_people(dataset))
     networks = 1 + again
     # A resumed run must not choose other folds because the computer is faster or slower than before.
     journal = journal_of(dataset, "budgets")
-    key = job_id({"evaluation": evaluation_id(config, dataset), "out": out.name, "seconds": budget_s})
+    key = job_id({"evaluation": run.id, "out": out.name, "seconds": budget_s})
     stored = journal.find(key)
     cost = None
     if stored is None:
@@ -248,12 +250,12 @@ def make_network(
             plan = _adjusted(plan, cost, training_s, _USED * budget_s - (time.monotonic() - began))
             config, whole = _planned(config, plan), sum(_work(plan, networks))
         journal.save(key, {"plan": asdict(plan), "bundle": bundle.name})
-    evaluation = dataset.path / "evaluations" / name_of(config, dataset)
+    run = prepare(dataset, config, warn)
+    evaluation = dataset.path / "evaluations" / run.name
     before = float(networks)
     started = time.monotonic()
-    result = evaluate(
-        dataset,
-        config,
+    result = evaluate_run(
+        run,
         out=evaluation,
         progress=_folds(EVALUATING, before, plan, 1.0, whole, bundle, progress),
         warn=warn,
@@ -267,7 +269,7 @@ def make_network(
         if stored is None and share * evaluation_s > left_s:
             break
         reported = _folds(LEARNING_CURVE, before, plan, share, whole, bundle, progress)
-        smaller = evaluate(dataset, config, training_people=size, progress=reported, warn=silent)
+        smaller = evaluate_run(run, training_people=size, progress=reported, warn=silent)
         points[size] = _accuracies(smaller.table)
         before += (plan.folds - 1) * share
     learning = learning_curve(points)

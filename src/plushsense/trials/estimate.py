@@ -15,24 +15,14 @@ from typing import Any
 import numpy as np
 
 from plushsense.core.gestures import NOBODY
-from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset
 from plushsense.evaluation.crossval import fold_windows, train_on_validation
 from plushsense.models.arch import Arch
-from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.trials.plan import PASSES, Plan, Task
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.config import RunConfig
-from plushsense.workflow.preparation import (
-    Warn,
-    classes_for,
-    network_inputs_of,
-    prepare_training,
-    refuse_hard_negatives,
-    silent,
-    windows_for,
-)
+from plushsense.workflow.preparation import Run, Warn, prepare, prepare_training, refuse_hard_negatives, silent
 
 _BATCHES, _EPOCHS = 3, 3
 
@@ -41,12 +31,12 @@ def preview_training(
     dataset: Dataset | str | os.PathLike[str], config: RunConfig, *, warn: Warn = silent
 ) -> dict[str, Any]:
     """Return what `api.train` would train on and its cost; see `preview_evaluation` for the keys."""
-    made = prepare_training(as_dataset(dataset), config, warn)
-    windows, division, config = made.windows, made.division, made.config
-    rate = _seconds_a_mac(windows, made.network, config.training)
-    head = {"split": division.kind, "leaky": division.split.leaky, "context": config.windows.context, "folds": 1}
+    made = prepare_training(dataset, config, warn)
+    run, windows, division = made.run, made.windows, made.division
+    rate = _seconds_a_mac(windows, run.network, run.training)
+    head = {"split": division.kind, "leaky": division.split.leaky, "context": run.windows.context, "folds": 1}
     sizes = [len(division.train), *([len(windows)] if division.refit else [])]
-    return head | _describe(made.dataset, made.network, config, windows, sizes, rate, 1)
+    return head | _describe(run, windows, sizes, rate, 1)
 
 
 def preview_evaluation(
@@ -59,20 +49,17 @@ def preview_evaluation(
         ``epochs`` (at most), ``parameters``, ``macs`` of all trainings, ``seconds`` (estimated), and
         ``window_epoch_s``, the measured seconds to train on one window for one epoch.
     """
-    refuse_hard_negatives(config)
-    dataset, config = network_inputs_of(as_dataset(dataset), config)
-    gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)
-    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
-    score = fit_on = windows_for(dataset, network, config.scored_on, gestures, warn)
-    if config.trained_on != config.scored_on:
-        fit_on = windows_for(dataset, network, config.trained_on, gestures, anywhere=config.anywhere)
-    split = parse_split(config.evaluation.split)
-    folds = fold_windows(fit_on, score, split, config.evaluation.seed)
-    folds = folds if config.holds_back else train_on_validation(folds)
-    rate = _seconds_a_mac(fit_on, network, config.training)
-    side_by_side = min(config.evaluation.processes, len(folds))
-    head = {"split": split.text, "leaky": split.leaky, "context": config.scored_on.context, "folds": len(folds)}
-    return head | _describe(dataset, network, config, fit_on, [len(f.train) for f in folds], rate, side_by_side)
+    run = prepare(dataset, config, warn)
+    refuse_hard_negatives(run)
+    score = fit_on = run.scored_windows(warn)
+    if run.trained_on != run.scored_on:
+        fit_on = run.training_windows()
+    folds = fold_windows(fit_on, score, run.split, run.evaluation.seed)
+    folds = folds if run.holds_back else train_on_validation(folds)
+    rate = _seconds_a_mac(fit_on, run.network, run.training)
+    side_by_side = min(run.evaluation.processes, len(folds))
+    head = {"split": run.split.text, "leaky": run.split.leaky, "context": run.scored_on.context, "folds": len(folds)}
+    return head | _describe(run, fit_on, [len(f.train) for f in folds], rate, side_by_side)
 
 
 def plan_seconds(planned: Plan, macs: float, workers: int) -> float:
@@ -86,25 +73,23 @@ def plan_seconds(planned: Plan, macs: float, workers: int) -> float:
 
 
 def _describe(
-    dataset: Dataset,
-    network: Arch,
-    config: RunConfig,
+    run: Run,
     windows: WindowSet,
     sizes: list[int],
     rate: float,
     side_by_side: int,
 ) -> dict[str, Any]:
-    macs = PASSES * network.macs_per_window * sum(sizes) * config.training.epochs
+    macs = PASSES * run.network.macs_per_window * sum(sizes) * run.training.epochs
     return {
-        "dataset": dataset.head.name,
-        "simulated": dataset.head.simulated,
+        "dataset": run.dataset.head.name,
+        "simulated": run.dataset.head.simulated,
         "people": len(set(windows.subject.tolist()) - {NOBODY, UNKNOWN_SUBJECT}),
         "classes": len(windows.labels),
         "windows": len(windows),
-        "epochs": config.training.epochs,
-        "parameters": network.parameters,
+        "epochs": run.training.epochs,
+        "parameters": run.network.parameters,
         "macs": macs,
-        "window_epoch_s": rate * PASSES * network.macs_per_window,
+        "window_epoch_s": rate * PASSES * run.network.macs_per_window,
         "seconds": macs * rate / max(1, side_by_side),
     }
 

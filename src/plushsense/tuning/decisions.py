@@ -294,14 +294,10 @@ def marked_streams(
     dataset: Dataset,
     subjects: Iterable[str],
     spec: DecideSpec,
-    gestures: GestureSet | None = None,
 ) -> list[MarkedStream]:
     """Compute the traces of the streams of some people, with their marked recordings.
 
     Streams without a marked recording are left out. Of more than an hour, an equal part is used for each person.
-
-    Args:
-        gestures: the set to which the indices of the truths refer; by default the network's own.
     """
     people = set(subjects)
     marked: dict[str, list[RecordingInfo]] = {}
@@ -316,7 +312,7 @@ def marked_streams(
         frames = dataset.read_stream(stream.id)
         frames = frames.slice(0, min(len(frames), left[stream.subject]))
         left[stream.subject] -= len(frames)
-        truths = truths_of(frames, marked[stream.id], gestures or bundle.gestures, dataset.layout)
+        truths = truths_of(frames, marked[stream.id], bundle.gestures, dataset.layout)
         if any(t.gesture != OTHER for t in truths):
             out.append(MarkedStream(stream.subject, trace_of(frames, bundle, spec.health), truths))
     return out

@@ -34,7 +34,7 @@ from plushsense.deploy.quantize import (
 )
 from plushsense.evaluation.crossval import EpochProgress, Evaluation, FoldOutput
 from plushsense.evaluation.crossval import evaluate as crossvalidate
-from plushsense.evaluation.leakage import warn_of_copies
+from plushsense.evaluation.leakage import LeakageResult, warn_of_copies
 from plushsense.evaluation.scores import FoldRecord, Predictions, gather_predictions, with_accuracy
 from plushsense.evaluation.scores import compute_scores as score_predictions
 from plushsense.jobs.journal import UNFINISHED, Journal, job_id, keep_if_possible
@@ -43,7 +43,6 @@ from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle, is_training_content, known_people
 from plushsense.models.reference import softmax
 from plushsense.runtime.decisions import DecideSpec
-from plushsense.scoring.splits import parse_split
 from plushsense.training.spec import TrainSpec
 from plushsense.tuning.decisions import fit_decisions as fit_on_people
 from plushsense.windows.cut import ANYWHERE, WindowSet, whole_gestures
@@ -52,9 +51,9 @@ from plushsense.workflow.networks import KEPT_S, REFIT, NetworkTrainer, TrainedN
 from plushsense.workflow.preparation import (
     WHOLE_PEOPLE,
     PreparedTraining,
+    Run,
     Warn,
-    classes_for,
-    network_inputs_of,
+    prepare,
     prepare_training,
     refuse_hard_negatives,
     warn_of_files_twice,
@@ -186,11 +185,12 @@ def train(
     given = config or from_settings(arch=arch, filters=filters, **settings)
     if quantize_aware < 0:
         raise ConfigError(f"quantize_aware is {quantize_aware}: accepted are 0 (off) and more epochs.")
-    made = prepare_training(as_dataset(dataset), given, warn, deployable=quantize_aware > 0)
-    dataset, config, scored, division = made.dataset, made.config, made.scored, made.division
+    made = prepare_training(dataset, given, warn, deployable=quantize_aware > 0)
+    run, scored, division = made.run, made.scored, made.division
+    dataset = run.dataset
     trainer = NetworkTrainer(
-        dataset, config, made.network, made.gestures, made.windows, division.kind == WHOLE_PEOPLE, quantize_aware,
-        journal, _reporting(progress, division.split.separates_people),
+        run, made.windows, division.kind == WHOLE_PEOPLE, quantize_aware, journal,
+        _reporting(progress, division.split.separates_people),
     )  # fmt: skip
     checked = trainer.train(division.train, scored.take(division.validation), division.fold.subjects)
     final = checked
@@ -199,13 +199,13 @@ def train(
     fitted = checked.fitted
     predictions, scores = _validated(made, checked, warn)
     bundle = Bundle(
-        arch=made.network,
+        arch=run.network,
         weights=final.weights,
         layout=dataset.layout,
         scaler=final.fitted.scaler,
-        gestures=made.gestures,
-        windowing=_windowing(config),
-        decision=config.live.to_dict(),
+        gestures=run.gestures,
+        windowing=_windowing(run),
+        decision=run.live.to_dict(),
         provenance={
             "dataset": dataset.head.name,
             "dataset_hash": dataset.hash,
@@ -215,8 +215,8 @@ def train(
             "split": division.kind,
             "refit": division.refit,
             "context": dict(sorted(Counter(made.windows.context.tolist()).items())),
-            "preset": config.preset,
-            "training": config.training.to_dict(),
+            "preset": run.preset,
+            "training": run.training.to_dict(),
             "quantize_aware": quantize_aware,
             "scores": scores,
             "code_version": __version__,
@@ -225,7 +225,7 @@ def train(
     )
     if fit_decisions:
         reader = replace(bundle, weights=checked.weights, scaler=fitted.scaler)
-        bundle = replace(bundle, decision=_decisions(reader, dataset, config.live, warn))
+        bundle = replace(bundle, decision=_decisions(reader, dataset, run.live, warn))
     if division.refit:
         _keep_predictions(bundle, dataset, predictions)
     trainer.discard()
@@ -243,7 +243,7 @@ def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> t
     """
     from plushsense.training.fit import predict
 
-    division, fitted, config = made.division, trained.fitted, made.config
+    run, division, fitted = made.run, made.division, trained.fitted
     test = made.scored.take(division.fold.test)
     sizes = (len(trained.at), len(division.validation), len(test))
     record = FoldRecord(division.fold.name, division.fold.subjects, sizes, len(fitted.history), fitted.seconds)
@@ -253,7 +253,7 @@ def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> t
         found = score_predictions(predictions, [record], made.scored.affects, division.split.separates_people)
         return predictions, {name: found[name]["mean"] for name in ("accuracy", "macro_f1")}, found["nobody"]
 
-    answers = predict(made.network, trained.weights, fitted.scaler, test, config.training.device)
+    answers = predict(run.network, trained.weights, fitted.scaler, test, run.training.device)
     predictions, means, nobody = score(answers)
     scores: dict[str, Any] = {
         "split": division.kind,
@@ -263,11 +263,11 @@ def _validated(made: PreparedTraining, trained: TrainedNetwork, warn: Warn) -> t
         **means,
         "nobody": nobody,
         "best_epoch": fitted.best_epoch,
-        "simulated": made.dataset.head.simulated,
+        "simulated": run.dataset.head.simulated,
         "int8": None,
     }
     if trained.ranges:
-        integer = quantize(made.network, trained.weights, fitted.scaler, Ranges.from_dict(trained.ranges))
+        integer = quantize(run.network, trained.weights, fitted.scaler, Ranges.from_dict(trained.ranges))
         deployed, means, _ = score(integer_probabilities(integer, test.integers))
         agreement = float((deployed.predicted == predictions.predicted).mean())
         scores["int8"] = {**means, "agreement": agreement}
@@ -318,11 +318,10 @@ def _keep_predictions(bundle: Bundle, dataset: Dataset, predictions: Predictions
     keep_if_possible(journal, _predictions_id(bundle), {**vars(predictions)})
 
 
-def _windowing(config: RunConfig) -> dict[str, Any]:
+def _windowing(run: Run) -> dict[str, Any]:
     """Return the window settings as a bundle stores them."""
-    tables = config.to_dict()
-    anywhere = {"anywhere": tables["anywhere"]} if config.windows.context == ANYWHERE else {}
-    return {**tables["windows"], **anywhere}
+    anywhere = {"anywhere": asdict(run.anywhere)} if run.windows.context == ANYWHERE else {}
+    return {**asdict(run.windows), **anywhere}
 
 
 def evaluate(
@@ -356,49 +355,68 @@ def evaluate(
         training_people: train each fold on so many of its people only, for a learning curve; not with ``out``.
     """
     given = config or from_settings(arch=arch, filters=filters, **settings)
-    dataset, config = network_inputs_of(as_dataset(dataset), given)
-    if split is not None:
-        config = replace(config, evaluation=replace(config.evaluation, split=split))
-    parse_split(config.evaluation.split)
-    refuse_hard_negatives(config)
+    run = prepare(dataset, given if split is None else given.for_split(split), warn)
+    return evaluate_run(
+        run,
+        out=out,
+        overwrite=overwrite,
+        cluster=cluster,
+        int8=int8,
+        training_people=training_people,
+        progress=progress,
+        warn=warn,
+    )
+
+
+def evaluate_run(
+    run: Run,
+    *,
+    out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    cluster: str | None = None,
+    int8: bool = False,
+    training_people: int | None = None,
+    progress: Callable[[JobProgress], None] | None = None,
+    warn: Warn = python_warning,
+) -> Evaluation:
+    """Train and score one network for each fold of a prepared run; the arguments are those of `evaluate`."""
+    refuse_hard_negatives(run)
     if out is not None:
-        check_place(Path(out), config, dataset, replace=overwrite)
-    gestures = classes_for(dataset, config.evaluation.classes, config.trained_on.context, warn)
-    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
+        check_place(Path(out), run, replace=overwrite)
     if int8:
-        refuse_undeployable(network)
-    warn_of_files_twice(dataset, gestures, warn)
-    score = fit_on = windows_for(dataset, network, config.scored_on, gestures, warn)
-    if parse_split(config.evaluation.split).separates_people:
+        refuse_undeployable(run.network)
+    warn_of_files_twice(run.dataset, run.gestures, warn)
+    score = fit_on = run.scored_windows(warn)
+    if run.split.separates_people:
         warn_of_single_people(score, warn)
-    if config.trained_on != config.scored_on:
-        fit_on = windows_for(dataset, network, config.trained_on, gestures, anywhere=config.anywhere)
+    if run.trained_on != run.scored_on:
+        fit_on = run.training_windows()
     from plushsense.training.fit import resolve_device
 
     result = crossvalidate(
         fit_on,
         score,
-        config.evaluation.split,
-        TrainAndPredict(network, config.training, int8, training_people),
-        journal=journal_of(dataset, "folds"),
+        run.split,
+        TrainAndPredict(run.network, run.training, int8, training_people),
+        journal=journal_of(run.dataset, "folds"),
         key={
-            "arch": network.to_dict(),
-            "training": resolve_device(config.training).key(),
+            "arch": run.network.to_dict(),
+            "training": resolve_device(run.training).key(),
             "vectors": fit_on.vectors,
             **({"int8": QUANTIZE_VERSION} if int8 else {}),
             **({"people": training_people} if training_people is not None else {}),
         },
-        workers=config.evaluation.processes,
+        workers=run.evaluation.processes,
         cluster=cluster,
-        seed=config.evaluation.seed,
-        validation=config.holds_back,
-        shared_rows=copied_recordings(dataset, score.recording_ids),
+        seed=run.evaluation.seed,
+        validation=run.holds_back,
+        shared_rows=copied_recordings(run.dataset, score.recording_ids),
         progress=progress,
     )
-    warn_of_copies(result.table["leakage"], warn)
+    warn_of_copies(LeakageResult.from_json(result.table["leakage"]), warn)
     if out is not None:
-        with dataset.generation.writing():
-            save_evaluation(result, dataset, config, network, Path(out))
+        with run.dataset.generation.writing():
+            save_evaluation(result, run, Path(out))
     return result
 
 

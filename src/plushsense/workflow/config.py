@@ -8,30 +8,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from plushsense.core.errors import ArchError, ConfigError, check_known, check_seed
-from plushsense.core.layouts import Layout
 from plushsense.core.toml import check_table, read_toml, refuse_unknown
-from plushsense.models.arch import (
-    DEFAULT_FILTERS,
-    DEFAULT_SYMBOL,
-    NORMS,
-    PADDINGS,
-    VECTOR_FILTERS,
-    VECTOR_SYMBOL,
-    Arch,
-    parse_filters,
-    parse_symbol,
-    symbol_at_rate,
-)
+from plushsense.models.arch import NORMS, PADDINGS, parse_filters
 from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import parse_split
-from plushsense.training.spec import CONTEXT, PADDING, PRESETS, VECTOR_AUGMENT, TrainSpec, preset
+from plushsense.training.spec import CONTEXT, TrainSpec, preset
 from plushsense.windows.anywhere import AnywhereSpec
-from plushsense.windows.cut import ANYWHERE, TRAIN_CONTEXTS, WindowSpec
+from plushsense.windows.cut import TRAIN_CONTEXTS, WindowSpec
 
 SHARED, ALL = "shared", "all"
 
@@ -67,27 +55,6 @@ class ModelSpec:
         if self.padding is not None:
             check_known(self.padding, PADDINGS, "padding", ArchError)
         check_known(self.norm, NORMS, "norm", ArchError)
-
-    def build(self, layout: Layout, classes: int, window_s: float, padding: str) -> Arch:
-        """Build the network for the inputs of a layout and a number of classes."""
-        arch = self.arch or symbol_at_rate(DEFAULT_SYMBOL, layout.rate_hz)
-        return Arch.parse(
-            arch,
-            self.filters or default_filters(arch),
-            channels=layout.n_inputs,
-            classes=classes,
-            padding=self.padding or padding,
-            norm=self.norm,
-            window=layout.samples(window_s),
-            step=layout.samples(self.step_s),
-            pool=None if self.pool_s is None else layout.samples(self.pool_s),
-            vectors=len(layout.vectors),
-        )
-
-
-def default_filters(symbol: str) -> tuple[int, ...]:
-    """Return the filters of a network for which none are given."""
-    return DEFAULT_FILTERS if parse_symbol(symbol).vector is None else VECTOR_FILTERS
 
 
 @dataclass(frozen=True)
@@ -131,7 +98,10 @@ class EvaluationSpec:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Resolved settings of a run; ``augment_given``: the augmentations were not left to the preset."""
+    """Settings of a run as they were given; `plushsense.workflow.preparation.prepare` resolves the rest for a data set.
+
+    ``augment_given``: the augmentations were not left to the preset.
+    """
 
     preset: str = "people"
     windows: WindowSpec = field(default_factory=WindowSpec)
@@ -142,79 +112,9 @@ class RunConfig:
     anywhere: AnywhereSpec = field(default_factory=AnywhereSpec)
     augment_given: bool = False
 
-    @property
-    def trained_on(self) -> WindowSpec:
-        """Settings of the training windows."""
-        return replace(self.windows, context=self.evaluation.train_context or self.windows.context)
-
-    @property
-    def scored_on(self) -> WindowSpec:
-        """Settings of the scored windows; the context "stream" (gestures with their real past) replaces "anywhere"."""
-        return replace(self.windows, context="stream") if self.windows.context == ANYWHERE else self.windows
-
-    @property
-    def holds_back(self) -> bool:
-        """Whether an evaluation holds people back for validation: not if nothing depends on them."""
-        return self.training.patience is not None or not parse_split(self.evaluation.split).separates_people
-
-    @property
-    def padding(self) -> str:
-        """The padding of ``model``, or if that is None, of the preset."""
-        return self.model.padding or PADDING[self.preset]
-
-    def for_layout(self, layout: Layout) -> RunConfig:
-        """Return the settings with the default network for a layout, its filters and augmentations, where not given.
-
-        With the preset ``people`` and a layout of vectors alone, one of them an acceleration, that is a network with a
-        vector layer. Beside other sensors it was no better (on the virtual toy; no real recordings were at hand).
-        Kernels of default networks last as long at any rate.
-        """
-        axes = {axis for vector in layout.vectors for axis in vector}
-        turns = layout.has_gravity and set(layout.inputs) <= axes
-        fits = self.preset == "people" and self.padding == "stream"
-        default = VECTOR_SYMBOL if turns and fits else DEFAULT_SYMBOL
-        arch = self.model.arch or symbol_at_rate(default, layout.rate_hz)
-        model = replace(self.model, arch=arch, filters=self.model.filters or default_filters(arch))
-        training = self.training
-        by_preset = not self.augment_given and training.augment == PRESETS["people"].augment
-        if parse_symbol(arch).vector is not None and by_preset:
-            training = replace(training, augment=VECTOR_AUGMENT)
-        return replace(self, model=model, training=training)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON, as a bundle stores them."""
-        values = asdict(self) | {"training": self.training.to_dict()}
-        del values["augment_given"]
-        return values
-
-    def changes(self, layout: Layout) -> dict[str, Any]:
-        """Return the settings of windows, network and training that differ from the preset's for this network.
-
-        The symbol of the network, its filters and padding, the context and the seed are left out.
-        """
-        told = ("arch", "filters", "padding", "seed", "context")
-        network = {key: getattr(self.model, key) for key in ("arch", "filters", "padding")}
-        usual = resolve(model=network, training={"preset": self.preset}).for_layout(layout).outcome()
-        return {
-            key: value
-            for table in ("windows", "model", "training")
-            for key, value in self.outcome()[table].items()
-            if value != usual[table].get(key) and key not in told
-        }
-
-    def outcome(self) -> dict[str, Any]:
-        """Return the settings that an evaluation's scores depend on, as plain values for JSON."""
-        evaluation = asdict(self.evaluation) | {"train_context": self.trained_on.context}
-        del evaluation["workers"]
-        training = {k: v for k, v in self.training.key().items() if k not in ("device", "threads")}
-        anywhere = {"anywhere": asdict(self.anywhere)} if self.trained_on.context == ANYWHERE else {}
-        return {
-            **anywhere,
-            "windows": asdict(self.windows),
-            "model": asdict(self.model) | {"padding": self.padding},
-            "training": training,
-            "evaluation": evaluation,
-        }
+    def for_split(self, split: str) -> RunConfig:
+        """Return the settings with another split."""
+        return replace(self, evaluation=replace(self.evaluation, split=split))
 
 
 @dataclass(frozen=True)

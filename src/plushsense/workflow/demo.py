@@ -20,7 +20,7 @@ from plushsense.runtime.classifier import StreamClassifier
 from plushsense.workflow.api import evaluate, import_simulation, simulate, train
 from plushsense.workflow.config import resolve
 from plushsense.workflow.export import export
-from plushsense.workflow.preparation import silent
+from plushsense.workflow.preparation import prepare, silent
 from plushsense.workflow.reporting import write_report
 
 SIMULATION = "These scores are of a simulation (the virtual toy) and say nothing about a real toy."
@@ -64,7 +64,7 @@ def run_demo(out: Path, *, quick: bool = False, stage: Stage, progress: Progress
     stage(f"1/6  {size.people} virtual people record {size.repetitions} × 17 gestures, and the recordings are imported")
     dataset = _dataset(out / f"dataset-{name}", out / f"recordings-{name}", size, progress)
     config = resolve(None, training={"epochs": size.epochs, "halve_every": max(1, size.epochs // 4)})
-    arch = config.for_layout(dataset.layout).model.arch
+    arch = prepare(dataset, config).model.arch
     stage(f"2/6  train {arch} on {len(dataset.subjects)} people, some of them for validation")
     trained = train(dataset, config, progress=lambda epoch, epochs, _: progress("training", epoch, epochs), warn=silent)
     bundle = trained.save(out / "model.plush")

@@ -26,15 +26,13 @@ from plushsense.deploy.quantize import calibrated, integer_model, refuse_undeplo
 from plushsense.evaluation.crossval import fold_windows
 from plushsense.models.bundle import Bundle, is_training_content
 from plushsense.runtime.image import image_check, patch_bytes, refuse_image
-from plushsense.scoring.splits import parse_split
 from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
 from plushsense.workflow.config import RunConfig, from_settings
 from plushsense.workflow.preparation import (
     WHOLE_PEOPLE,
     Warn,
-    classes_for,
-    network_inputs_of,
+    prepare,
     silent,
     windows_for,
 )
@@ -201,23 +199,21 @@ def save_windows(
         MissingExtraError: if SciPy is not installed.
     """
     path = Path(path)
-    dataset, config = network_inputs_of(as_dataset(dataset), config or from_settings(**settings))
-    division = parse_split(split or config.evaluation.split)
+    given = config or from_settings(**settings)
     if path.suffix != ".mat":
         raise ConfigError(f"'{path}' is no name of a MATLAB file: give one that ends in .mat.")
     if path.exists() and not overwrite:
         raise ConfigError(f"'{path}' exists already: give the name of a new file, or replace it with --force.")
-    gestures = classes_for(dataset, config.evaluation.classes, config.scored_on.context, warn)
-    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
-    windows = windows_for(dataset, network, config.scored_on, gestures, warn)
-    folds = fold_windows(windows, windows, division, config.evaluation.seed)
+    run = prepare(dataset, given if split is None else given.for_split(split), warn)
+    windows = run.scored_windows(warn)
+    folds = fold_windows(windows, windows, run.split, run.evaluation.seed)
     if len(folds) > 1:
         raise ConfigError(
-            f"The split '{division.text}' has {len(folds)} folds, and a file of windows one: give windows:file-order, "
+            f"The split '{run.split.text}' has {len(folds)} folds, and a file of windows one: give windows:file-order, "
             "windows:holdout, recordings:holdout, recordings:random or saved."
         )
     values = windows.x.astype(np.float64)
-    variables: dict[str, Any] = {"c": cells(windows.labels), SIMULATED: dataset.head.simulated}
+    variables: dict[str, Any] = {"c": cells(windows.labels), SIMULATED: run.dataset.head.simulated}
     sizes = {}
     for name, data, labels in SETS:
         mine = getattr(folds[0], name)
@@ -229,7 +225,7 @@ def save_windows(
             variables[labels.replace("labels", "recordings")] = cells(ids)
     content = mat_bytes(variables)
     try:
-        with dataset.generation.writing():
+        with run.dataset.generation.writing():
             path.parent.mkdir(parents=True, exist_ok=True)
             write_file(path, content)
     except OSError as cause:

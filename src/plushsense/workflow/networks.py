@@ -10,16 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plushsense.core.gestures import GestureSet
-from plushsense.dataset.store import Dataset
 from plushsense.deploy.quantize import calibration
 from plushsense.evaluation.crossval import EpochProgress, windows_fingerprint
 from plushsense.jobs.journal import Journal, job_id, keep_if_possible
 from plushsense.models.arch import Arch
 from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import WindowSet
-from plushsense.workflow.config import RunConfig
-from plushsense.workflow.preparation import add_hard_negatives, outside_streams
+from plushsense.workflow.preparation import Run, add_hard_negatives, outside_streams
 
 if TYPE_CHECKING:
     from plushsense.training.engine import FitState
@@ -92,10 +89,7 @@ class NetworkTrainer:
         progress: as for `fit`.
     """
 
-    dataset: Dataset
-    config: RunConfig
-    network: Arch
-    gestures: GestureSet
+    run: Run
     windows: WindowSet
     by_people: bool
     quantize_aware: int
@@ -114,7 +108,7 @@ class NetworkTrainer:
         """
         from plushsense.training.fit import fit
 
-        spec, network = self.config.training, self.network
+        run, spec, network = self.run, self.run.training, self.run.network
 
         def reporting(*names: str) -> EpochProgress:
             def report(epoch: int, epochs: int, row: dict[str, Any]) -> None:
@@ -125,11 +119,11 @@ class NetworkTrainer:
 
         if self.by_people:
             # Decisions are fitted on whole streams of the others, which may contain recordings at rest.
-            at = at[outside_streams(self.windows, self.dataset, others)[at]]
+            at = at[outside_streams(self.windows, run.dataset, others)[at]]
         train_on = self.windows.take(at)
         if self.by_people:
             train_on = add_hard_negatives(
-                train_on, self.dataset, network, self.config.windows, self.config.anywhere, self.gestures, spec,
+                train_on, run.dataset, network, run.windows, run.anywhere, run.gestures, spec,
                 others, reporting(what, FIRST_NETWORK),
             )  # fmt: skip
         state = None if self.journal is None else ResumableTraining(self.journal, network, spec, train_on, watched)

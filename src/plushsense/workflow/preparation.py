@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,15 +12,28 @@ from numpy.typing import NDArray
 
 from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.core.gestures import NOBODY, GestureSet, merge_names
+from plushsense.core.layouts import Layout
 from plushsense.core.sentences import Sentence
 from plushsense.dataset.importing.proposals import median_gesture_s
+from plushsense.dataset.index import as_dataset
 from plushsense.dataset.quality.outliers import far_inputs
 from plushsense.dataset.store import UNKNOWN_SUBJECT, Dataset, RecordingInfo
 from plushsense.deploy.quantize import refuse_undeployable
 from plushsense.evaluation.crossval import fold_windows
-from plushsense.models.arch import Arch, parse_symbol, symbol_within
+from plushsense.jobs.journal import job_id
+from plushsense.models.arch import (
+    DEFAULT_FILTERS,
+    DEFAULT_SYMBOL,
+    VECTOR_FILTERS,
+    VECTOR_SYMBOL,
+    Arch,
+    parse_symbol,
+    symbol_at_rate,
+    symbol_within,
+)
+from plushsense.runtime.decisions import DecideSpec
 from plushsense.scoring.splits import VALIDATION_SHARE, Fold, Split, parse_split
-from plushsense.training.spec import TrainSpec
+from plushsense.training.spec import PADDING, PRESETS, VECTOR_AUGMENT, TrainSpec
 from plushsense.windows.anywhere import AnywhereSpec, add_idle_gesture, cut_anywhere, idle_candidates
 from plushsense.windows.cut import (
     ANYWHERE,
@@ -30,7 +44,7 @@ from plushsense.windows.cut import (
     cut_windows,
     shared_gestures,
 )
-from plushsense.workflow.config import ALL, SHARED, RunConfig
+from plushsense.workflow.config import ALL, SHARED, EvaluationSpec, ModelSpec, RunConfig
 
 Warn = Callable[[str], None]
 
@@ -39,17 +53,180 @@ def silent(_: str) -> None:
     """Ignore a warning."""
 
 
-def network_inputs_of(dataset: Dataset, config: RunConfig) -> tuple[Dataset, RunConfig]:
-    """Return the data set as the network of ``config`` reads it, and the settings with that network.
+@dataclass(frozen=True)
+class Run:
+    """Everything that a training or an evaluation needs, resolved once by `prepare`.
 
-    The data set has the inputs of the network and, if the classes are merged gestures, these gestures.
+    Attributes:
+        dataset: the data set as the network reads it: with its inputs and, if the classes are merged gestures, these.
+        gestures: the classes.
+        network: the network for the inputs and the number of classes.
+        model: the settings of ``network``, with symbol, filters and padding.
+        training: the settings of the training, with the augmentations.
+        windows: the settings of the windows (see `trained_on` and `scored_on`).
+        evaluation: its ``classes`` are labels if merged gestures were given.
     """
-    config = config.for_layout(dataset.layout)
-    dataset, classes = named_classes(dataset, config.evaluation.classes)
-    config = replace(config, evaluation=replace(config.evaluation, classes=classes))
-    if config.model.arch is not None and parse_symbol(config.model.arch).vector is not None:
+
+    dataset: Dataset
+    gestures: GestureSet
+    network: Arch
+    preset: str
+    windows: WindowSpec
+    model: ModelSpec
+    training: TrainSpec
+    evaluation: EvaluationSpec
+    live: DecideSpec
+    anywhere: AnywhereSpec
+
+    @property
+    def split(self) -> Split:
+        """The split of the evaluation."""
+        return parse_split(self.evaluation.split)
+
+    @property
+    def trained_on(self) -> WindowSpec:
+        """Settings of the training windows."""
+        return replace(self.windows, context=self.evaluation.train_context or self.windows.context)
+
+    @property
+    def scored_on(self) -> WindowSpec:
+        """Settings of the scored windows; the context "stream" (gestures with their real past) replaces "anywhere"."""
+        return replace(self.windows, context="stream") if self.windows.context == ANYWHERE else self.windows
+
+    @property
+    def holds_back(self) -> bool:
+        """Whether an evaluation holds people back for validation: not if nothing depends on them."""
+        return self.training.patience is not None or not self.split.separates_people
+
+    def training_windows(self, warn: Warn = silent) -> WindowSet:
+        """Cut the windows to train on (see `windows_for`)."""
+        return windows_for(self.dataset, self.network, self.trained_on, self.gestures, warn, self.anywhere)
+
+    def scored_windows(self, warn: Warn = silent) -> WindowSet:
+        """Cut the windows to score (see `windows_for`)."""
+        return windows_for(self.dataset, self.network, self.scored_on, self.gestures, warn)
+
+    def settings(self) -> dict[str, Any]:
+        """Return all settings as plain values for JSON."""
+        names = ("windows", "model", "training", "evaluation", "live", "anywhere")
+        tables = {name: asdict(getattr(self, name)) for name in names}
+        return {"preset": self.preset, **tables, "training": self.training.to_dict()}
+
+    def outcome(self) -> dict[str, Any]:
+        """Return the settings that an evaluation's scores depend on, as plain values for JSON."""
+        evaluation = asdict(self.evaluation) | {"train_context": self.trained_on.context}
+        del evaluation["workers"]
+        anywhere = {"anywhere": asdict(self.anywhere)} if self.trained_on.context == ANYWHERE else {}
+        return {
+            **anywhere,
+            "windows": asdict(self.windows),
+            "model": asdict(self.model),
+            "training": _outcome_of(self.training),
+            "evaluation": evaluation,
+        }
+
+    def changes(self) -> dict[str, Any]:
+        """Return the settings of windows, network and training that differ from the preset's for this network.
+
+        The symbol of the network, its filters and padding, the context and the seed are left out.
+        """
+        usual = {
+            "windows": asdict(WindowSpec()),
+            "model": asdict(ModelSpec()),
+            "training": _outcome_of(_augmented(PRESETS[self.preset], self.network.vector is not None)),
+        }
+        own = self.outcome()
+        apart = ("arch", "filters", "padding", "seed", "context")
+        return {
+            key: value
+            for table, values in usual.items()
+            for key, value in own[table].items()
+            if value != values.get(key) and key not in apart
+        }
+
+    @property
+    def id(self) -> str:
+        """Identifier of 20 hexadecimal digits of an evaluation, equal for equal settings and data."""
+        return job_id({"settings": self.outcome(), "data": self.dataset.hash})
+
+    @property
+    def name(self) -> str:
+        """Name of a folder for the evaluation: the main settings and the start of `id`."""
+        evaluation, model = self.evaluation, self.model
+        context = self.windows.context
+        if evaluation.train_context not in (None, context):
+            context = f"{evaluation.train_context}-to-{context}"
+        filters = "-".join(map(str, model.filters or ()))
+        parts = (evaluation.split.replace(":", "-"), str(model.arch), filters, str(model.padding), model.norm, context)
+        words = "_".join(parts) + f"_{self.preset}_e{self.training.epochs}_seed{self.training.seed}"
+        return f"{words[:180]}_{self.id[:8]}"
+
+
+def _outcome_of(training: TrainSpec) -> dict[str, Any]:
+    return {key: value for key, value in training.key().items() if key not in ("device", "threads")}
+
+
+def _augmented(training: TrainSpec, has_vectors: bool) -> TrainSpec:
+    """Return the settings of a training with the augmentations of a network with a vector layer, if it has one."""
+    usual = training.augment == PRESETS["people"].augment
+    return replace(training, augment=VECTOR_AUGMENT) if has_vectors and usual else training
+
+
+def network_for(config: RunConfig, layout: Layout) -> tuple[str, tuple[int, ...], str]:
+    """Return symbol, filters and padding of the network for a layout: those of ``config``, or the defaults.
+
+    With the preset ``people`` and a layout of vectors alone, one of them an acceleration, the default network has a
+    vector layer. Beside other sensors it was no better (on the virtual toy; no real recordings were at hand). Kernels
+    of default networks last as long at any rate.
+    """
+    padding = config.model.padding or PADDING[config.preset]
+    axes = {axis for vector in layout.vectors for axis in vector}
+    turns = layout.has_gravity and set(layout.inputs) <= axes
+    default = VECTOR_SYMBOL if turns and config.preset == "people" and padding == "stream" else DEFAULT_SYMBOL
+    symbol = config.model.arch or symbol_at_rate(default, layout.rate_hz)
+    usual = DEFAULT_FILTERS if parse_symbol(symbol).vector is None else VECTOR_FILTERS
+    return symbol, config.model.filters or usual, padding
+
+
+def prepare(dataset: Dataset | str | os.PathLike[str], config: RunConfig, warn: Warn = silent) -> Run:
+    """Choose the classes and the network for a data set, and all settings that depend on them.
+
+    With context "anywhere", there is a class for idleness.
+
+    Raises:
+        ArchError, DatasetError: for an invalid network, or fewer than two gestures.
+    """
+    dataset, classes = named_classes(as_dataset(dataset), config.evaluation.classes)
+    symbol, filters, padding = network_for(config, dataset.layout)
+    has_vectors = parse_symbol(symbol).vector is not None
+    if has_vectors:
         dataset = dataset.with_inputs(dataset.layout.for_vectors())
-    return dataset, config
+    layout, model = dataset.layout, config.model
+    gestures = classes_for(dataset, classes, config.evaluation.train_context or config.windows.context, warn)
+    network = Arch.parse(
+        symbol,
+        filters,
+        channels=layout.n_inputs,
+        classes=len(gestures),
+        padding=padding,
+        norm=model.norm,
+        window=layout.samples(config.windows.window_s),
+        step=layout.samples(model.step_s),
+        pool=None if model.pool_s is None else layout.samples(model.pool_s),
+        vectors=len(layout.vectors),
+    )
+    return Run(
+        dataset,
+        gestures,
+        network,
+        config.preset,
+        config.windows,
+        replace(model, arch=symbol, filters=filters, padding=padding),
+        config.training if config.augment_given else _augmented(config.training, has_vectors),
+        replace(config.evaluation, classes=classes),
+        config.live,
+        config.anywhere,
+    )
 
 
 def named_classes(dataset: Dataset, choice: str | Sequence[str]) -> tuple[Dataset, str | tuple[str, ...]]:
@@ -178,11 +355,11 @@ def add_hard_negatives(
     return with_hard_negatives(train, candidates, idle[0], reactions, arch, training, anywhere.hard_share, progress)
 
 
-def refuse_hard_negatives(config: RunConfig) -> None:
+def refuse_hard_negatives(run: Run) -> None:
     """Raise ConfigError for settings with which `train` would add hard negatives, and an evaluation would not."""
-    if config.trained_on.context == ANYWHERE and config.anywhere.hard_share:
+    if run.trained_on.context == ANYWHERE and run.anywhere.hard_share:
         raise ConfigError(
-            f"hard_share is {config.anywhere.hard_share:g}, but an evaluation trains without hard negatives: set it to "
+            f"hard_share is {run.anywhere.hard_share:g}, but an evaluation trains without hard negatives: set it to "
             "0, or score networks with them on whole streams with  plushsense stream-eval --split."
         )
 
@@ -293,7 +470,7 @@ def count_people(dataset: Dataset) -> int:
     return len({r.subject for r in dataset.used} - {NOBODY, UNKNOWN_SUBJECT})
 
 
-def refits(config: RunConfig, people: int) -> bool:
+def refits(config: RunConfig | Run, people: int) -> bool:
     """Return whether `api.train` trains a second time, on everybody: where whole people are held out for nothing else.
 
     With early stopping, the people who are held out determine when to stop.
@@ -301,7 +478,7 @@ def refits(config: RunConfig, people: int) -> bool:
     return people >= _FEWEST_APART and config.training.patience is None and config.preset != "search"
 
 
-def split_validation(windows: WindowSet, config: RunConfig, scored: WindowSet | None = None) -> TrainValidationSplit:
+def split_validation(windows: WindowSet, run: Run, scored: WindowSet | None = None) -> TrainValidationSplit:
     """Hold out people for validation; with fewer than three, recordings; with the preset ``search``, windows.
 
     Where the validation windows do not determine when to stop, ``refit`` asks for a second training on everybody.
@@ -310,9 +487,9 @@ def split_validation(windows: WindowSet, config: RunConfig, scored: WindowSet | 
     with other settings (default: ``windows``). Except with ``search``, no scored recording is trained on.
     """
     scored = windows if scored is None else scored
-    seed = config.evaluation.seed
-    stops = "" if config.training.patience is None else " but decided when to stop"
-    if config.preset == "search":
+    seed = run.evaluation.seed
+    stops = "" if run.training.patience is None else " but decided when to stop"
+    if run.preset == "search":
         split = parse_split("windows:holdout")
         fold = fold_windows(windows, scored, split, seed)[0]
         description = "15 % of the windows, drawn at random: leaky, windows of one recording are on both sides"
@@ -321,7 +498,7 @@ def split_validation(windows: WindowSet, config: RunConfig, scored: WindowSet | 
     if len(people) >= _FEWEST_APART:
         split = parse_split(f"by-subject:{min(len(people), round(1 / VALIDATION_SHARE))}")
         kind, description = WHOLE_PEOPLE, f"people who were not trained on{stops}: "
-        if refits(config, len(people)):
+        if refits(run, len(people)):
             description = "people who were held back from the first of two trainings: "
     else:
         recordings = len(np.unique(windows.recording))
@@ -332,41 +509,35 @@ def split_validation(windows: WindowSet, config: RunConfig, scored: WindowSet | 
     if split.separates_people:
         description += ", ".join(fold.subjects)
     rest = np.sort(np.concatenate([fold.train, fold.validation]))
-    return TrainValidationSplit(split, kind, description, fold, rest, fold.test, refits(config, len(people)))
+    return TrainValidationSplit(split, kind, description, fold, rest, fold.test, refits(run, len(people)))
 
 
 @dataclass(frozen=True)
 class PreparedTraining:
     """All that a single training starts from; ``scored`` are the windows of validation (see `split_validation`)."""
 
-    dataset: Dataset
-    config: RunConfig
-    gestures: GestureSet
-    network: Arch
+    run: Run
     windows: WindowSet
     scored: WindowSet
     division: TrainValidationSplit
 
 
 def prepare_training(
-    dataset: Dataset, config: RunConfig, warn: Warn = silent, *, deployable: bool = False
+    dataset: Dataset | str | os.PathLike[str], config: RunConfig, warn: Warn = silent, *, deployable: bool = False
 ) -> PreparedTraining:
-    """Choose the gestures and the network, cut the windows and divide them.
+    """Choose the gestures and the network, cut the windows and divide them; a ``train_context`` is ignored.
 
     Args:
         deployable: refuse a network that cannot run in 8 bits.
     """
-    dataset, config = network_inputs_of(dataset, config)
-    gestures = classes_for(dataset, config.evaluation.classes, config.windows.context, warn)
-    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
+    run = prepare(dataset, replace(config, evaluation=replace(config.evaluation, train_context=None)), warn)
     if deployable:
-        refuse_undeployable(network)
-    warn_of_files_twice(dataset, gestures, warn)
-    windows = windows_for(dataset, network, config.windows, gestures, warn, config.anywhere)
-    scored = windows
-    if config.scored_on != config.windows:
-        scored = windows_for(dataset, network, config.scored_on, gestures)
-    division = split_validation(windows, config, scored)
-    if config.windows.context == ANYWHERE and config.anywhere.hard_share and division.kind != WHOLE_PEOPLE:
+        refuse_undeployable(run.network)
+    warn_of_files_twice(run.dataset, run.gestures, warn)
+    windows = scored = run.training_windows(warn)
+    if run.scored_on != run.trained_on:
+        scored = run.scored_windows()
+    division = split_validation(windows, run, scored)
+    if run.windows.context == ANYWHERE and run.anywhere.hard_share and division.kind != WHOLE_PEOPLE:
         warn("no hard negatives are added, as whole people must be held out for that: record three people or more")
-    return PreparedTraining(dataset, config, gestures, network, windows, scored, division)
+    return PreparedTraining(run, windows, scored, division)

@@ -12,17 +12,16 @@ from typing import Any
 
 from plushsense.core.errors import BadInput, BundleError, ConfigError
 from plushsense.core.files import write_file
-from plushsense.core.layouts import Layout
 from plushsense.core.version import __version__
 from plushsense.dataset.files import CACHE
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.crossval import Evaluation
-from plushsense.jobs.journal import Journal, job_id
+from plushsense.jobs.journal import Journal
 from plushsense.models.arch import Arch
 from plushsense.models.bundle import Bundle
 from plushsense.reports.table import text
-from plushsense.workflow.config import RunConfig
+from plushsense.workflow.preparation import Run
 
 
 def check_folder(out: Path, name: str) -> None:
@@ -98,12 +97,7 @@ def machine(*more: str) -> str:
 SCORES, PREDICTIONS, PAGE, LEARNING = "evaluation.json", "predictions.parquet", "report.html", "learning.json"
 
 
-def evaluation_id(config: RunConfig, dataset: Dataset) -> str:
-    """Return an identifier of 20 hexadecimal digits, equal for equal settings and data."""
-    return job_id({"settings": config.for_layout(dataset.layout).outcome(), "data": dataset.hash})
-
-
-def check_place(out: Path, config: RunConfig, dataset: Dataset, *, replace: bool = False) -> None:
+def check_place(out: Path, run: Run, *, replace: bool = False) -> None:
     """Check before the training that an evaluation can be written to a folder.
 
     Raises:
@@ -118,10 +112,10 @@ def check_place(out: Path, config: RunConfig, dataset: Dataset, *, replace: bool
     if replace or not path.exists():
         return
     earlier = _evaluation_table(path)
-    if earlier.get("id") == evaluation_id(config, dataset):
+    if earlier.get("id") == run.id:
         return
     data = earlier.get("dataset")
-    other = isinstance(data, Mapping) and data.get("hash") != dataset.hash
+    other = isinstance(data, Mapping) and data.get("hash") != run.dataset.hash
     raise ConfigError(
         f"'{out}' contains an evaluation of {'other data' if other else 'other settings'} "
         f"({earlier.get('split', 'no split')}, {earlier.get('title', 'no title')}): choose another --out, or --force "
@@ -130,7 +124,7 @@ def check_place(out: Path, config: RunConfig, dataset: Dataset, *, replace: bool
     )
 
 
-def save_evaluation(result: Evaluation, dataset: Dataset, config: RunConfig, arch: Arch, out: Path) -> Path:
+def save_evaluation(result: Evaluation, run: Run, out: Path) -> Path:
     """Write ``predictions.parquet`` and ``evaluation.json`` (scores, data set, network, settings) to a folder."""
     out.mkdir(parents=True, exist_ok=True)
     # `forget` finds the people in the scores, so that new predictions must never lie beside scores of other people.
@@ -139,13 +133,13 @@ def save_evaluation(result: Evaluation, dataset: Dataset, config: RunConfig, arc
     content = {
         **result.to_dict(),
         "predictions": PREDICTIONS,
-        "id": evaluation_id(config, dataset),
-        "simulated": dataset.head.simulated,
-        "validation_decides": config.training.patience is not None,
-        "title": evaluation_title(result, arch, config, dataset.layout),
-        "model": card(arch, rate_hz=dataset.layout.rate_hz),
-        "dataset": dataset.summary(),
-        "config": config.to_dict(),
+        "id": run.id,
+        "simulated": run.dataset.head.simulated,
+        "validation_decides": run.training.patience is not None,
+        "title": evaluation_title(result, run),
+        "model": card(run.network, rate_hz=run.dataset.layout.rate_hz),
+        "dataset": run.dataset.summary(),
+        "config": run.settings(),
         "code_version": __version__,
     }
     path = out / SCORES
@@ -153,16 +147,16 @@ def save_evaluation(result: Evaluation, dataset: Dataset, config: RunConfig, arc
     return path
 
 
-def evaluation_title(result: Evaluation, arch: Arch, config: RunConfig, layout: Layout) -> str:
+def evaluation_title(result: Evaluation, run: Run) -> str:
     """Return a title with network, split, contexts, preset, seed, and the settings that differ from the preset's."""
     context = f"{result.context} context"
     if result.train_context != result.context:
         context += f", trained on {result.train_context}"
     training = ", ".join(
-        [f"{config.preset} training, seed {config.training.seed}"]
-        + [f"{key} {text(value)}" for key, value in config.changes(layout).items()]
+        [f"{run.preset} training, seed {run.training.seed}"]
+        + [f"{key} {text(value)}" for key, value in run.changes().items()]
     )
-    return f"{arch.title} {arch.padding}, {result.split.text}, {context}, {training}"
+    return f"{run.network.title} {run.network.padding}, {result.split.text}, {context}, {training}"
 
 
 def card(arch: Arch, **more: Any) -> dict[str, Any]:
@@ -286,16 +280,3 @@ def _evaluation_table(source: Evaluation | Mapping[str, Any] | str | os.PathLike
     # The title names the network, and the model card shows its numbers.
     table.pop("model", None)
     return table
-
-
-def name_of(config: RunConfig, dataset: Dataset) -> str:
-    """Return a folder name for an evaluation: the main settings and the start of `evaluation_id`."""
-    config = config.for_layout(dataset.layout)
-    evaluation, model = config.evaluation, config.model
-    context = config.windows.context
-    if evaluation.train_context not in (None, context):
-        context = f"{evaluation.train_context}-to-{context}"
-    filters = "-".join(map(str, model.filters or ()))
-    parts = (evaluation.split.replace(":", "-"), str(model.arch), filters, config.padding, model.norm, context)
-    words = "_".join(parts) + f"_{config.preset}_e{config.training.epochs}_seed{config.training.seed}"
-    return f"{words[:180]}_{evaluation_id(config, dataset)[:8]}"

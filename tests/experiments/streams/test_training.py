@@ -12,18 +12,15 @@ import plushsense as ps
 from plushsense.core.errors import ConfigError
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import Dataset
-from plushsense.evaluation.crossval import fold_windows
-from plushsense.experiments.abstention import _without_other_people
 from plushsense.experiments.streams.run import TrainStreams, recipes_for
 from plushsense.experiments.streams.score import PeopleFold
 from plushsense.experiments.streams.systems import ANYWHERE, WINDOWS
-from plushsense.scoring.splits import parse_split
 from plushsense.training import fit as fitting
 from plushsense.trials.budget import make_network
 from plushsense.trials.estimate import preview_evaluation
 from plushsense.windows.cut import WindowSet
 from plushsense.workflow.config import from_settings
-from plushsense.workflow.preparation import outside_streams, windows_for
+from plushsense.workflow.preparation import outside_streams, prepare
 
 
 @pytest.fixture
@@ -55,9 +52,10 @@ def owners(dataset: Dataset, windows: WindowSet) -> set[str]:
 
 
 def test_a_fold_of_the_benchmark(rested: Dataset, trained: list[WindowSet], tmp_path: Path) -> None:
-    config = from_settings(filters=(4, 4, 4), epochs=2, classes="all", hard_share=0.15)
+    run = prepare(rested, from_settings(filters=(4, 4, 4), epochs=2, classes="all", hard_share=0.15))
     fold = PeopleFold("fold 1", ("P1", "P2", "P3"), ("P4",), ("P5",))
-    TrainStreams(recipes_for(rested, config, {WINDOWS, ANYWHERE}, None), False, tmp_path)(rested, fold, lambda *_: None)
+    recipes = recipes_for(run.dataset, run, {WINDOWS, ANYWHERE}, None)
+    TrainStreams(recipes, False, tmp_path)(run.dataset, fold, lambda *_: None)
     # Gestures, anywhere without hard negatives, anywhere with them.
     assert len(trained) == 3
     for windows in trained:
@@ -84,23 +82,8 @@ def test_a_training_anywhere_adds_hard_negatives_of_the_training_people(
         assert owners(rested, first) == owners(rested, second) == theirs
 
 
-def test_a_fold_of_abstaining(rested: Dataset) -> None:
-    config = from_settings()
-    gestures = rested.gestures
-    arch = config.model.build(rested.layout, len(gestures), config.windows.window_s, config.padding)
-    windows = windows_for(rested, arch, config.windows, gestures)
-    for fold in fold_windows(windows, windows, parse_split("by-subject:3"), 0):
-        apart = _without_other_people(fold, windows, rested)
-        heard = set(windows.subject[np.concatenate([fold.validation, fold.test])].tolist()) - {NOBODY}
-        assert owners(rested, windows.take(fold.train)) & heard  # it would be otherwise
-        assert owners(rested, windows.take(apart.train)) and not owners(rested, windows.take(apart.train)) & heard
-        assert apart.test.tolist() == fold.test.tolist()
-
-
 def test_what_lies_in_no_stream_of_theirs(dataset: Dataset) -> None:
-    config = from_settings()
-    arch = config.model.build(dataset.layout, 3, config.windows.window_s, config.padding)
-    windows = windows_for(dataset, arch, config.windows, dataset.gestures)
+    windows = prepare(dataset, from_settings(classes="all")).scored_windows()
     assert (outside_streams(windows, dataset, {"P1", "P3"}) == ~np.isin(windows.subject, ["P1", "P3"])).all()
     assert outside_streams(windows, dataset, set()).all()
 

@@ -42,7 +42,7 @@ from plushsense.training.spec import TrainSpec
 from plushsense.windows.cut import ANYWHERE, WindowSet
 from plushsense.windows.features import Scaler
 from plushsense.workflow.config import RunConfig, from_settings
-from plushsense.workflow.preparation import Warn, choose_classes, network_inputs_of, windows_for
+from plushsense.workflow.preparation import Run, Warn, prepare
 from plushsense.workflow.reporting import check_results, journal_of, machine
 
 SPLITS = ("leave-one-subject-out", "windows:5")
@@ -181,14 +181,13 @@ class ComparisonSpec:
                 yield f"left out: {BASELINES[name].title} on {view} windows {how} PCA, which takes too long"
 
 
-def contenders(
-    spec: ComparisonSpec, config: RunConfig, arch: Arch, dataset: Dataset, windows: WindowSet, inputs: Sequence[str]
-) -> list[Contender]:
-    """Return the requested programs for `compare`; all use the seed of ``config.training``.
+def contenders(spec: ComparisonSpec, run: Run, windows: WindowSet, inputs: Sequence[str]) -> list[Contender]:
+    """Return the requested programs for `compare`; all use the seed of ``run.training``.
 
     All read as many samples as our network; only it reads inputs that are not in ``inputs``.
     """
-    models, training, samples = chosen(spec.models), config.training, arch.span
+    arch = run.network
+    models, training, samples = chosen(spec.models), run.training, arch.span
     made = classical([m for m in models if m in BASELINES], spec.features, PCA[spec.pca], samples, training.seed)
     recurrent_names = [m for m in models if _kind(m) in RECURRENT]
     if NETWORK in models or recurrent_names:
@@ -203,8 +202,8 @@ def contenders(
     if NETWORK in models:
         key = {"arch": arch.to_dict(), "training": training.key(), "vectors": vectors}
         title = f"{arch.title} {arch.padding} (ours)"
-        gestures = dataset.gestures.subset(windows.labels)
-        network = NetworkFit(arch, training, dataset.layout, gestures)
+        gestures = run.gestures
+        network = NetworkFit(arch, training, run.dataset.layout, gestures)
         made.append(Contender(NETWORK, title, "windows", False, network, key, samples))
     return made
 
@@ -235,25 +234,24 @@ def baselines(
     """
     spec, dataset = spec or ComparisonSpec(), as_dataset(dataset)
     inputs = dataset.layout.inputs
-    dataset, config = network_inputs_of(dataset, config or from_settings(**settings))
-    if config.windows.context == ANYWHERE:
+    given = config or from_settings(**settings)
+    if given.windows.context == ANYWHERE:
         raise ConfigError("Programs are compared on windows of gestures: choose the context stream or loop.")
-    identity = comparison_id(dataset, config, spec)
+    run = prepare(dataset, given, warn)
+    dataset, identity = run.dataset, comparison_id(run, spec)
     if out is not None:
         need("matplotlib", extra="reports")
         need("jinja2", extra="reports")
         check_results(Path(out), "A comparison", TABLE, identity, replace=overwrite)
-    gestures = choose_classes(dataset, config.evaluation.classes, warn)
-    network = config.model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
-    windows = windows_for(dataset, network, config.windows, gestures, warn)
+    windows = run.scored_windows(warn)
     for sentence in spec.too_long(chosen(spec.models)):
         warn(sentence)
     compared = compare(
         windows,
-        contenders(spec, config, network, dataset, windows, inputs),
+        contenders(spec, run, windows, inputs),
         spec.splits,
-        spec=JobsSpec(config.evaluation.processes, journal=journal_of(dataset, "baselines"), cluster=cluster),
-        seed=config.evaluation.seed,
+        spec=JobsSpec(run.evaluation.processes, journal=journal_of(dataset, "baselines"), cluster=cluster),
+        seed=run.evaluation.seed,
         progress=progress,
     )
     result = BaselinesResult(
@@ -261,9 +259,9 @@ def baselines(
         dataset=dataset.head.name,
         dataset_hash=dataset.hash,
         simulated=dataset.head.simulated,
-        preset=config.preset,
-        training=config.training.to_dict(),
-        window_s=config.windows.window_s,
+        preset=run.preset,
+        training=run.training.to_dict(),
+        window_s=run.windows.window_s,
         id=identity,
         machine=machine("one thread a program", f"Python {platform.python_version()}"),
         code_version=__version__,
@@ -274,17 +272,17 @@ def baselines(
     return result
 
 
-def comparison_id(dataset: Dataset, config: RunConfig, spec: ComparisonSpec) -> str:
+def comparison_id(run: Run, spec: ComparisonSpec) -> str:
     """Return an identifier of 20 hexadecimal digits, equal for equal settings and data.
 
     Raises:
         ConfigError: for an unknown setting.
     """
-    outcome = {key: value for key, value in config.for_layout(dataset.layout).outcome().items() if key != "evaluation"}
-    outcome |= {"seed": config.evaluation.seed, "classes": config.evaluation.classes}
+    outcome = {key: value for key, value in run.outcome().items() if key != "evaluation"}
+    outcome |= {"seed": run.evaluation.seed, "classes": run.evaluation.classes}
     outcome |= {"splits": [parse_split(text).text for text in spec.splits], "models": chosen(spec.models)}
     outcome |= {"features": list(spec.features), "pca": spec.pca}
-    return job_id({"settings": outcome, "data": dataset.hash})
+    return job_id({"settings": outcome, "data": run.dataset.hash})
 
 
 def save_baselines(result: BaselinesResult, out: Path) -> None:

@@ -66,13 +66,14 @@ from plushsense.windows.anywhere import AnywhereSpec
 from plushsense.windows.cut import WindowSpec
 from plushsense.workflow.config import SHARED, RunConfig, from_settings
 from plushsense.workflow.preparation import (
+    Run,
     Warn,
     add_hard_negatives,
     choose_classes,
     classes_for,
     named_classes,
-    network_inputs_of,
     outside_streams,
+    prepare,
     silent,
     windows_for,
 )
@@ -160,7 +161,7 @@ class TrainStreams:
 
 
 def recipes_for(
-    dataset: Dataset, config: RunConfig, networks: Collection[str], anywhere_pool_s: float | None, warn: Warn = silent
+    dataset: Dataset, run: Run, networks: Collection[str], anywhere_pool_s: float | None, warn: Warn = silent
 ) -> dict[str, Recipe]:
     """Return the recipe of each network in ``networks``; they differ in windows, classes, epochs and perhaps the pool.
 
@@ -168,25 +169,22 @@ def recipes_for(
     """
     from plushsense.training.fit import resolve_device
 
-    if config.padding != "stream":
-        raise ConfigError(f"A network with {config.padding} padding cannot follow a stream: use --padding stream.")
-    training = resolve_device(config.training)
-    classes, recipes = config.evaluation.classes, dict[str, Recipe]()
+    if run.network.padding != "stream":
+        raise ConfigError(f"A network with {run.network.padding} padding cannot follow a stream: use --padding stream.")
+    training = resolve_device(run.training)
+    classes, recipes = run.evaluation.classes, dict[str, Recipe]()
     if WINDOWS in networks:
         gestures = choose_classes(dataset, classes, warn)
-        windows = replace(
-            config.windows, context="stream" if config.windows.context == "anywhere" else config.windows.context
-        )
-        arch = config.model.build(dataset.layout, len(gestures), windows.window_s, config.padding)
-        recipes[WINDOWS] = Recipe(arch, training, windows, gestures)
+        arch = replace(run.network, classes=len(gestures))
+        recipes[WINDOWS] = Recipe(arch, training, run.scored_on, gestures)
     if ANYWHERE in networks:
         gestures = classes_for(dataset, classes, "anywhere", warn if WINDOWS not in networks else silent)
-        model = config.model if anywhere_pool_s is None else replace(config.model, pool_s=anywhere_pool_s)
-        arch = model.build(dataset.layout, len(gestures), config.windows.window_s, config.padding)
+        pool = run.network.pool if anywhere_pool_s is None else dataset.layout.samples(anywhere_pool_s)
+        arch = replace(run.network, classes=len(gestures), pool=pool)
         halved = replace(training, epochs=-(-training.epochs // 2))
         if training.halve_every:
             halved = replace(halved, halve_every=-(-training.halve_every // 2))
-        recipes[ANYWHERE] = Recipe(arch, halved, replace(config.windows, context="anywhere"), gestures, config.anywhere)
+        recipes[ANYWHERE] = Recipe(arch, halved, replace(run.windows, context="anywhere"), gestures, run.anywhere)
     return recipes
 
 
@@ -452,15 +450,15 @@ def stream_benchmark(
     Returns:
         what `score.summed` returns, with ``dataset``, ``simulated``, ``split``, ``note`` and the settings.
     """
-    dataset, config = network_inputs_of(as_dataset(dataset), config or from_settings(**settings))
-    dataset = dataset if labels else dataset.without_stretches()
+    run = prepare(dataset, config or from_settings(**settings))
+    dataset = run.dataset if labels else run.dataset.without_stretches()
     names = _named(systems)
     if out is not None:
         need("matplotlib", extra="reports")
         need("jinja2", extra="reports")
         check_results(Path(out), "A benchmark", TABLE, replace=overwrite)
-    people_folds(dataset, split, config.evaluation.seed)  # raises before anything is trained
-    recipes = recipes_for(dataset, config, {SYSTEMS[n].network for n in names}, anywhere_pool_s, warn)
+    people_folds(dataset, split, run.evaluation.seed)  # raises before anything is trained
+    recipes = recipes_for(dataset, run, {SYSTEMS[n].network for n in names}, anywhere_pool_s, warn)
     networks = dataset.path / CACHE / "stream-networks"
     fit = TrainStreams(recipes, any(SYSTEMS[n].gate_to for n in names), networks)
     folds = crossvalidated_streams(
@@ -468,9 +466,9 @@ def stream_benchmark(
         split,
         fit,
         settings=Settings(names, late_s=late_s),
-        spec=JobsSpec(config.evaluation.processes, journal=journal_of(dataset, "streams")),
+        spec=JobsSpec(run.evaluation.processes, journal=journal_of(dataset, "streams")),
         key=fit.key(),
-        seed=config.evaluation.seed,
+        seed=run.evaluation.seed,
         progress=progress,
     )
     table = {
@@ -485,11 +483,11 @@ def stream_benchmark(
         "subjects": sorted({person for fold in folds for person in fold["test"]} & set(people_with_streams(dataset))),
         "code_version": __version__,
         **summed(folds),
-        "seed": config.evaluation.seed,
+        "seed": run.evaluation.seed,
         "networks": {name: recipe.arch.title for name, recipe in recipes.items()},
-        "anywhere": {"pool_s": anywhere_pool_s, **vars(config.anywhere)},
-        "preset": config.preset,
-        "training": config.training.to_dict(),
+        "anywhere": {"pool_s": anywhere_pool_s, **vars(run.anywhere)},
+        "preset": run.preset,
+        "training": run.training.to_dict(),
     }
     if out is not None:
         with dataset.generation.writing():

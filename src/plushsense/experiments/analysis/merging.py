@@ -9,11 +9,11 @@ with the merges of each person chosen on all other people.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tomli_w
@@ -25,6 +25,7 @@ from plushsense.core.gestures import AFFECT, NOBODY, Gesture, GestureSet, merge_
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.scores import Predictions, read_predictions
+from plushsense.experiments.analysis.results import Grouping, MergeResult, MergeStep
 from plushsense.scoring.metrics import column_metrics, confusion, summary
 from plushsense.workflow.reporting import PREDICTIONS, load_evaluation
 
@@ -34,6 +35,14 @@ Groups = tuple[tuple[int, ...], ...]
 Floats = NDArray[np.float64]
 
 
+class Merge(NamedTuple):
+    """The groups after a merge, with its confusion, and in how many people it occurs (None before the first)."""
+
+    groups: Groups
+    confusion: float | None
+    people: int | None
+
+
 def propose_merges(
     dataset: Dataset | str | os.PathLike[str],
     evaluation: str | os.PathLike[str],
@@ -41,7 +50,7 @@ def propose_merges(
     merges: int | None = None,
     groups: str | None = None,
     out: str | os.PathLike[str] | None = None,
-) -> dict[str, Any]:
+) -> MergeResult:
     """Merge the two groups of gestures that people's windows are most confused between, again and again.
 
     Only gestures of one affect are merged, and never one that is recorded without a person or means that nothing
@@ -53,15 +62,6 @@ def propose_merges(
         groups: the merged gestures to write instead: "family", "affect", a built-in merge, or a file, which is scored
             as well (see `GestureSet.merged_by`).
         out: a TOML file to write, for ``--classes`` of `train` and `evaluate`.
-
-    Returns:
-        ``steps``, one for each number of merges from 0: {merges, classes, merged (labels), confusion, people, largest,
-        scores, crossfitted}. ``confusion`` is the mean over people of the share of windows that the two groups of the
-        last merge exchanged, in ``people`` of them; ``largest`` the share of the most frequent class in the windows of
-        people; ``scores`` and ``crossfitted`` hold the summary of each metric over people, with merges chosen on all
-        people and on the others.
-        ``groupings``, one for each merge named beforehand that applies: {name, classes, merged, largest, scores};
-        nothing is chosen, so that nothing needs to be cross-fitted.
 
     Raises:
         BadInput: for an evaluation of other gestures; GestureError: for unknown ``groups``; ConfigError: for a number
@@ -81,42 +81,42 @@ def propose_merges(
         raise BadInput(f"'{folder}' has one person, but merges are chosen by several: evaluate more people.")
     counts = np.stack([_counts(predictions, predictions.subject == person) for person in people])
     path = merge_path(counts, gestures)
-    # Without a person, another order of merges may follow, of another length.
-    others = [merge_path(np.delete(counts, i, axis=0), gestures) for i in range(len(people))]
-    steps = []
-    for number, (merged, exchanged, confused) in enumerate(path):
-        chosen = [other[min(number, len(other) - 1)][0] for other in others]
-        steps.append(
-            {
-                "merges": number,
-                **_scored(predictions, people, merged),
-                "confusion": exchanged,
-                "people": confused,
-                "crossfitted": _scores(predictions, people, lambda i, chosen=chosen: chosen[i]),  # type: ignore[misc]
-            }
-        )
     named = _named(gestures, groups)
-    result = {
-        "steps": steps,
-        "groupings": [
-            {"name": name, **_scored(predictions, people, gestures.groups_of(merged))} for name, merged in named.items()
-        ],
-        "split": table["split"],
-        "leaky": table["leaky"],
-        "simulated": table["simulated"],
-        "people": len(people),
-        "gestures": None,
-    }
     if out is not None:
         if groups is not None:
             merged_set = named[groups]
         elif merges is not None and 0 < merges < len(path):
-            merged_set = gestures.merged(path[merges][0])
+            merged_set = gestures.merged(path[merges].groups)
         else:
             raise ConfigError(f"merges is {merges}: accepted are 1 to {len(path) - 1}, the steps that are possible.")
         write_file(Path(out), tomli_w.dumps(_without_defaults(merged_set)))
-        result["gestures"] = str(out)
-    return result
+    return MergeResult(
+        steps=_steps(predictions, people, counts, path, gestures),
+        groupings={n: _grouping(predictions, people, gestures.groups_of(merged)) for n, merged in named.items()},
+        split=table["split"],
+        leaky=table["leaky"],
+        simulated=table["simulated"],
+        people=len(people),
+        gestures=None if out is None else str(out),
+    )
+
+
+def _steps(
+    predictions: Predictions,
+    people: NDArray[np.str_],
+    counts: NDArray[np.int64],
+    path: Sequence[Merge],
+    gestures: GestureSet,
+) -> tuple[MergeStep, ...]:
+    """Score the groups of ``path``, with each person's merges chosen on all people, and on all others."""
+    # Without a person, another order of merges may follow, of another length.
+    others = [merge_path(np.delete(counts, i, axis=0), gestures) for i in range(len(people))]
+    steps = []
+    for number, merge in enumerate(path):
+        chosen = [other[min(number, len(other) - 1)].groups for other in others]
+        grouping = _grouping(predictions, people, merge.groups)
+        steps.append(MergeStep(grouping, _scores(predictions, people, chosen), merge.confusion, merge.people))
+    return tuple(steps)
 
 
 def _named(gestures: GestureSet, groups: str | None) -> dict[str, GestureSet]:
@@ -136,29 +136,29 @@ def _named(gestures: GestureSet, groups: str | None) -> dict[str, GestureSet]:
     return found
 
 
-def _scored(predictions: Predictions, people: NDArray[np.str_], groups: Groups) -> dict[str, Any]:
+def _grouping(predictions: Predictions, people: NDArray[np.str_], groups: Groups) -> Grouping:
     # Like the scores, of people only: recordings at rest would often be the largest class.
     truth = predictions.truth[np.isin(predictions.subject, people)]
     sizes = np.array([np.isin(truth, group).sum() for group in groups])
-    return {
-        "classes": len(groups),
-        "merged": [[predictions.labels[k] for k in group] for group in groups if len(group) > 1],
-        "largest": float(sizes.max() / sizes.sum()),
-        "scores": _scores(predictions, people, lambda _: groups),
-    }
+    return Grouping(
+        classes=len(groups),
+        merged=tuple(tuple(predictions.labels[k] for k in group) for group in groups if len(group) > 1),
+        largest=float(sizes.max() / sizes.sum()),
+        scores=_scores(predictions, people, [groups] * len(people)),
+    )
 
 
-def merge_path(counts: NDArray[np.int64], gestures: GestureSet) -> list[tuple[Groups, float | None, int | None]]:
+def merge_path(counts: NDArray[np.int64], gestures: GestureSet) -> list[Merge]:
     """Merge the most confused pair of groups until two are left, or none that may be merged and is confused.
 
     Args:
         counts: confusion matrices of the people, (people, K, K).
 
     Returns:
-        the groups after 0, 1, 2, … merges, with the confusion of the last merge, and in how many people it occurs.
+        the groups after 0, 1, 2, … merges.
     """
     groups: Groups = tuple((k,) for k in range(len(gestures)))
-    path: list[tuple[Groups, float | None, int | None]] = [(groups, None, None)]
+    path = [Merge(groups, None, None)]
     while len(groups) > 2:
         best: tuple[float, int, int, int] | None = None
         for a, b in combinations(range(len(groups)), 2):
@@ -172,7 +172,7 @@ def merge_path(counts: NDArray[np.int64], gestures: GestureSet) -> list[tuple[Gr
         mean, people, a, b = best
         joined = tuple(sorted((*groups[a], *groups[b])))
         groups = tuple(sorted([g for i, g in enumerate(groups) if i not in (a, b)] + [joined]))
-        path.append((groups, mean, people))
+        path.append(Merge(groups, mean, people))
     return path
 
 
@@ -203,11 +203,13 @@ def _counts(predictions: Predictions, mask: NDArray[np.bool_]) -> NDArray[np.int
     return confusion(predictions.truth[mask], predictions.predicted[mask], len(predictions.labels))
 
 
-def _scores(predictions: Predictions, people: NDArray[np.str_], groups_of: Callable[[int], Groups]) -> dict[str, Any]:
+def _scores(
+    predictions: Predictions, people: NDArray[np.str_], groups_of: Sequence[Groups]
+) -> dict[str, dict[str, Any]]:
     """Return the summary over people of each metric, with the groups of each person."""
     values: dict[str, list[float]] = {key: [] for key in column_metrics()}
-    for i, person in enumerate(people):
-        mine, groups = predictions.subject == person, groups_of(i)
+    for person, groups in zip(people, groups_of, strict=True):
+        mine = predictions.subject == person
         member = np.zeros((len(predictions.labels), len(groups)))
         for g, group in enumerate(groups):
             member[list(group), g] = 1

@@ -1,4 +1,4 @@
-"""``plushsense abstain`` and what ``train`` leaves in a bundle, on a small data set."""
+"""The decision settings that ``train`` fits and leaves in a bundle, on a small data set."""
 
 from __future__ import annotations
 
@@ -7,10 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 import plushsense as ps
-from plushsense.core.errors import ConfigError, DatasetError
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.dataset.store import Dataset
 from plushsense.runtime.decisions import DecideSpec
@@ -56,41 +53,11 @@ def test_where_nobody_is_held_back_the_defaults_stay_and_train_says_so(dataset: 
     assert any("decision settings are the defaults" in line for line in said)
 
 
-def test_abstain_withholds_gestures_and_goes_on_from_what_is_kept(cli: Cli, dataset: Dataset, tmp_path: Path) -> None:
-    words = ("abstain", dataset.path, "--split", "by-subject:2", *SMALL, "--workers", 1, "--out", tmp_path / "a")
-    ran = cli(*words, "--json")
-    assert ran.status == 0, ran.err
-    table = ran.json
-    assert table["people"] == 5 and table["recordings"] == 5 * 6
-    assert {row["confidence"] for row in table["confidences"]} >= {"softmax", "energy", "set size"}
-    assert all(-2 < row["gain"] <= 1 for row in table["confidences"] if row["gain"] is not None)
-    assert table["stated_coverage"]["by_person"]["n"] == 5
-    assert table["withheld"] == {} and table["free_choice"] is None
-    assert (tmp_path / "a" / "risk-coverage.png").read_bytes()[:4] == b"\x89PNG"
-    assert json.loads((tmp_path / "a" / "abstaining.json").read_text())["people"] == 5
-    more = cli(*words, "--withhold")
-    assert "training: 8 of 8 networks (2 from before)" in more.err
-    for label in ("Rest", "Slow", "Fast"):
-        assert label in more.out
-    again = cli(*words, "--withhold", "--json")
-    assert "training: 8 of 8 networks (8 from before)" in again.err
-    for row in again.json["withheld"].values():
-        assert (row["recordings"], row["folds"]) == (10, 2)
-        assert 0 <= row["auroc"]["logit"]["mean"] <= 1
-
-
-def test_what_cannot_be_asked_is_refused(dataset: Dataset, recordings: Path, tmp_path: Path) -> None:
-    from plushsense.experiments.abstention import abstaining
-
-    with pytest.raises(ConfigError, match="people apart"):
-        abstaining(dataset, split="windows:5")
+def test_without_a_stream_decisions_are_fitted_on_recordings(recordings: Path, tmp_path: Path) -> None:
     for person in ("P1", "P2", "P3"):
         (tmp_path / "src" / person).mkdir(parents=True)
         for file in (recordings / person).glob("*_*_*.csv"):
             (tmp_path / "src" / person / file.name).write_bytes(file.read_bytes())
     plain = import_recordings(tmp_path / "src", tmp_path / "plain", layout="accel-3").dataset
-    with pytest.raises(DatasetError, match="stream"):
-        abstaining(plain)
-    # Without a stream a bundle is fitted all the same, on recordings.
     fitted = ps.train(plain, epochs=1, filters=(4, 4, 4)).bundle.decision["fitted"]
     assert fitted["streams"] == 0 and "windows" in fitted["answers"]["on"]

@@ -13,8 +13,8 @@ from plushsense.core.errors import GestureError
 from plushsense.core.gestures import Gesture, GestureSet, load_gestures
 from plushsense.dataset.store import Dataset
 from plushsense.evaluation.scores import Predictions
-from plushsense.experiments.people import merging
-from plushsense.experiments.people.merging import merge_path
+from plushsense.experiments.analysis import merging
+from plushsense.experiments.analysis.merging import merge_path
 from plushsense.models.bundle import Bundle
 
 Cli = Callable[..., Any]
@@ -74,12 +74,12 @@ def test_the_largest_class_is_that_of_the_people_who_are_scored() -> None:
     read = np.eye(6, dtype=np.float32)[[0] * 6 + [3, 2, 2, 2]]
     predictions = Predictions(SET.labels, subject, window=truth, truth=truth, probabilities=read, **plain)
     people = np.array(["P1", "P2"])
-    alone = merging._scored(predictions, people, tuple((k,) for k in range(6)))
-    assert (alone["classes"], alone["largest"], alone["merged"]) == (6, 0.75, [])
-    assert alone["scores"]["accuracy"]["mean"] == 0.5
-    taps = merging._scored(predictions, people, SET.groups_of(SET.merged_by("family")))
-    assert (taps["classes"], taps["largest"], taps["merged"]) == (5, 1.0, [["Tap 1", "Tap 2"]])
-    assert taps["scores"]["accuracy"]["mean"] == 1.0
+    alone = merging._grouping(predictions, people, tuple((k,) for k in range(6)))
+    assert (alone.classes, alone.largest, alone.merged) == (6, 0.75, ())
+    assert alone.scores["accuracy"]["mean"] == 0.5
+    taps = merging._grouping(predictions, people, SET.groups_of(SET.merged_by("family")))
+    assert (taps.classes, taps.largest, taps.merged) == (5, 1.0, (("Tap 1", "Tap 2"),))
+    assert taps.scores["accuracy"]["mean"] == 1.0
     assert list(merging._named(SET, None)) == ["family", "affect"], "plush-13 merges nothing of these"
 
 
