@@ -11,6 +11,7 @@ from nicegui import run, ui
 
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import UNKNOWN_SUBJECT
+from plushsense.deploy.code import ModelFacts
 from plushsense.deploy.convert import CONVERTERS
 from plushsense.deploy.package import ARDUINO, IDF, IDF_EXAMPLE, SKETCH
 from plushsense.deploy.targets import TARGETS
@@ -99,9 +100,10 @@ def _missing_target(words: Words, title: str, packages: Sequence[str]) -> str:
 
 def show_facts(page: Page, export: ExportFacts, made: StudioJob | None) -> None:
     """Build the card with facts, files and download of an export; ``made`` is the job that wrote it, if known."""
-    words, card = page.words, export.facts
+    words, model = page.words, export.facts
+    assert model is not None
     with tag(ui.column().classes("ps-card w-full"), "export-facts"):
-        if card.get("simulated"):
+        if model.simulated:
             notice(words("shell.simulation"))
         for warning in made.warnings if made else ():
             notice(words.sentence(warning))
@@ -109,7 +111,7 @@ def show_facts(page: Page, export: ExportFacts, made: StudioJob | None) -> None:
         download = ui.link(words("export.download"), download_address(EXPORTS, export.name)).classes("ps-link")
         tag(download.props("download"), "download")
         with _folded(words("export.details")):
-            _list_facts(words, export)
+            _list_facts(words, export, model)
 
 
 def _folded(title: str) -> ui.element:
@@ -120,28 +122,27 @@ def _folded(title: str) -> ui.element:
     return box
 
 
-def _list_facts(words: Words, export: ExportFacts) -> None:
+def _list_facts(words: Words, export: ExportFacts, model: ModelFacts) -> None:
     """List the facts and the files of an export."""
-    card = export.facts
-    step = words.significant(card["step_ms"], 3)
+    step = words.significant(model.step_ms, 3)
     facts(
         [
-            (words("export.network"), str(card["title"])),
-            (words("export.gestures"), str(card["classes"])),
-            (words("export.layout"), str(card.get("layout", ""))),
-            (words("export.flash"), words("export.flash_value", n=words.count(export.flash_bytes))),
-            (words("export.ram"), words("export.ram_value", n=words.count(export.ram_bytes))),
+            (words("export.network"), model.title),
+            (words("export.gestures"), str(model.classes)),
+            (words("export.layout"), model.layout),
+            (words("export.flash"), words("export.flash_value", n=words.count(model.flash_bytes))),
+            (words("export.ram"), words("export.ram_value", n=words.count(model.ram_bytes))),
             (
                 words("export.step"),
-                words("export.step_value", ms=step, macs=words.count(card["macs_per_step"])),
+                words("export.step_value", ms=step, macs=words.count(model.macs_per_step)),
             ),
             (words("export.made"), moment(export.made_s)),
             (words("export.place"), str(export.folder)),
         ]
     )
-    for name, each in card.get("conversions", {}).items():
-        apart = each.get("largest_difference")
-        message = words("export.converted", file=each["file"], n=words.count(each["bytes"]), name=name)
+    for name, each in model.conversions.items():
+        apart = each.largest_difference
+        message = words("export.converted", file=each.file, n=words.count(each.bytes), name=name)
         text(message if apart is None else f"{message} {words('export.apart', d=words.significant(apart, 1))}")
     with ui.expansion(
         words("export.files", n=len(export.files), size=size(sum(export.files.values()), words))
@@ -507,8 +508,8 @@ class _Exporting:
             rows.append(
                 (
                     link(each.name, address("export", name=each.name)),
-                    words.sentence(each.problem) if each.problem else str(each.facts["title"]),
-                    words("export.simulation_short") if each.facts.get("simulated") else "",
+                    each.facts.title if each.facts else words.sentence(each.problem) if each.problem else "",
+                    words("export.simulation_short") if each.facts and each.facts.simulated else "",
                     moment(each.made_s) if each.made_s else "",
                     verification_verdict(words, each, proof),
                 )
