@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 
 from plushsense.core.layouts import load_layout
 from plushsense.core.recorder_csv import STREAM_NAME, Frames
-from plushsense.deploy.golden import answers_by_block
+from plushsense.deploy.golden import ToyRows
 from plushsense.deploy.quantize import integer_model
 from plushsense.devices.opening import open_device
 from plushsense.live.loop import run_live
@@ -243,7 +243,8 @@ def chip(work: Path, hours: float, model: Path, python_hours: float = float("inf
             part[:, 0] = (part[:, 0] + shift) % WRAP
             yield part
 
-    wanted = answers_by_block(deployed, blocks(compared // BLOCK * BLOCK))
+    python = ToyRows(deployed)
+    wanted = map(python.read, blocks(compared // BLOCK * BLOCK))
     for number, frames in enumerate(blocks(count)):
         began = time.process_time()
         expected = next(wanted, None)

@@ -15,7 +15,8 @@ from opponents.case import Case
 from opponents.tables import LOOPS_ROW, ONNX2C_ROW, OUR_ROW, PLAIN_ROW, WHOLE_ROW
 
 from plushsense.deploy import profile
-from plushsense.deploy.emit import emit, read_facts
+from plushsense.deploy.code import read_facts
+from plushsense.deploy.emit import emit
 from plushsense.deploy.targets import build
 
 HERE = Path(__file__).resolve().parent

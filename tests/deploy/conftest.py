@@ -14,7 +14,6 @@ import pytest
 
 from plushsense.dataset.importing.importers import import_recordings
 from plushsense.deploy.emit import emit
-from plushsense.deploy.package import package
 from plushsense.deploy.quantize import integer_model
 from plushsense.runtime.image import IntegerModel
 from support.c_toy import C_FOLDER, TOY_C, compiled
@@ -151,7 +150,7 @@ def packages(tmp_path_factory: pytest.TempPathFactory, needs: Callable[..., None
     for layout in LAYOUTS:
         bundle = bundle_of(layout, window=60)
         model = integer_model(bundle)
-        write = partial(emit, model, bundle, extras=[package])
+        write = partial(emit, model, bundle)
         made = built_once(tmp_path_factory, f"packages-{layout}", lambda draft, write=write: write(draft / "out"))
         found[layout] = made / "out", model
     return found

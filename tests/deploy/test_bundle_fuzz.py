@@ -13,7 +13,7 @@ import numpy as np
 
 from plushsense.core.errors import PlushSenseError, printable
 from plushsense.core.gestures import load_gestures
-from plushsense.deploy.emit import IMAGE, code_files, facts_of
+from plushsense.deploy.code import IMAGE, code_files, facts_of
 from plushsense.deploy.golden import answers_of, golden_frames
 from plushsense.deploy.package import firmware, handbook
 from plushsense.deploy.quantize import classifier_of, integer_model

@@ -7,6 +7,7 @@ import os
 import re
 import struct
 import subprocess
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,12 @@ from typing import Any
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 TESTS = Path(__file__).parents[1]
 
 
-from plushsense.deploy.golden import EVENT, FAULT, HEALTH, answers_of, answers_over_swaps, column
+from plushsense.deploy.golden import EVENT, FAULT, HEALTH, ToyRows, answers_of, column
 from plushsense.runtime.events import ENDED
 from plushsense.runtime.gate import JERK, LEVEL, MOST_SIZE, GateSettings, Rule, Signal, Term
 from plushsense.runtime.image import IntegerModel, image_head
@@ -26,6 +28,22 @@ from support.c_toy import Seat, seat
 from support.integers import any_frames, edged_model, models, plain_model, ruled_model, vector_model
 
 OK, NOT_A_MODEL, OTHER_VERSION, DAMAGED, TOO_SMALL, OTHER_LAYOUT = range(6)
+
+
+def answers_over_swaps(parts: Sequence[tuple[IntegerModel, NDArray[np.int64]]]) -> list[NDArray[np.int32]]:
+    """The rows of each model and its frames when models are swapped during a stream.
+
+    A swap ends an open event: its row is the last one of the part and has the index of the next frame.
+    """
+    rows, tables = ToyRows(parts[0][0]), []
+    for n, (_, frames) in enumerate(parts, 1):
+        rows.feed(frames)
+        following = ToyRows(parts[n][0], rows.frame) if n < len(parts) else rows
+        if following is not rows:
+            rows.add(following.toy.continue_from(rows.toy))
+        tables.append(rows.take())
+        rows = following
+    return tables
 
 
 def test_what_plush_begin_says(c_library: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plushsense.core.layouts import MOST_CALIBRATED_OTHER, Channel
-from plushsense.deploy.emit import LIBRARY, library_text
+from plushsense.deploy.code import CALIBRATE, LIBRARY, library_files
 from plushsense.deploy.golden import answers_of
+from plushsense.deploy.package import ARDUINO, IDF
+from plushsense.deploy.proof.vectors import Export
+from plushsense.deploy.proof.verify import verify
 from plushsense.deploy.quantize import integer_model
 from plushsense.runtime.image import IntegerModel, image_head, memory_bytes
 from support.c_toy import Seat, seat
-from support.exports import bundle_of
+from support.exports import bundle_of, exported
 from support.integers import any_frames, models, vector_model
 
 OK, OTHER_VERSION, DAMAGED = 0, 2, 3
@@ -55,12 +59,21 @@ def test_each_library_takes_its_own_models(c_library: Any, calibrated_library: A
     model = calibrated_model()
     assert seat(calibrated_library, model).status == OK
     assert seat(c_library, model).status == seat(calibrated_library, vector_model()).status == OTHER_VERSION
-    for name in LIBRARY:
-        text, without = library_text(name, calibrate=True), library_text(name)
-        assert "PLUSH_CALIBRATE" not in text + without and "plush_sensor" in text and "plush_sensor" not in without
-    versions = (library_text(LIBRARY[0]), library_text(LIBRARY[0], calibrate=True))
-    for text, version in zip(versions, (6, 8), strict=True):
-        assert f"#define PLUSH_IMAGE_VERSION {version}\n" in text
+    plain, calibrating = library_files(), library_files(calibrate=True)
+    assert set(plain) == set(LIBRARY) and set(calibrating) == {*LIBRARY, CALIBRATE}
+    assert plain[LIBRARY[1]] == calibrating[LIBRARY[1]], "one line of the header chooses"
+    defined = "#define PLUSH_CALIBRATE\n"
+    assert defined in calibrating[LIBRARY[0]] and defined not in plain[LIBRARY[0]]
+
+
+def test_only_an_export_of_such_a_model_has_the_file(c_compiler: str, tmp_path: Path) -> None:
+    plain = bundle_of("accel-3", "3d1_2d2", "3,4", window=40)
+    themselves = replace(plain, layout=replace(plain.layout, self_calibration=plain.layout.names))
+    for bundle, where in ((plain, set()), (themselves, {"", f"{ARDUINO}/src/", f"{IDF}/include/"})):
+        out = exported(tmp_path / str(len(where)), bundle)
+        assert {p.relative_to(out).as_posix() for p in out.rglob(CALIBRATE)} == {f"{w}{CALIBRATE}" for w in where}
+    done = verify(Export(out), ["host"], only=lambda s: s.optimise == "-O2" and s.compiler == "gcc")
+    assert done.passed and done.own and len(done.runs) == 3, "compiled in, from a file, and called from C++"
 
 
 def test_ten_touch_channels_and_an_accelerometer(calibrated_library: Any) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 TESTS = Path(__file__).parents[1]
 
-from plushsense.deploy.emit import TOY_BYTES
+from plushsense.deploy.code import TOY_BYTES
 from support.c_toy import C_FOLDER
 from support.requirements import LONG
 

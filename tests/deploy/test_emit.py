@@ -14,7 +14,8 @@ import pytest
 from plushsense.core.errors import BadInput
 from plushsense.core.gestures import GestureSet
 from plushsense.core.templates import c_comment
-from plushsense.deploy.emit import TOY_BYTES, c_names, emit, read_facts
+from plushsense.deploy.code import TOY_BYTES, c_names, read_facts
+from plushsense.deploy.emit import emit
 from plushsense.deploy.golden import answers_of, column, golden_frames, read_golden
 from plushsense.deploy.quantize import integer_model
 from plushsense.models.bundle import Bundle
@@ -43,15 +44,15 @@ def test_the_folder(tmp_path: Path) -> None:
         "golden/answers.bin",
         "golden/README.md",
         "export.json",
-    } <= set(done.files)
+    } <= set(done.facts.files)
     assert {p.relative_to(tmp_path / "out").as_posix() for p in (tmp_path / "out").rglob("*") if p.is_file()} == set(
-        done.files
+        done.facts.files
     )
     facts = read_facts(tmp_path / "out")
-    assert facts["memory_bytes"] == memory_bytes(model)
+    assert facts.memory_bytes == memory_bytes(model)
     assert (tmp_path / "out" / "plush_model.bin").read_bytes() == model.to_bytes()
-    assert done.flash_bytes == len(model.to_bytes()) == facts["model_bytes"]
-    assert json.loads(json.dumps(done.to_dict()))["ram_bytes"] == facts["memory_bytes"] + TOY_BYTES
+    assert facts.flash_bytes == len(model.to_bytes()) == facts.model_bytes
+    assert json.loads(json.dumps(done.to_json()))["ram_bytes"] == facts.memory_bytes + TOY_BYTES
     frames, answers = read_golden(tmp_path / "out" / "golden", 3, 18)
     assert np.array_equal(answers, answers_of(model, frames))
     assert set(column(answers, "state")) == {0, 1}
@@ -62,12 +63,13 @@ def test_the_folder(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".out*"))
 
 
-def test_a_folder_that_cannot_be_finished_leaves_nothing(tmp_path: Path) -> None:
-    def fail(folder: Path, facts: object) -> None:
+def test_a_folder_that_cannot_be_finished_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
         raise OSError("no more")
 
+    monkeypatch.setattr("plushsense.deploy.emit.write_golden", fail)
     with pytest.raises(BadInput, match="no more"):
-        emit(*made(), tmp_path / "out", extras=[fail])
+        emit(*made(), tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 
@@ -156,5 +158,5 @@ def test_no_export_is_refused(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="is no export"):
         read_facts(tmp_path)
     (tmp_path / "export.json").write_text("{}")
-    with pytest.raises(BadInput, match="lacks channels"):
+    with pytest.raises(BadInput, match="lacks channels, classes"):
         read_facts(tmp_path)

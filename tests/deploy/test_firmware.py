@@ -24,9 +24,7 @@ from plushsense.deploy.package import (
     IDF,
     IDF_TASKS,
     SKETCH,
-    copies,
     firmware,
-    package,
 )
 from plushsense.deploy.quantize import integer_model
 from plushsense.devices.wire import LineParser
@@ -105,10 +103,10 @@ def test_wired_sensors_arrive_in_their_channels(packages: Packages, tmp_path: Pa
 def test_a_damaged_model_blinks_and_the_lines_go_on(packages: Packages, tmp_path: Path, board: str) -> None:
     out, model = packages["accel-3"]
     shutil.copytree(out, tmp_path / "out")
-    for copy in (c for c, original in copies().items() if original == "plush_model.c"):
-        text = (tmp_path / "out" / copy).read_text(encoding="utf-8")
+    for copy in (tmp_path / "out").glob("*/**/plush_model.c"):
+        text = copy.read_text(encoding="utf-8")
         at = text.rindex("128,")
-        (tmp_path / "out" / copy).write_text(text[:at] + "129," + text[at + 4 :], encoding="utf-8")
+        copy.write_text(text[:at] + "129," + text[at + 4 :], encoding="utf-8")
     sent, pins = play(BUILDS[board](tmp_path / "out", tmp_path), seconds=3)
     assert len(frames_of(model.layout, sent)) > 280
     red = [value for _, pin, value in pins if value == 255]
@@ -307,7 +305,7 @@ def test_names_of_any_kind_become_legal(tmp_path: Path) -> None:
     labels = ["OK", "One", "Tracking", "2 hands", "Ä", "Ö", "a-b", "a b.", "A_B 2", "*/ int x;", 'say "hi" ??/']
     gestures = GestureSet("odd ones", tuple(Gesture(label) for label in labels))
     bundle = bundle_of(layout, gestures=gestures, window=60)
-    out = emit(integer_model(bundle), bundle, tmp_path / "out", extras=[package]).folder
+    out = emit(integer_model(bundle), bundle, tmp_path / "out").folder
     sent, pins = play(arduino(out, tmp_path, "TELL_ANSWERS=1"), seconds=4)
     assert sent.decode().splitlines()[-1].split(" ", 3)[3] in labels
     # Nobody told an affect: the eyes have a gesture's own colour, and there is no sound.

@@ -16,7 +16,7 @@ import pytest
 
 from plushsense.core.layouts import load_layout
 from plushsense.deploy.emit import emit
-from plushsense.deploy.package import ARDUINO, package
+from plushsense.deploy.package import ARDUINO
 from plushsense.deploy.proof.scenarios import patches_of
 from plushsense.deploy.quantize import integer_model
 from support.c_toy import C_FOLDER
@@ -32,7 +32,7 @@ def corpus(folder: Path) -> tuple[dict[str, list[bytes]], Path]:
     """Good inputs of each entry, and the folder of an export whose lines and model are used."""
     bundle = bundle_of("phone-6", "3d1_2d2", "3,4", window=40)
     model = integer_model(bundle)
-    out = emit(model, bundle, folder / "out", [package]).folder
+    out = emit(model, bundle, folder / "out").folder
     others = (bundle_of("phone-6", *shape, window=40) for shape in (("v5_3d2", "2,4"), ("2", "5")))
     images = [image.to_bytes() for image in (model, *map(integer_model, others))]
     patches = [patch for _, patch in patches_of(model, bundle.scaler).patches]

@@ -7,8 +7,9 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 
-from plushsense.deploy.emit import emit, read_facts
-from plushsense.deploy.package import ARDUINO, package
+from plushsense.deploy.code import read_facts
+from plushsense.deploy.emit import emit
+from plushsense.deploy.package import ARDUINO
 from plushsense.deploy.quantize import integer_model
 from plushsense.runtime.image import IntegerModel
 from support.exports import bundle_of
@@ -80,7 +81,7 @@ def test_the_swap_of_the_readme_keeps_the_old_model_or_all_that_must_stay(
 
 def with_provenance(tmp_path: Path, **provenance: object) -> str:
     bundle = replace(bundle_of(window=60), provenance=provenance)
-    emit(integer_model(bundle), bundle, tmp_path / "out", extras=[package])
+    emit(integer_model(bundle), bundle, tmp_path / "out")
     return (tmp_path / "out" / "README.md").read_text(encoding="utf-8")
 
 
@@ -98,9 +99,9 @@ def test_the_readme_tells_this_model(tmp_path: Path) -> None:
     text = with_provenance(tmp_path, dataset="gestures | of 2", scores=SCORES, subjects=people, simulated=False)
     facts = read_facts(tmp_path / "out")
     for figure in ("parameters", "macs_per_step", "model_bytes", "memory_bytes", "span"):
-        assert f"{facts[figure]:,}" in text
+        assert f"{getattr(facts, figure):,}" in text
     for sentence in (
-        facts["symbol"],
+        facts.symbol,
         "50 ms",
         "0.56 s",
         "0.679",

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import BadInput, ConfigError
-from plushsense.deploy.emit import BUNDLE, code_files, emit, prefixed, read_facts, without_prefix
+from plushsense.deploy.code import BUNDLE, code_files, prefixed, read_facts, without_prefix
+from plushsense.deploy.emit import emit
 from plushsense.deploy.golden import ANSWER, read_golden
-from plushsense.deploy.package import package
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.quantize import integer_model
 from support.exports import bundle_of
@@ -73,7 +73,7 @@ def named(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("named")
     for name, make in MODELS.items():
         bundle = make()
-        emit(integer_model(bundle), bundle, folder / name, extras=[package], name=name)
+        emit(integer_model(bundle), bundle, folder / name, name=name)
     return {name: folder / name for name in MODELS}
 
 
@@ -100,7 +100,7 @@ def test_several_models_in_one_program_answer_as_alone(
     run(*compiler, *STRICT, *includes, tmp_path / f"main.{suffix}", *objects, "-o", program)
     frames, expected = {}, []
     for name, folder in named.items():
-        channels, classes = len(read_facts(folder)["channels"]), read_facts(folder)["classes"]
+        channels, classes = len(read_facts(folder).channels), read_facts(folder).classes
         frames[name], rows = read_golden(folder / "golden", channels, classes)
         rows = rows[(rows[:, 0] == ANSWER) & (rows[:, 1] < FRAMES) & (rows[:, 4] == 1)]
         expected += [f"{name} {row[3]} {' '.join(map(str, row[12 : 12 + classes]))}" for row in rows.tolist()]
@@ -132,7 +132,7 @@ def test_it_is_the_plain_export_with_a_prefix(named: dict[str, Path], tmp_path: 
         assert prefixed((plain / file).read_text(encoding="utf-8"), "left").encode() == text
     for file in ("plush_model.bin", BUNDLE, "golden/answers.bin"):
         assert (named["left"] / file).read_bytes() == (plain / file).read_bytes()
-    assert "name" not in read_facts(plain) and read_facts(named["left"])["name"] == "left"
+    assert not read_facts(plain).name and read_facts(named["left"]).name == "left"
 
 
 def test_it_is_verified_and_changes_are_found(named: dict[str, Path], tmp_path: Path) -> None:

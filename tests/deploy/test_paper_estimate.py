@@ -27,7 +27,7 @@ def test_the_papers_network_takes_the_papers_times() -> None:
     assert (window.macs, step.macs) == (MINE.macs_per_window, MINE.macs_per_step)
     assert str(MINE.span) in window.what and f"{MINE.step} samples" in step.what and "250" in paper.what
     assert found.float_bytes == 4 * MINE.parameters
-    table = found.to_dict()
+    table = found.to_json()
     assert (table["ours_step_ms"], table["ours_window_ms"]) == (None, None)
     assert table["mmac_s"] == {"float": 58.0, "int16": 137.0} and table["float_weights_bytes"] == found.float_bytes
     assert table["estimates"][0] == {
@@ -42,6 +42,6 @@ def test_ours_is_that_of_the_esp32() -> None:
     esp32 = SimpleNamespace(core=core, low_ms=1.23456, high_ms=2.5)
     found = compare_with_paper(profiled(esp32=esp32, esp8266=None))
     assert found.step_ms == (1.23456, 2.5) and found.window_ms == pytest.approx((12.5, 25.0))
-    table = found.to_dict()
+    table = found.to_json()
     assert (table["ours_step_ms"], table["ours_window_ms"]) == ([1.235, 2.5], [12.5, 25.0])
     assert compare_with_paper(profiled(esp8266=esp32)).step_ms is None

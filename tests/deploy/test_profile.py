@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.core.errors import BadInput, ProgramError, ToolError
-from plushsense.deploy.emit import TOY_BYTES, read_facts
+from plushsense.deploy.code import TOY_BYTES, read_facts
 from plushsense.deploy.profile import Core, Cost, Estimate, _stack_usage, cores, count, estimate, profile
 from plushsense.deploy.targets import TARGETS
 from plushsense.models.arch import Arch
@@ -35,11 +35,11 @@ def test_counts(target: str, small: Path, target_here: Here) -> None:
     assert 1.6 * cost.step < cost.gap < 2.2 * cost.step
     assert cost.call_most is not None and cost.call_bound is not None
     assert cost.gap <= cost.call_most <= cost.call_bound < 1.5 * cost.call_most
-    assert cost.sections["plush_model"]["rodata"] == facts["model_bytes"]
-    assert cost.flash_bytes > facts["model_bytes"] + 2000
+    assert cost.sections["plush_model"]["rodata"] == facts.model_bytes
+    assert cost.flash_bytes > facts.model_bytes + 2000
     code = cost.sections["plushsense"]
     assert 3_000 < code["others"] < code["text"] - 4_000, "plush_begin and its like, and what plush_push runs"
-    assert 0 <= TOY_BYTES - cost.toy_bytes <= 24 and cost.memory_bytes == facts["memory_bytes"]
+    assert 0 <= TOY_BYTES - cost.toy_bytes <= 24 and cost.memory_bytes == facts.memory_bytes
     assert cost.ram_bytes == cost.toy_bytes + cost.memory_bytes
     assert cost.stack_push is not None
     assert cost.stack_functions["plush_push"] < cost.stack_push < sum(cost.stack_functions.values()) + 64
@@ -134,7 +134,7 @@ def test_a_folder_that_does_not_work_is_refused(own: Path, target_here: Here) ->
 
 def test_sizes_on_the_host_without_counts(small: Path, target_here: Here) -> None:
     found = profile(small, [target_here("host")])
-    table = found.to_dict()
+    table = found.to_json()
     assert table["instructions_per_step"] == {} and table["estimated_ms"] == {}
     assert found.costs["host"].flash_bytes > 0 and found.costs["host"].step is None
 
@@ -185,7 +185,7 @@ def test_a_cost_adds_up_its_sections_and_names_what_it_should_not_need() -> None
     assert cost.flash_bytes == 15_000 + 300 + 20 + 1 + 10_000 + 40
     assert cost.ram_bytes == 500 + 1000 + 20 + 7 + 40
     assert cost.running_bytes() == 10_320 + 10_040 and cost.running_bytes(with_model=False) == 10_320
-    assert cost.to_dict() == {
+    assert cost.to_json() == {
         "title": TARGETS["xtensa"].title,
         "instructions_per_step": 10,
         "instructions_per_step_most": 11,
@@ -244,13 +244,13 @@ def test_estimates_are_a_band_and_a_verdict() -> None:
     slow = of(1_000_000, flash)
     assert (slow.low_ms, slow.core_ms, slow.flash_ms, slow.high_ms, slow.call_ms) == (10.0, 20.0, 10.0, 30.0, 42.0)
     assert of(1_000_000, replace(flash, model_in_flash=False)).flash_ms == 5.0
-    assert found.to_dict() == {
+    assert found.to_json() == {
         "estimate": True, "chip": core.title, "mhz": 100, "counted_on": "xtensa", "instructions": 1_000_000,
         "cycles_per_instruction": [1.0, 2.0], "flash_mb_s": None, "low": 10.0, "high": 20.0, "of_it_flash": 0.0,
         "longest_call": 40.0, "energy_uj": [200.0, 1200.0], "volts": 2.0, "current_ma": [10.0, 30.0],
         "current_source": core.power, "fits": "yes", "verdict": found.verdict, "why": core.why,
     }  # fmt: skip
-    assert slow.to_dict()["of_it_flash"] == 10.0 and slow.to_dict()["longest_call"] == 42.0
+    assert slow.to_json()["of_it_flash"] == 10.0 and slow.to_json()["longest_call"] == 42.0
     assert of(2_500_000).fits == "yes" and of(5_000_000).fits == "unsure"
     assert of(4_000_000).verdict.startswith("fits 20 Hz: not sure, it would use about 80 to 160")
     assert of(6_000_000).verdict == "fits 20 Hz: no, it would use 120 % of the core or more"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from plushsense.deploy.emit import emit
-from plushsense.deploy.package import TWO_SLOTS, package
+from plushsense.deploy.package import TWO_SLOTS
 from plushsense.deploy.quantize import integer_model
 from support.exports import bundle_of
 from support.virtual_boards import run
@@ -175,7 +175,7 @@ def test_only_a_sound_and_signed_model_takes_over(
         bundle_of("plush-15", window=60),
     )
     own, good, wrong = (integer_model(b).to_bytes() for b in (bundle, other, foreign))
-    out = emit(integer_model(bundle), bundle, tmp_path / "out", extras=[package]).folder
+    out = emit(integer_model(bundle), bundle, tmp_path / "out").folder
     (tmp_path / "good").write_bytes(good)
     (tmp_path / "foreign").write_bytes(wrong)
     (tmp_path / "firmware.c").write_text(_FIRMWARE)

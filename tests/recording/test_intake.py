@@ -35,9 +35,9 @@ def test_a_spoilt_stamp_lets_no_time_pass(spoilt: int) -> None:
     # The computer of the test may be slow by up to a second.
     assert 980 <= intake.toy_ms <= 2500
     assert intake.lost == 0
-    assert {gap["reason"] for gap in intake.gaps} == {"the toy's clock restarted", "the toy's clock jumped"}
-    assert max(gap["missing_ms"] for gap in intake.gaps) <= 20
-    assert [gap["device_ms"] for gap in intake.gaps] == [[100_490, spoilt], [spoilt, 100_510]]
+    assert {gap.reason for gap in intake.gaps} == {"the toy's clock restarted", "the toy's clock jumped"}
+    assert max(gap.missing_ms for gap in intake.gaps) <= 20
+    assert [gap.device_ms for gap in intake.gaps] == [(100_490, spoilt), (spoilt, 100_510)]
 
 
 def test_a_hole_that_the_computer_waited_through_counts() -> None:
@@ -47,7 +47,7 @@ def test_a_hole_that_the_computer_waited_through_counts() -> None:
     intake.receive(Frame(1_005_000, 10_000, VALUES))
     assert intake.toy_ms == 5000
     (gap,) = intake.gaps
-    assert (gap["reason"], gap["missing_ms"]) == ("nothing came", 5000)
+    assert (gap.reason, gap.missing_ms) == ("nothing came", 5000)
 
 
 def test_a_toy_faster_than_time_is_believed() -> None:

@@ -57,7 +57,8 @@ def test_the_task_writes_what_the_library_writes(
     assert [r["progress"]["stage"] for r in reports] == ["export", "profile"]
     found = ExportFacts.of(place)
     assert exports_of(little) == [place]
-    assert (found.flash_bytes, found.ram_bytes) == (result["flash_bytes"], result["ram_bytes"])
+    facts = found.facts
+    assert facts and (facts.flash_bytes, facts.ram_bytes) == (result["flash_bytes"], result["ram_bytes"])
     assert result["profile"]["digest"] == found.digest == folder_digest(place)
     assert "No emulator to count on" in result["profile"]["refused"]
     assert "qemu-system-arm" in result["profile"]["refused"]

@@ -13,8 +13,8 @@ import pytest
 
 from plushsense.core.sentences import Message
 from plushsense.dataset.backup import backup
-from plushsense.dataset.importing.results import SIMULATED
 from plushsense.dataset.importing.importers import ADOPTED
+from plushsense.dataset.importing.results import SIMULATED
 from plushsense.dataset.importing.sources import LAYOUT_GUESSED
 from plushsense.dataset.index import open_dataset
 from plushsense.studio.app.words import Words

@@ -83,7 +83,11 @@ def source() -> Source:
                     found.texts.update(dict.fromkeys((t for v in given for t in texts_of(v)), place))
                 elif name in MESSAGES and node.args:
                     made = any(isinstance(part, ast.JoinedStr) for part in ast.walk(node.args[0]))
-                    if made and (node.keywords or (place.startswith("studio/") and not place.endswith("/serve.py"))):
+                    if made and (
+                        node.keywords
+                        or (name == "error" and "importing" in place)
+                        or (place.startswith("studio/") and not place.endswith("/serve.py"))
+                    ):
                         found.untranslatable.append(f"{place}:{node.lineno}")
                     if node.keywords or place.startswith("studio/"):
                         found.texts.update(dict.fromkeys(texts_of(node.args[0]), place))

@@ -42,6 +42,6 @@ def bundle_of(
 
 
 def exported(out: Path, bundle: Bundle) -> Path:
-    """The bundle as an export folder, without packages."""
+    """The bundle as an export folder."""
     emit(integer_model(bundle), bundle, out)
     return out

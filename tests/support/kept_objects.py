@@ -13,8 +13,8 @@ import pytest
 from filelock import FileLock
 from numpy.typing import NDArray
 
-from plushsense.deploy.golden import answers_of
-from plushsense.deploy.proof.scenarios import Scenario, scenarios_of
+from plushsense.deploy.golden import Vectors, answers_of
+from plushsense.deploy.proof.scenarios import scenarios_of
 from plushsense.deploy.targets import Program, build
 from plushsense.runtime.image import IntegerModel
 from plushsense.windows.features import Scaler
@@ -55,9 +55,9 @@ def keeping_answers(factory: pytest.TempPathFactory) -> Iterator[None]:
         answers: NDArray[np.int32] = once(lambda: answers_of(model, frames), *inputs)
         return answers
 
-    def scenarios_once(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[Scenario]:
+    def scenarios_once(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[Vectors]:
         inputs = model.to_bytes(), repr(model.gestures), scaler.offset.tobytes(), scaler.scale.tobytes(), repeat
-        scenarios: list[Scenario] = once(lambda: scenarios_of(model, scaler, repeat), *inputs)
+        scenarios: list[Vectors] = once(lambda: scenarios_of(model, scaler, repeat), *inputs)
         return scenarios
 
     with pytest.MonkeyPatch.context() as patch:

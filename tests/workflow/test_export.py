@@ -103,7 +103,7 @@ def test_a_folder_is_no_bundle(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_an_export_says_of_how_many_people(tmp_path: Path, bundle: Bundle) -> None:
     origin = {"subjects": ["Anna", "Bo"], "validation_subjects": ["Cleo"], "scores": {"accuracy": 0.5, "macro_f1": 0.4}}
     done = ps.export(replace(bundle, provenance=origin), tmp_path / "out")
-    assert (done.facts["provenance"]["subjects"], done.facts["provenance"]["validation_subjects"]) == (2, 1)
+    assert (done.facts.provenance["subjects"], done.facts.provenance["validation_subjects"]) == (2, 1)
     said = (tmp_path / "out" / "README.md").read_text(encoding="utf-8")
     assert "| trained on | 2 people |" in said and "of 1 other people" in said and "Anna" not in said
 

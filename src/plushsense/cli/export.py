@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import textwrap
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from plushsense.cli.output import emit, say, table, warn
 from plushsense.cli.settings import listed
@@ -12,9 +12,10 @@ from plushsense.core.errors import ConfigError
 from plushsense.jobs.progress import ProgressReporter
 
 if TYPE_CHECKING:
+    from plushsense.deploy.code import ConversionFacts
     from plushsense.deploy.paper_estimate import PaperComparison
     from plushsense.deploy.profile import Cost, Profile
-    from plushsense.deploy.proof.verify import VerificationReport
+    from plushsense.deploy.proof.verify import VerificationResult
 
 _SAMPLES = 100_000
 _STAGES = {
@@ -30,10 +31,10 @@ _STAGES = {
 }
 
 
-def _conversion(entry: dict[str, Any]) -> str:
-    largest = entry["largest_difference"]
+def _conversion(entry: ConversionFacts) -> str:
+    largest = entry.largest_difference
     difference = "" if largest is None else f"; logits differ from the original by at most {largest:.1g}"
-    return f"  {entry['file']:<17} {entry['bytes']:,} bytes{difference}"
+    return f"  {entry.file:<17} {entry.bytes:,} bytes{difference}"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -45,17 +46,17 @@ def run(args: argparse.Namespace) -> int:
     package = {"name": args.name, "model_version": args.model_version, "url": args.url}
     done = export(args.bundle, args.out, dataset=args.dataset, also=also, **package, warn=warn)
     facts = done.facts
-    simulated = ["  SIMULATION: trained on a virtual toy, not on real touch"] if facts["simulated"] else []
+    simulated = ["  SIMULATION: trained on a virtual toy, not on real touch"] if facts.simulated else []
     emit(
         args,
-        done.to_dict(),
+        done.to_json(),
         [
-            f"{args.out}: {facts['title']}, {facts['classes']} gestures, layout {facts['layout']}",
+            f"{args.out}: {facts.title}, {facts.classes} gestures, layout {facts.layout}",
             *simulated,
-            f"  model             {done.flash_bytes:,} bytes of flash, without the code (see plushsense profile)",
-            f"  memory            {done.ram_bytes:,} bytes of RAM",
-            f"  a step            {facts['step_ms']:g} ms, {facts['macs_per_step']:,} MACs",
-            *(_conversion(entry) for entry in facts.get("conversions", {}).values()),
+            f"  model             {facts.flash_bytes:,} bytes of flash, without the code (see plushsense profile)",
+            f"  memory            {facts.ram_bytes:,} bytes of RAM",
+            f"  a step            {facts.step_ms:g} ms, {facts.macs_per_step:,} MACs",
+            *(_conversion(entry) for entry in facts.conversions.values()),
             f"  prove it          plushsense verify {args.out}",
         ],
     )
@@ -107,11 +108,11 @@ def run_verify(args: argparse.Namespace) -> int:
     else:
         mutants = (lambda mutant: True) if args.faults else None
         done = verify(export, listed(*args.target), vectors, mutants=mutants, trust=args.trust, progress=progress)
-    emit(args, {"export": args.export, **done.to_dict()}, verification_lines(done))
+    emit(args, {"export": args.export, **done.to_json()}, verification_lines(done))
     return 0 if done.passed else 1
 
 
-def verification_lines(done: VerificationReport) -> list[str]:
+def verification_lines(done: VerificationResult) -> list[str]:
     streams = [f"{v.name}: {v.samples:,} samples of {v.frames:,} frames, {v.answers:,} answers" for v in done.counts]
     rows = [
         (r.target, r.compiler, r.flags, f"{r.vectors}", f"{r.mismatches}", f"{r.max_abs_diff}", f"{r.seconds:.1f}")
@@ -170,12 +171,12 @@ def run_profile(args: argparse.Namespace) -> int:
     for name, packages in result.missing.items():
         say(f"left out: {name}, which needs Debian's {' '.join(packages)}")
     if not args.paper:
-        emit(args, result.to_dict(), format_profile(result))
+        emit(args, result.to_json(), format_profile(result))
         return 0
     from plushsense.deploy.paper_estimate import compare_with_paper
 
     paper = compare_with_paper(result)
-    emit(args, result.to_dict() | {"paper": paper.to_dict()}, format_profile(result) + format_paper(paper))
+    emit(args, result.to_json() | {"paper": paper.to_json()}, format_profile(result) + format_paper(paper))
     return 0
 
 
@@ -230,7 +231,7 @@ def _counts(profile: Profile) -> list[str]:
     rows += [
         ["whole step", *(f"{c.step:,}" for c in costs)],
         ["dearest step", *(f"{c.step_most:,}" for c in costs)],
-        [f"longest gap ({profile.facts['gap_ms']} ms), one call", *(f"{c.gap:,}" for c in costs)],
+        [f"longest gap ({profile.facts.gap_ms} ms), one call", *(f"{c.gap:,}" for c in costs)],
         ["longest call seen", *(f"{c.call_most:,}" for c in costs)],
         ["longest call, bound", *(f"{c.call_bound:,}" for c in costs)],
         ["plush_begin, once", *(f"{c.begin:,}" for c in costs)],

@@ -67,7 +67,7 @@ def _report(args: argparse.Namespace, recorder: Recorder) -> int:
         "session": recorder.session.head.session,
         "recordings": status.done,
         **{name: getattr(status, name) for name in counts},
-        "gaps": recorder.gaps,
+        "gaps": [gap.to_json() for gap in recorder.gaps],
         "finished": finished,
         "resumed": recorder.session.progress.resumed,
     }

@@ -305,51 +305,45 @@ def read_bytes(path: Path) -> bytes:
         raise FileFormatError("'{path}' cannot be read: {why}.", path=path, why=cause.strerror or cause) from None
 
 
-def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool = False) -> ReadResult:  # noqa: C901
-    if data is None:
-        data = read_bytes(path)
+def _plain_text(path: Path, data: bytes) -> bytes:
+    """Return the content of a file with plain line ends, without a byte order mark; refuse one that is not text."""
     data = data.removeprefix(b"\xef\xbb\xbf")
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if b"\x00" in data[:4096]:
         raise FileFormatError("'{path}' is not a text file: a recording is a CSV file in UTF-8.", path=path.name)
-    data = data.lstrip()
+    return data.lstrip()
+
+
+def _as_whole(numbers: NDArray[Any]) -> NDArray[np.int64]:
+    # Clipped values are invalid in any case: LIMIT is outside every valid range.
+    if numbers.dtype != np.int64:
+        numbers = np.clip(np.round(numbers), -LIMIT, LIMIT)
+    return np.ascontiguousarray(numbers, dtype=np.int64)
+
+
+def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool = False) -> ReadResult:
+    data = _plain_text(path, read_bytes(path) if data is None else data)
     cut = whole_lines and b"\n" in data and not data.endswith(b"\n")
     if cut:
         data = data[: data.rfind(b"\n") + 1]
     if not data:
         raise FileFormatError("'{path}' is empty: a recording has one row a sample.", path=path.name)
-    end = data.find(b"\n")
-    first = data if end < 0 else data[:end]
+    first, _, rest = data.partition(b"\n")
     if len(first) > LONGEST_LINE:
         raise FileFormatError(
             "'{path}' begins with a line of {n} characters: it is not a recording.", path=path.name, n=len(first)
         )
     keys, header = column_keys(first, layout, path)
-    if header and (end < 0 or not data[end:].strip()):
+    if header and not rest.strip():
         raise FileFormatError(
             "'{path}' has a header but no row: the authors' recorder writes such files if the toy sends fewer than "
             "14 integers a line.",
             path=path.name,
         )
     table, labels, malformed = parse_table(data, keys, 1 if header else 0, path)
-    numeric = [k for k in keys if k != "label"]
-    warnings: list[str] = ["the last line is cut off: left out"] if cut else []
-    if malformed:
-        warnings.append(f"{malformed} malformed line{'s' if malformed > 1 else ''} left out")
-
-    def as_whole(numbers: NDArray[Any]) -> NDArray[np.int64]:
-        # Clipped values are invalid in any case: LIMIT is outside every valid range.
-        if numbers.dtype != np.int64:
-            numbers = np.clip(np.round(numbers), -LIMIT, LIMIT)
-        return np.ascontiguousarray(numbers, dtype=np.int64)
-
-    def column(name: str) -> NDArray[np.int64] | None:
-        return as_whole(table[:, numeric.index(name)]) if name in numeric else None
-
-    steps = np.array([c.step for c in layout.channels])
-    missing = [n for n in layout.names if n not in numeric]
-    if missing:
+    columns = dict(zip((k for k in keys if k != "label"), table.T, strict=True))
+    if missing := [n for n in layout.names if n not in columns]:
         raise FileFormatError(
             "'{path}' has no column for {missing} of layout '{layout}'.",
             path=path.name,
@@ -357,11 +351,11 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
             layout=layout.name,
             column=missing[0],
         )
-    values = table[:, [numeric.index(n) for n in layout.names]]
-    host = column(HOST_MS)
-    clock = column(DEVICE_MS)
-    delay = column(DELAY_MS)
-    if clock is not None and (delay is None) and _looks_like_delay(clock, host):
+    warnings: list[str] = ["the last line is cut off: left out"] if cut else []
+    if malformed:
+        warnings.append(f"{malformed} malformed line{'s' if malformed > 1 else ''} left out")
+    host, clock, delay = (_as_whole(columns[k]) if k in columns else None for k in (HOST_MS, DEVICE_MS, DELAY_MS))
+    if clock is not None and delay is None and _looks_like_delay(clock, host):
         delay, clock = clock, None
         warnings.append("the clock column holds delays (14-integer firmware): integrated")
     integrated = clock is None and delay is not None
@@ -379,7 +373,9 @@ def _read(path: Path, layout: Layout, data: bytes | None, *, whole_lines: bool =
                 delay_ms=DELAY_MS,
                 host_ms=HOST_MS,
             )
-    frames = Frames(as_whole(values if np.all(steps == 1.0) else values / steps), clock, host, labels)
+    values = table[:, [list(columns).index(n) for n in layout.names]]
+    steps = np.array([c.step for c in layout.channels])
+    frames = Frames(_as_whole(values if np.all(steps == 1.0) else values / steps), clock, host, labels)
     return ReadResult(frames, warnings, malformed + cut, header, integrated, cut)
 
 

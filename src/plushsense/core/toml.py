@@ -250,32 +250,36 @@ def _leaves(cause: Exception, steps: Steps, expected: Any) -> Iterator[tuple[Ste
         yield from _leaves(inner, at, kind)
 
 
+def _structure_number(value: Any, kind: type[Any]) -> Any:
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral if kind is int else numbers.Real):
+        raise TypeError(kind)
+    number = kind(value)
+    if not math.isfinite(number):
+        raise TypeError(kind)
+    return number
+
+
+def _structure_exact(value: Any, kind: type[T]) -> T:
+    if not isinstance(value, kind):
+        raise TypeError(kind)
+    return value
+
+
+def _is_tuple(kind: Any) -> bool:
+    return get_origin(kind) is tuple
+
+
+def _is_union(kind: Any) -> bool:
+    return get_origin(kind) in _UNIONS
+
+
 @functools.cache
-def _converter() -> Converter:  # noqa: C901
+def _converter() -> Converter:
     """Return a converter that coerces nothing. cattrs is imported here because importing it is slow."""
     from cattrs import Converter
     from cattrs.gen import make_dict_structure_fn
 
     converter = Converter()
-
-    def structure_number(value: Any, kind: type[Any]) -> Any:
-        if isinstance(value, bool) or not isinstance(value, numbers.Integral if kind is int else numbers.Real):
-            raise TypeError(kind)
-        number = kind(value)
-        if not math.isfinite(number):
-            raise TypeError(kind)
-        return number
-
-    def structure_exact(value: Any, kind: type[T]) -> T:
-        if not isinstance(value, kind):
-            raise TypeError(kind)
-        return value
-
-    def is_tuple(kind: Any) -> bool:
-        return get_origin(kind) is tuple
-
-    def is_union(kind: Any) -> bool:
-        return get_origin(kind) in _UNIONS
 
     def tuples_of(kind: Any) -> Any:
         listed: Any = list[get_args(kind)[0]]  # type: ignore[misc]
@@ -314,11 +318,14 @@ def _converter() -> Converter:  # noqa: C901
 
         return structure_table
 
-    converter.register_structure_hook(int, structure_number)
-    converter.register_structure_hook(float, structure_number)
-    converter.register_structure_hook(str, structure_exact)
-    converter.register_structure_hook(bool, structure_exact)
-    converter.register_structure_hook_factory(is_tuple, tuples_of)
-    converter.register_structure_hook_factory(is_union, one_of)
+    for kind, hook in {
+        int: _structure_number,
+        float: _structure_number,
+        str: _structure_exact,
+        bool: _structure_exact,
+    }.items():
+        converter.register_structure_hook(kind, hook)
+    converter.register_structure_hook_factory(_is_tuple, tuples_of)
+    converter.register_structure_hook_factory(_is_union, one_of)
     converter.register_structure_hook_factory(is_dataclass, tables_of)
     return converter

@@ -5,7 +5,9 @@ No recordings are used, because exports are given to others and must not contain
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Sequence
+import struct
+from collections.abc import Container, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +17,15 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BadInput
 from plushsense.core.files import read_bytes
 from plushsense.core.layouts import MAGNITUDE_FRACTION_BITS, Layout
+from plushsense.core.recorder_csv import Frames
 from plushsense.core.templates import fill_text
 from plushsense.runtime.events import AFFECT_CODES
 from plushsense.runtime.fixed import InputScale, Ints
 from plushsense.runtime.health import HealthSettings
-from plushsense.runtime.image import IntegerModel
-from plushsense.runtime.integer import IntegerDense, IntegerStepper
+from plushsense.runtime.image import IntegerModel, memory_bytes
+from plushsense.runtime.integer import IntegerDense
 from plushsense.runtime.machine import Moment, ToyMachine
+from plushsense.windows.clock import resample
 from plushsense.windows.features import Scaler
 
 _MS_BITS = 32
@@ -326,42 +330,7 @@ def answers_of(model: IntegerModel, frames: Ints, silences: Container[int] = ())
     Args:
         silences: indices of the frames after which a silence is reported (``plush_silence``).
     """
-    toy = _toy(model)
-    table = _RowTable(toy, model)
-    table.read(frames, silences)
-    return table.array()
-
-
-def answers_by_block(model: IntegerModel, blocks: Iterable[Ints]) -> Iterator[NDArray[np.int32]]:
-    """Yield the rows of `answers_of` for each block of frames of one long stream; earlier ones are not kept."""
-    toy, frame = _toy(model), 0
-    for frames in blocks:
-        table = _RowTable(toy, model, frame)
-        table.read(frames)
-        frame = table.frame
-        yield table.array()
-
-
-def answers_over_swaps(parts: Sequence[tuple[IntegerModel, Ints]]) -> list[NDArray[np.int32]]:
-    """Compute the toy's rows when models with the same channels are swapped during a stream (``plush_swap``).
-
-    Args:
-        parts: each model with the frames (n, 1 + C) that it reads.
-
-    Returns:
-        The rows of each part, as from `answers_of`. A swap ends an open event: its row is the last one of the part and
-        has the index of the next frame. Frame indices and counts continue, and the toy is warming again.
-    """
-    toy, frame, tables = _toy(parts[0][0]), 0, []
-    for n, (model, frames) in enumerate(parts, 1):
-        table = _RowTable(toy, model, frame)
-        table.read(frames)
-        if n < len(parts):
-            following = _toy(parts[n][0])
-            table.add(following.continue_from(toy))
-            toy, frame = following, table.frame
-        tables.append(table.array())
-    return tables
+    return ToyRows(model).read(frames, silences)
 
 
 def answers_over_patches(
@@ -377,33 +346,32 @@ def answers_over_patches(
     Returns:
         The rows of each part, as from `answers_of`. The state is kept, so that the next step uses the new layer.
     """
-    network = model.network.stepper()
-    toy, frame, tables = _toy(model, network), 0, list[NDArray[np.int32]]()
-    for (dense, frames), status in zip(parts, [*statuses, *[None] * (len(parts) - len(statuses))], strict=True):
-        network.patch(dense)
-        table = _RowTable(toy, model, frame)
-        table.read(frames)
-        if status is not None:
-            table.add_patch(int(frames[-1, 0]), status)
-        frame = table.frame
-        tables.append(table.array())
+    rows, tables = ToyRows(model), list[NDArray[np.int32]]()
+    for n, (dense, frames) in enumerate(parts):
+        rows.network.patch(dense)
+        rows.feed(frames)
+        if n < len(statuses):
+            rows.add_patch(int(frames[-1, 0]), statuses[n])
+        tables.append(rows.take())
     return tables
 
 
-def _toy(model: IntegerModel, network: IntegerStepper | None = None) -> ToyMachine:
-    stepper = network or model.network.stepper()
-    return ToyMachine(stepper, model.layout, model.gestures, model.rules, model.smoothing)
+class ToyRows:
+    """The rows of `answers_of` for one stream, piece by piece; ``frame`` is the index of the current frame."""
 
+    def __init__(self, model: IntegerModel, frame: int = 0) -> None:
+        self.network = model.network.stepper()
+        self.toy = ToyMachine(self.network, model.layout, model.gestures, model.rules, model.smoothing)
+        self.frame = frame
+        self._affects = [AFFECT_CODES[a] for a in model.gestures.affects]
+        self._rows: list[list[int]] = []
 
-class _RowTable:
-    """Collects rows of the output of a toy; ``frame`` is the index of the current frame."""
+    def read(self, frames: Ints, silences: Container[int] = ()) -> NDArray[np.int32]:
+        """Return the rows for further frames."""
+        self.feed(frames, silences)
+        return self.take()
 
-    def __init__(self, toy: ToyMachine, model: IntegerModel, frame: int = 0) -> None:
-        self.toy, self.frame = toy, frame
-        self.affects = [AFFECT_CODES[a] for a in model.gestures.affects]
-        self.rows: list[list[int]] = []
-
-    def read(self, frames: Ints, silences: Container[int] = ()) -> None:
+    def feed(self, frames: Ints, silences: Container[int] = ()) -> None:
         """Feed frames to the toy and add the resulting rows."""
         health = self.toy.frames.health
         for ms, *values in frames.tolist():
@@ -411,14 +379,16 @@ class _RowTable:
             for moment in self.toy.push(ms, values):
                 self.add(moment)
             if (health.fault, health.suspect) != before:
-                self.add_health(ms)
+                state = FAULT if health.fault else WARMING if self.toy.samples.warming else TRACKING
+                self._add(HEALTH, ms, health.faults, state, int(health.suspect))
             if self.frame in silences:
                 self.add(self.toy.silence())
             self.frame += 1
 
-    def array(self) -> NDArray[np.int32]:
-        """Return the rows as 32-bit integers."""
-        rows = np.array(self.rows, dtype=np.int64).reshape(len(self.rows), HEAD + 2 * len(self.affects))
+    def take(self) -> NDArray[np.int32]:
+        """Return the rows since the last call as 32-bit integers."""
+        made, self._rows = self._rows, []
+        rows = np.array(made, dtype=np.int64).reshape(len(made), HEAD + 2 * len(self._affects))
         return (rows & 0xFFFFFFFF).astype(np.uint32).view(np.int32)
 
     def add(self, moment: Moment) -> None:
@@ -431,15 +401,9 @@ class _RowTable:
         if answer is None or moment.logits is None or moment.smoothed is None:
             self._add(ANSWER, ms, count, WARMING)
             return
-        values = answer.best, self.affects[answer.best], answer.share, answer.kind, answer.known
+        values = answer.best, self._affects[answer.best], answer.share, answer.kind, answer.known
         numbers = [*moment.logits.tolist(), *moment.smoothed.tolist()]
         self._add(ANSWER, ms, count, TRACKING, *values, numbers=numbers)
-
-    def add_health(self, ms: int) -> None:
-        """Add the current state of the health check."""
-        health = self.toy.frames.health
-        state = FAULT if health.fault else WARMING if self.toy.samples.warming else TRACKING
-        self._add(HEALTH, ms, health.faults, state, int(health.suspect))
 
     def add_patch(self, ms: int, status: int) -> None:
         """Add what ``plush_patch`` returned after the last frame, of time ``ms``."""
@@ -453,7 +417,7 @@ class _RowTable:
     def _add(self, kind: int, ms: int, *values: int, numbers: Sequence[int] = ()) -> None:
         counts = self.toy.frames.clock.restarts, self.toy.frames.clock.invalid
         row = [kind, self.frame, ms, *values, *[0] * (HEAD - 5 - len(values)), *counts, *numbers]
-        self.rows.append(row + [0] * (HEAD + 2 * len(self.affects) - len(row)))
+        self._rows.append(row + [0] * (HEAD + 2 * len(self._affects) - len(row)))
 
 
 def write_golden(model: IntegerModel, scaler: Scaler, folder: Path) -> list[Path]:
@@ -502,3 +466,85 @@ def read_golden(folder: Path, channels: int, classes: int) -> tuple[Ints, NDArra
     frames = tables[0].astype(np.int64)
     frames[:, 0] &= 0xFFFFFFFF
     return frames, tables[1].astype(np.int32)
+
+
+def samples_of(frames: Ints, layout: Layout) -> int:
+    """Return the number of samples that frames are resampled to."""
+    return sum(map(len, resample(Frames(frames[:, 1:], frames[:, 0]), layout)))
+
+
+@dataclass(frozen=True, eq=False)
+class Vectors:
+    """A test case for the C: frames to feed to it, and the expected answers.
+
+    Attributes:
+        frames: (n, 1 + C), the time in ms and the channels.
+        answers: (m, 12 + 2 K), as `answers_of` computes them.
+        samples: length of the resampled frames.
+        model: model to run, if not that of the export.
+        silences: indices of the frames after which a silence is reported.
+        patches: indices of the frames after which a patch is offered, and its bytes; none: the patch is undone.
+    """
+
+    name: str
+    frames: Ints
+    answers: NDArray[np.int32]
+    samples: int
+    model: IntegerModel | None = None
+    silences: tuple[int, ...] = ()
+    patches: tuple[tuple[int, bytes], ...] = ()
+
+    @property
+    def decisions(self) -> int:
+        """Number of answers after the warm-up."""
+        return int((column(self.answers, "state") == TRACKING).sum())
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of memory that ``model`` needs; 0 for the model of the export."""
+        return memory_bytes(self.model) if self.model else 0
+
+    @property
+    def kept_bytes(self) -> int:
+        """Bytes of the model and the patches, which the test program keeps until the end."""
+        model = len(self.model.to_bytes()) if self.model else 0
+        return sum(-(-n // 4) * 4 for n in (model, *(len(patch) for _, patch in self.patches)))
+
+    def to_bytes(self) -> bytes:
+        """Serialise for the test program, whose source describes the format: model, frames, silences and patches."""
+        pieces = [_counted(self.model.to_bytes() if self.model else b"")]
+        between = [(at, struct.pack("<I", _SILENCE)) for at in self.silences]
+        between += [(at, struct.pack("<I", _PATCH) + _counted(patch)) for at, patch in self.patches]
+        frames, begin = (self.frames & 0xFFFFFFFF).astype("<u4"), 0
+        for at, action in (*sorted(between), (len(frames) - 1, struct.pack("<I", _END))):
+            pieces += [struct.pack("<I", at + 1 - begin), frames[begin : at + 1].tobytes(), action]
+            begin = at + 1
+        return b"".join(pieces)
+
+
+# What comes after frames.
+_END, _SILENCE, _PATCH = range(3)
+
+
+def _counted(data: bytes) -> bytes:
+    """Return the number of bytes, and the bytes, filled up to whole 32-bit numbers."""
+    return struct.pack("<I", len(data)) + data + bytes(-len(data) % 4)
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Number of frames, samples and answers streamed under one name."""
+
+    name: str
+    frames: int
+    samples: int
+    answers: int
+
+
+def counted(streams: Sequence[Vectors]) -> tuple[Counts, ...]:
+    """Return the total counts of the vectors of each name."""
+    return tuple(
+        Counts(name, sum(len(v.frames) for v in own), sum(v.samples for v in own), sum(len(v.answers) for v in own))
+        for name in dict.fromkeys(v.name for v in streams)
+        for own in [[v for v in streams if v.name == name]]
+    )

@@ -15,18 +15,7 @@ from plushsense.core.errors import LayoutError
 from plushsense.core.files import read_bytes
 from plushsense.core.layouts import DELAY_MS, DEVICE_MS, Channel, Layout
 from plushsense.core.templates import c_comment, fill_text
-from plushsense.deploy.emit import (
-    BUNDLE,
-    FACTS,
-    IMAGE,
-    LIBRARY,
-    MODEL,
-    TOY_BYTES,
-    c_names,
-    prefixed,
-    read_facts,
-    without_prefix,
-)
+from plushsense.deploy.code import BUNDLE, FACTS, IMAGE, LIBRARY, TOY_BYTES, ModelFacts, c_names, prefixed
 from plushsense.deploy.golden import measured
 from plushsense.models.bundle import Bundle
 from plushsense.windows.features import Scaler
@@ -65,53 +54,28 @@ _TEMPLATES = {
 }
 
 
-def package(out: Path, facts: Mapping[str, Any] | None = None) -> list[Path]:
-    """Add README, Arduino library, ESP-IDF component, CMake project and Zephyr module to an export folder.
+def export_files(bundle: Bundle, facts: ModelFacts, code: Mapping[str, bytes]) -> dict[str, bytes]:
+    """Return the contents of the files of an export, by their paths: its code, README, and packages for build systems.
 
-    ``facts`` default to its ``export.json``.
-
-    The library and the model are copied from the folder. Existing files are overwritten.
-
-    Returns:
-        The written files.
-
-    Raises:
-        BadInput: if the folder is no export.
-        LayoutError: for a layout with values that the toy's line format cannot represent.
-    """
-    facts = read_facts(out) if facts is None else facts
-    name = str(facts.get("name", ""))
-    code = {file: without_prefix((out / prefixed(file, name)).read_bytes(), name) for file in (*LIBRARY, *MODEL)}
-    written = []
-    for file, content in package_files(Bundle.load(out / BUNDLE), facts, code).items():
-        path = out / file
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
-        written.append(path)
-    return written
-
-
-def package_files(bundle: Bundle, facts: Mapping[str, Any], code: Mapping[str, bytes]) -> dict[str, bytes]:
-    """Return the contents of the files that `package` adds, by their paths in the export.
-
-    ``code`` holds the library and the model without the name of the export (`plushsense.deploy.emit.code_files`).
+    The packages are an Arduino library, an ESP-IDF component, a CMake project and a Zephyr module. ``code`` holds the
+    library and the model without the name of the export (`plushsense.deploy.code.code_files`).
 
     Raises:
         LayoutError: for a layout with values that the toy's line format cannot represent.
     """
     rendered = firmware(bundle.layout, bundle.scaler, facts)
-    name = str(facts.get("name", ""))
+    name = facts.name
     header = prefixed(code[LIBRARY[0]].decode(), name)
     c_folder = files("plushsense.deploy") / "c"
     licence = (c_folder / LICENCE).read_text(encoding="utf-8")
-    simulated = " SIMULATION: trained on a virtual toy." if facts["simulated"] else ""
+    simulated = " SIMULATION: trained on a virtual toy." if facts.simulated else ""
     paragraph = (
-        f"Model {facts['title']}: {facts['classes']} gestures from {len(facts['channels'])} channels "
-        f"(layout {facts['layout']}), an answer every {facts['step_ms']:g} ms.{simulated}"
+        f"Model {facts.title}: {facts.classes} gestures from {len(facts.channels)} channels "
+        f"(layout {facts.layout}), an answer every {facts.step_ms:g} ms.{simulated}"
     )
     values = {
-        "version": facts["model_version"],
-        "url": facts.get("url", NO_PAGE),
+        "version": facts.model_version,
+        "url": facts.url or NO_PAGE,
         **_folders(name),
         "author": "The PlushSense developers",
         "sentence": "What a soft toy feels: a small streaming network in whole numbers.",
@@ -136,21 +100,15 @@ def package_files(bundle: Bundle, facts: Mapping[str, Any], code: Mapping[str, b
         texts |= {f"{ARDUINO}/src/{file}": rendered[file], f"{IDF}/{_component_path(file)}": rendered[file]}
     for file in _EXAMPLE:
         texts |= {f"{SKETCH}/{file}": rendered[file], f"{IDF_EXAMPLE}/main/{file}": rendered[file]}
-    contents = {_named_path(file, name): prefixed(text, name).encode() for file, text in texts.items()}
-    plain = {
-        prefixed(file, name): prefixed(text.decode(), name).encode() for file, text in code.items() if file != IMAGE
-    }
-    return contents | {copy: plain[original] for copy, original in copies(name).items()}
+    own = {file: content.decode() for file, content in code.items() if file != IMAGE}
+    texts |= {f"{ARDUINO}/src/{file}": text for file, text in own.items()}
+    texts |= {f"{IDF}/{_component_path(file)}": text for file, text in own.items()}
+    contents = {file: prefixed(text, name).encode() for file, text in (own | {IMAGE: ""} | texts).items()}
+    return {_named_path(file, name): content for file, content in (contents | {IMAGE: code[IMAGE]}).items()}
 
 
-def copies(name: str = "") -> dict[str, str]:
-    """Return the files of the packages that are copies, mapped to their originals, relative to the export folder.
-
-    ``name`` is that of the export.
-    """
-    files = (*LIBRARY, *MODEL)
-    found = {f"{ARDUINO}/src/{f}": f for f in files} | {f"{IDF}/{_component_path(f)}": f for f in files}
-    return {_named_path(copy, name): prefixed(original, name) for copy, original in found.items()}
+def _component_path(name: str) -> str:
+    return f"{'include' if name.endswith('.h') else 'src'}/{name}"
 
 
 def _named_path(path: str, name: str) -> str:
@@ -205,7 +163,7 @@ def _holds(path: Path, content: bytes) -> bool:
         return False
 
 
-def handbook(bundle: Bundle, facts: Mapping[str, Any]) -> str:
+def handbook(bundle: Bundle, facts: ModelFacts) -> str:
     """Render the README in Markdown from the ``facts`` (of ``export.json``) and the bundle, not yet `prefixed`."""
     layout = bundle.layout
     ranges = layout.valid_min_int.tolist(), layout.valid_max_int.tolist()
@@ -213,14 +171,15 @@ def handbook(bundle: Bundle, facts: Mapping[str, Any]) -> str:
     return _fill(
         "templates/README.md",
         facts=facts,
-        **_folders(str(facts.get("name", ""))),
+        **_folders(facts.name),
         channels=list(zip(layout.channels, c_names(layout.names), *ranges, strict=True)),
         provenance=bundle.provenance,
         personal=bundle.personal,
         toy_bytes=TOY_BYTES,
         samples_of_gap=samples_of_gap,
-        answers_of_gap=-(-samples_of_gap // int(facts["step"])),
+        answers_of_gap=-(-samples_of_gap // facts.step),
         bundle=BUNDLE,
+        calibrate=bool(layout.self_calibration),
         image=IMAGE,
         facts_file=FACTS,
     )
@@ -228,10 +187,6 @@ def handbook(bundle: Bundle, facts: Mapping[str, Any]) -> str:
 
 def _fill(template: str, **values: Any) -> str:
     return fill_text("plushsense.deploy", f"{template}.j2", **values)
-
-
-def _component_path(name: str) -> str:
-    return f"{'include' if name.endswith('.h') else 'src'}/{name}"
 
 
 def _keywords(headers: str) -> str:
@@ -271,7 +226,7 @@ class _ChannelSource:
     note: str = ""
 
 
-def firmware(layout: Layout, scaler: Scaler, facts: Mapping[str, Any]) -> dict[str, str]:
+def firmware(layout: Layout, scaler: Scaler, facts: ModelFacts) -> dict[str, str]:
     """Render the files of `FIRMWARE` for a model with these ``facts`` (of ``export.json``), by name.
 
     Raises:
@@ -282,12 +237,12 @@ def firmware(layout: Layout, scaler: Scaler, facts: Mapping[str, Any]) -> dict[s
     names = {c.name: f"PLUSH_CHANNEL_{n}" for c, n in zip(layout.channels, c_names(layout.names), strict=True)}
     indent = " *     "
     values = {
-        "title": c_comment(facts["title"]),
+        "title": c_comment(facts.title),
         "layout": c_comment(layout.name),
-        "classes": facts["classes"],
+        "classes": facts.classes,
         "period_ms": f"{layout.period_us / 1000:g}",
         "gap_ms": layout.gap_ms,
-        "warming_s": f"{facts['span'] * layout.period_us / 1e6:.2g}",
+        "warming_s": f"{facts.span * layout.period_us / 1e6:.2g}",
         "decimal": any(f != (1, 0) for f in formats),
         "delay_only": DEVICE_MS not in layout.wire,
         "fields": textwrap.fill(c_comment(" ".join(layout.wire)), 110, initial_indent=indent, subsequent_indent=indent),

@@ -56,7 +56,7 @@ class PaperEstimate:
         """Time in ms at the rate of 16-bit integers."""
         return self.macs / INT16_MMAC_S / 1000
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         return {
             "what": self.what,
@@ -79,11 +79,11 @@ class PaperComparison:
     window_ms: tuple[float, float] | None
     float_bytes: int
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         return {
             "mmac_s": {"float": FLOAT_MMAC_S, "int16": INT16_MMAC_S},
-            "estimates": [e.to_dict() for e in self.estimates],
+            "estimates": [e.to_json() for e in self.estimates],
             "ours_step_ms": None if self.step_ms is None else [round(ms, 3) for ms in self.step_ms],
             "ours_window_ms": None if self.window_ms is None else [round(ms, 1) for ms in self.window_ms],
             "float_weights_bytes": self.float_bytes,

@@ -14,7 +14,7 @@ import numpy as np
 
 from plushsense.core.errors import BadInput, ProgramError, ToolError
 from plushsense.core.toml import load_table, read_toml
-from plushsense.deploy.emit import GOLDEN, LIBRARY, MODEL
+from plushsense.deploy.code import GOLDEN, LIBRARY, MODEL, ModelFacts
 from plushsense.deploy.golden import read_golden
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.targets import (
@@ -106,7 +106,7 @@ class Estimate:
         """Verdict as text, with the rate of steps."""
         return f"fits {1000 / self.step_ms:g} Hz: {self.answer}"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the estimate as plain values for JSON."""
         core = self.core
         return {
@@ -228,7 +228,7 @@ class Cost:
         """Helper functions for floating point that the library requires; should be empty."""
         return tuple(s for s in self.needs if _FLOAT.match(s))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the cost as plain values for JSON."""
         return {
             "title": TARGETS[self.target].title,
@@ -256,9 +256,7 @@ class Cost:
         }
 
 
-def count(
-    folder: Path, target: str, facts: Mapping[str, Any], optimise: str = "-O2", *, code: Path | None = None
-) -> Cost:
+def count(folder: Path, target: str, facts: ModelFacts, optimise: str = "-O2", *, code: Path | None = None) -> Cost:
     """Build the C code of an export folder for a target, run it there, and count instructions.
 
     The folder is only read. ``code`` is another folder from which to take the C code.
@@ -284,7 +282,7 @@ def count(
         if counts:
             staged = same(sources, work / "stages", defines={"PLUSH_STAGES": 1})
             rows = np.frombuffer(staged.run(), dtype="<i4").astype(np.int64).reshape(-1, len(STAGES))
-            bound, rows = _bound(rows[-2], rows[-1], int(facts["step"])), rows[:-2]
+            bound, rows = _bound(rows[-2], rows[-1], facts.step), rows[:-2]
             stages = {name: _mean(rows[:, i]) for i, name in enumerate(STAGES)}
             stages = {"clock": _mean(rows_jittered[:-1, 0]) - sum(stages.values()), **stages}
         objects = {"plushsense": whole.objects[2], "plush_model": whole.objects[1]}
@@ -334,16 +332,16 @@ def _bound(most: Ints, least: Ints, step: int) -> int:
     return int(frame + forget + samples * sum(sample) + -(-samples // together) * network + answers * answer)
 
 
-def _streams(folder: Path, facts: Mapping[str, Any]) -> tuple[Ints, Ints, Ints]:
+def _streams(folder: Path, facts: ModelFacts) -> tuple[Ints, Ints, Ints]:
     """Return frames at even times, the same readings with jitter and the longest bridged gap at the end, and stress.
 
     The latter are readings at the ends of all golden frames, valid or not, mostly after gaps. The other readings are
     touches near the beginning of the golden frames, which have no faults. Their counted part begins and ends with a
     frame without jitter, so that it contains a whole number of samples. The gap completes a step.
     """
-    span, step, period_us = int(facts["span"]), int(facts["step"]), int(facts["period_us"])
-    gap_ms = int(facts["gap_ms"])
-    frames, _ = read_golden(folder / GOLDEN, len(facts["channels"]), int(facts["classes"]))
+    span, step, period_us = facts.span, facts.step, facts.period_us
+    gap_ms = facts.gap_ms
+    frames, _ = read_golden(folder / GOLDEN, len(facts.channels), facts.classes)
     clean = frames[6 : 6 + span, 1:]
     if len(clean) < span:
         raise BadInput(f"'{folder / GOLDEN}' holds too few frames: export the model again.")
@@ -363,7 +361,7 @@ def _streams(folder: Path, facts: Mapping[str, Any]) -> tuple[Ints, Ints, Ints]:
     return even, np.vstack([jittered, last]), stress
 
 
-def _whole(program: Program, facts: Mapping[str, Any]) -> tuple[list[int], Ints, Ints]:
+def _whole(program: Program, facts: ModelFacts) -> tuple[list[int], Ints, Ints]:
     """Run the program; return its seven numbers about the toy, and a table of the steps of each stream.
 
     The tables, even (n, 3) and jittered (n + 1, 3), omit the first decision; the latter ends with the gap.
@@ -379,7 +377,7 @@ def _whole(program: Program, facts: Mapping[str, Any]) -> tuple[list[int], Ints,
     n = STEPS
     if (len(even), len(jittered)) != (n, n + 1):
         raise ProgramError(
-            f"The C in the export gave {len(even)} answers on {program.target.name} where {n} steps of {facts['step']} "
+            f"The C in the export gave {len(even)} answers on {program.target.name} where {n} steps of {facts.step} "
             "samples should: plushsense verify shows where it goes wrong."
         )
     return numbers[:7].tolist(), even, jittered
@@ -439,7 +437,7 @@ class Profile:
     ``missing`` maps each target that is not installed to the Debian packages that it needs.
     """
 
-    facts: Mapping[str, Any]
+    facts: ModelFacts
     arch: Arch
     optimise: str
     costs: Mapping[str, Cost]
@@ -449,7 +447,7 @@ class Profile:
     @property
     def step_ms(self) -> float:
         """Time between two decisions."""
-        return float(self.facts["step_ms"])
+        return self.facts.step_ms
 
     @property
     def macs_by_layer(self) -> dict[str, int]:
@@ -467,7 +465,7 @@ class Profile:
         ratio = self.arch.macs_per_window / self.arch.macs_per_step
         return {name: round(c.stages["network"] * ratio) for name, c in self.costs.items() if c.stages}
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return plain values for JSON, as ``plushsense profile --json`` prints them."""
         counted = {name: c for name, c in self.costs.items() if c.step is not None}
         return {
@@ -484,9 +482,9 @@ class Profile:
             "macs_by_layer": self.macs_by_layer,
             "flash_bytes": {name: c.flash_bytes for name, c in self.costs.items()},
             "ram_bytes": {name: c.ram_bytes for name, c in self.costs.items()},
-            "estimated_ms": {name: e.to_dict() for name, e in self.estimates.items()},
+            "estimated_ms": {name: e.to_json() for name, e in self.estimates.items()},
             "estimated_window_instructions": self.window_instructions,
-            "targets": {name: c.to_dict() for name, c in self.costs.items()},
+            "targets": {name: c.to_json() for name, c in self.costs.items()},
             "missing": {name: list(packages) for name, packages in self.missing.items()},
         }
 
@@ -542,6 +540,6 @@ def profile(
     estimates = {
         core.name: found
         for core in cores()
-        if core.target in costs and (found := estimate(core, costs[core.target], arch, float(facts["step_ms"])))
+        if core.target in costs and (found := estimate(core, costs[core.target], arch, facts.step_ms))
     }
     return Profile(facts, arch, optimise, costs, estimates, missing)

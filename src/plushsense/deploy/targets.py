@@ -171,20 +171,24 @@ def build(
             else:
                 name = _object_name(source, compiling, include)
             objects.append((object_folder or out_dir) / name)
-            if object_folder and objects[-1].exists():
-                continue
-            made = Path(work) / name
-            _compile([*compiling, *included, "-c", str(source.resolve()), "-o", str(made)], Path(work), source.name)
-            # Programs that are built at the same time share the folder: a file appears there complete, and the object
-            # file after the compiler's reports beside it.
-            for file in sorted(Path(work).glob(f"{made.stem}.*"), reverse=True):
-                file.replace(objects[-1].with_name(file.name))
+            if not (object_folder and objects[-1].exists()):
+                _compile_object(source, [*compiling, *included], objects[-1], Path(work))
         inputs = [str(file) for file in objects]
         file = out_dir / f"program-{target}{'.exe' if sys.platform == 'win32' and not machine.run else ''}"
         collect = ["-Wl,--gc-sections"] if machine.run else []
         command = [compiler, *machine.flags, optimise, *flags, *collect, *inputs, "-o", str(file), *machine.link]
         _compile(command, Path(work), "the program")
     return Program(machine, file, tuple(objects[: len(sources)]))
+
+
+def _compile_object(source: Path, compiling: Sequence[str], out: Path, work: Path) -> None:
+    """Compile ``source`` to ``out``, with the compiler's reports beside it; ``work`` is an own folder."""
+    made = work / out.name
+    _compile([*compiling, "-c", str(source.resolve()), "-o", str(made)], work, source.name)
+    # Programs that are built at the same time share the folder: a file appears there complete, and the object file
+    # after the reports.
+    for file in sorted(work.glob(f"{made.stem}.*"), reverse=True):
+        file.replace(out.with_name(file.name))
 
 
 def _object_name(source: Path, command: Sequence[str], include: Iterable[Path]) -> str:

@@ -13,7 +13,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -29,7 +29,7 @@ from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.recording.session import OpenSession
 from plushsense.recording.session_files import SessionEvent, SessionHead
 from plushsense.recording.status import PlanProgress, RecorderState, RecorderStatus, StepResult, key_of
-from plushsense.recording.takes import AWAY_S, Ended, FrameReceiver, RecordingTake, gap_entry, sidecar
+from plushsense.recording.takes import AWAY_S, Ended, FrameReceiver, RecordingTake, StreamGap, sidecar
 from plushsense.recording.writer import BackgroundWriter, StreamFile, lacks_descriptor, save_take, to_frames
 
 _NO_DESCRIPTOR = Message(
@@ -167,7 +167,7 @@ class Recorder:
             return last.device_ms + round(1000.0 * (self.protocol.countdown_s - self._passed_s()))
 
     @property
-    def gaps(self) -> list[dict[str, Any]]:
+    def gaps(self) -> list[StreamGap]:
         """Gaps since this recorder started, as in the sidecars, but with ``after_row`` in rows of the stream."""
         with self._changed:
             return list(self._receiver.gaps)
@@ -489,7 +489,7 @@ class Recorder:
         waiting = self._receiver.away or (self._speed == 1.0 and self._receiver.silent)
         if waiting and ended in ("space", "toy"):
             silent_ms = self._receiver.silent_ms
-            take.gaps.append(gap_entry(len(take.frames), take.frames[-1], None, silent_ms, "nothing came any more"))
+            take.gaps.append(StreamGap.of(len(take.frames), take.frames[-1], None, silent_ms, "nothing came any more"))
         self._take = None
         counters = Counters(**self.device.counters.to_dict())
         self._enter("saving")
@@ -583,13 +583,13 @@ class Recorder:
             self._writer.add_frames(self._received, self._receiver.toy_ms)
         self._received = []
 
-    def _gap(self, gap: dict[str, Any]) -> None:
+    def _gap(self, gap: StreamGap) -> None:
         """Log a gap of the stream, add it to a running recording, and show a message if it is long."""
-        (self._log_step if self._take is not None else self._log)("gap", **gap)
+        (self._log_step if self._take is not None else self._log)("gap", **gap.to_json())
         if self._take is not None:
-            self._take.gaps.append(gap | {"after_row": len(self._take.frames)})
-        if gap["missing_ms"] >= 1000.0 * AWAY_S:
-            away_s = round(gap["missing_ms"] / 1000.0, 1)
+            self._take.gaps.append(replace(gap, after_row=len(self._take.frames)))
+        if gap.missing_ms >= 1000.0 * AWAY_S:
+            away_s = round(gap.missing_ms / 1000.0, 1)
             if self._state == "countdown":
                 self._cancel(Message("The toy was disconnected for {s:.1f} s: press space again.", s=away_s))
             elif self._state == "recording":
@@ -653,7 +653,7 @@ def store_take(
         longest_s = session.protocol.longest_s
         message = Message("Nobody stopped the recording: it ended after {s:g} s; r records it again.", s=longest_s)
     elif take.gaps:
-        longest = max(gap["missing_ms"] for gap in take.gaps) / 1000.0
+        longest = max(gap.missing_ms for gap in take.gaps) / 1000.0
         if longest >= 0.05:
             message = Message("This recording has a gap of {s:.1f} s; it is kept, r records it again.", s=longest)
         else:

@@ -50,7 +50,7 @@ Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
-class SimulationSummary:
+class SimulationResult:
     """Size of a simulated data set; ``lost`` counts frames."""
 
     folder: str
@@ -167,7 +167,7 @@ def simulate(
     gestures: Sequence[str] | None = None,
     layout: Layout | str = "plush-15",
     world: World = WORLD,
-) -> SimulationSummary:
+) -> SimulationResult:
     """Write a simulated data set, by default of the size of the authors' archive.
 
     These are 25 people × 17 gestures × 3, of which 25 recordings are missing, and 51 at rest: 1301.
@@ -188,29 +188,22 @@ def simulate(
         DatasetError: if the folder is not empty.
     """
     labels = tuple(gestures) if gestures is not None else GESTURES
-    unknown = [label for label in labels if label not in GESTURES]
-    if unknown:
-        raise ConfigError(f"The virtual people know no gesture '{unknown[0]}'; they know {', '.join(GESTURES)}.")
-    sizes = (("people", people, 1, 9999), ("repetitions", repetitions, 1, 1000), ("seed", seed, 0, 2**31))
-    for name, value, low, high in sizes:
-        if not low <= value <= high:
-            raise ConfigError(f"{name} is {value}; a whole number from {low} to {high} is accepted.")
+    _check(labels, people, repetitions, seed)
     resting = max(3, round(len(labels) * repetitions * people / 25)) if at_rest is None else at_rest
-    folder = Path(out)
     resolved = layout if isinstance(layout, Layout) else load_layout(layout)
     width = max(2, len(str(people)))
-    sessions: list[tuple[str, int | None]] = [(f"P{who:0{width}d}", who) for who in range(1, people + 1)]
-    if resting > 0:
-        sessions.append((NOBODY, None))
     made = {label: repetitions_made(label, people, repetitions, seed) for label in labels}
+    sessions: dict[str, tuple[int | None, list[tuple[str, int]]]] = {
+        f"P{who + 1:0{width}d}": (who + 1, [(label, made[label][who]) for label in labels]) for who in range(people)
+    }
+    if resting > 0:
+        sessions[NOBODY] = None, [(AT_REST, resting)]
     recordings = rows = stream_rows = lost = 0
     # Write the folder completely or not at all: an incomplete one would look like a small data set.
-    with new_folder(folder, DatasetError) as work:
-        (work / SIMULATION_MARK).write_text(
-            f"Recordings of the virtual toy, seed {seed}. Nobody touched anything.\n", "utf-8"
-        )
-        for done, (name, who) in enumerate(sessions, 1):
-            parts = [(AT_REST, resting)] if who is None else [(label, made[label][who - 1]) for label in labels]
+    with new_folder(Path(out), DatasetError) as work:
+        mark = f"Recordings of the virtual toy, seed {seed}. Nobody touched anything.\n"
+        (work / SIMULATION_MARK).write_text(mark, "utf-8")
+        for done, (name, (who, parts)) in enumerate(sessions.items(), 1):
             take = _session(who, seed, parts, resolved, world)
             rows += _write(work / name, take, resolved)
             recordings += len(take.cuts)
@@ -218,7 +211,18 @@ def simulate(
             lost += take.lost
             if progress is not None:
                 progress(done, len(sessions), name)
-    return SimulationSummary(str(folder), people, recordings, rows, stream_rows, lost, seed)
+    return SimulationResult(str(Path(out)), people, recordings, rows, stream_rows, lost, seed)
+
+
+def _check(labels: Sequence[str], people: int, repetitions: int, seed: int) -> None:
+    """Raise ConfigError for an unknown gesture or a number out of range."""
+    unknown = [label for label in labels if label not in GESTURES]
+    if unknown:
+        raise ConfigError(f"The virtual people know no gesture '{unknown[0]}'; they know {', '.join(GESTURES)}.")
+    sizes = (("people", people, 1, 9999), ("repetitions", repetitions, 1, 1000), ("seed", seed, 0, 2**31))
+    for name, value, low, high in sizes:
+        if not low <= value <= high:
+            raise ConfigError(f"{name} is {value}; a whole number from {low} to {high} is accepted.")
 
 
 RECORDED = "recordings"
@@ -227,7 +231,7 @@ TRUTH = "truth.jsonl"
 
 
 @dataclass(frozen=True)
-class PlayedScenario:
+class PlayResult:
     """What `play_to_folder` has written: the true gestures, and what a reader of the toy counts."""
 
     folder: str
@@ -241,7 +245,7 @@ class PlayedScenario:
         return asdict(self)
 
 
-def play_to_folder(spec: ToySpec, out: str | os.PathLike[str], layout: Layout | str = "plush-15") -> PlayedScenario:
+def play_to_folder(spec: ToySpec, out: str | os.PathLike[str], layout: Layout | str = "plush-15") -> PlayResult:
     """Play the scenario of a virtual toy into a folder, as its lines are read without waiting.
 
     ``fulldatastream.csv`` is the whole stream (``replay://OUT``), ``truth.jsonl`` has the true gestures, and
@@ -278,7 +282,7 @@ def play_to_folder(spec: ToySpec, out: str | os.PathLike[str], layout: Layout | 
             mine = people == who
             take = _Take(_rows_of(stream, mine), log.cuts(who, stream, mine), 0)
             _write(work / RECORDED / f"P{who:02d}", take, resolved)
-    return PlayedScenario(str(out), tuple(everybody), len(log.truth), log.passed_ms / 1000.0, log.counters)
+    return PlayResult(str(out), tuple(everybody), len(log.truth), log.passed_ms / 1000.0, log.counters)
 
 
 class _PlayLog:

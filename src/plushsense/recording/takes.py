@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -101,7 +101,7 @@ class RecordingTake:
     """Recording in progress.
 
     It begins at ``row`` of the session's stream, at the time ``from_s`` of the computer's monotonic clock; ``before``
-    are the counters at that time. ``lost`` frames are missing between its rows; ``gaps`` are of the form `gap_entry`.
+    are the counters at that time. ``lost`` frames are missing between its rows.
     """
 
     step: Step
@@ -110,18 +110,28 @@ class RecordingTake:
     before: Counters
     frames: list[Frame] = field(default_factory=list)
     lost: int = 0
-    gaps: list[dict[str, Any]] = field(default_factory=list)
+    gaps: list[StreamGap] = field(default_factory=list)
 
 
-def gap_entry(rows: int, last: Frame, now: Frame | None, missing_ms: float, reason: str) -> dict[str, Any]:
-    """Return the description of a gap: number of rows before it, both clocks before and after it, length, reason."""
-    return {
-        "after_row": rows,
-        "device_ms": [last.device_ms, now.device_ms if now else None],
-        "host_ms": [last.host_ms, now.host_ms if now else None],
-        "missing_ms": round(missing_ms),
-        "reason": reason,
-    }
+@dataclass(frozen=True)
+class StreamGap:
+    """A gap: number of rows before it, both clocks before and after it (None: it has not ended), length, reason."""
+
+    after_row: int
+    device_ms: tuple[int, int | None]
+    host_ms: tuple[int, int | None]
+    missing_ms: int
+    reason: str
+
+    @classmethod
+    def of(cls, rows: int, last: Frame, now: Frame | None, missing_ms: float, reason: str) -> StreamGap:
+        """Return the gap between two frames; ``now`` is None if nothing came any more."""
+        clocks = (last.device_ms, now.device_ms if now else None), (last.host_ms, now.host_ms if now else None)
+        return cls(rows, *clocks, round(missing_ms), reason)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the gap as sidecars and the log hold it."""
+        return asdict(self)
 
 
 def measured_rate_hz(device_ms: Any) -> float:
@@ -171,7 +181,7 @@ def sidecar(
         "malformed": counters.malformed - take.before.malformed,
         "garbage": int(outside.any(axis=1).sum()),
         "reconnects": counters.reconnects - take.before.reconnects,
-        "gaps": take.gaps,
+        "gaps": [gap.to_json() for gap in take.gaps],
         "ended": ended,
         "auto_stopped": ended == "longest",
         "layout": layout.name,
@@ -197,7 +207,7 @@ class ReceivedFrame(NamedTuple):
 
     frame: Frame
     missing: int
-    gap: dict[str, Any] | None
+    gap: StreamGap | None
 
 
 class FrameReceiver:
@@ -215,7 +225,7 @@ class FrameReceiver:
         self.toy_ms = 0.0
         self.last: Frame | None = None
         self.lost = 0
-        self.gaps: list[dict[str, Any]] = []
+        self.gaps: list[StreamGap] = []
         self._device = device
         self._layout = layout
         self._real = speed == 1.0
@@ -298,7 +308,7 @@ class FrameReceiver:
         if last is not None and (odd or step_ms > self._layout.gap_ms or returned):
             missing_ms = max(on_host, 0 if odd else step_ms)
             reason = "another toy" if another else self._reason(step_ms, odd, returned)
-            gap = gap_entry(self.rows, last, frame, missing_ms, reason)
+            gap = StreamGap.of(self.rows, last, frame, missing_ms, reason)
             self.gaps.append(gap)
         self._monitor.push(came.device_ms)
         self.last = frame

@@ -449,7 +449,7 @@ def _profile(folder: Path, reporter: TaskReporter) -> dict[str, Any]:
     digest = folder_digest(folder)
     reporter.progress(stage="profile")
     try:
-        return {"digest": digest, **profile(folder, progress=partial(reporter.stage, "profile")).to_dict()}
+        return {"digest": digest, **profile(folder, progress=partial(reporter.stage, "profile")).to_json()}
     except ToolError as refusal:
         # Not an error: an export without a profile is valid.
         return {"digest": digest, "refused": refusal.message}
@@ -465,7 +465,7 @@ def run_export(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         also=spec.get("also", ()),
         warn=reporter.warn,
     )
-    return {**done.to_dict(), "profile": _profile(Path(spec["place"]), reporter)}
+    return {**done.to_json(), "profile": _profile(Path(spec["place"]), reporter)}
 
 
 _SAMPLES = 100_000
@@ -491,7 +491,7 @@ def run_verify(spec: dict[str, Any], reporter: TaskReporter) -> dict[str, Any]:
         trust=bool(spec.get("trust")),
         progress=partial(reporter.stage, "verify"),
     )
-    return {**done.to_dict(), "digest": digest}
+    return {**done.to_json(), "digest": digest}
 
 
 TASKS: dict[str, Callable[[dict[str, Any], TaskReporter], dict[str, Any]]] = {

@@ -11,7 +11,7 @@ from typing import Any
 from plushsense.core.errors import ConfigError
 from plushsense.dataset.index import open_dataset
 from plushsense.dataset.store import Dataset
-from plushsense.deploy.emit import FACTS
+from plushsense.deploy.code import FACTS
 from plushsense.devices.opening import open_device
 from plushsense.devices.virtual.stream import VirtualDevice
 from plushsense.live.loop import run_live

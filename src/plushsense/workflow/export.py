@@ -18,10 +18,10 @@ from plushsense.core.sentences import Message
 from plushsense.dataset.importing.saved_windows import SETS, SIMULATED
 from plushsense.dataset.index import as_dataset
 from plushsense.dataset.store import Dataset
-from plushsense.deploy.convert import CONVERTERS, check_format, convert
+from plushsense.deploy.code import IMAGE, check_names, read_facts
+from plushsense.deploy.convert import check_format
 from plushsense.deploy.convert.matlab import cells, mat_bytes
-from plushsense.deploy.emit import IMAGE, ExportResult, check_model_version, check_name, check_page, emit, read_facts
-from plushsense.deploy.package import package
+from plushsense.deploy.emit import ExportResult, emit
 from plushsense.deploy.quantize import calibrated, integer_model, refuse_undeployable
 from plushsense.evaluation.crossval import fold_windows
 from plushsense.models.bundle import Bundle, is_training_content
@@ -146,9 +146,9 @@ def export(
             version or address that is not accepted.
         BadInput: for a folder that is not empty.
     """
-    check_name(name)
-    if url:
-        check_page(url)
+    check_names(name, url=url, model_version=model_version)
+    for other in also:
+        check_format(other)
     given = bundle if isinstance(bundle, Bundle) else Bundle.load(Path(bundle))
     refuse_image(given.arch)
     windows = None
@@ -159,31 +159,8 @@ def export(
             windows = windows[:: -(-len(windows) // _TRIED)]
         given = calibrated_on(given, dataset, warn if windows is None else silent)
     if model_version:
-        check_model_version(model_version)
         given = replace(given, provenance=given.provenance | {"model_version": model_version})
-    model = integer_model(given)
-    given = given.without_people()
-
-    for other in also:
-        check_format(other)
-
-    def converted(folder: Path, facts: dict[str, Any]) -> None:
-        facts |= {"url": url} if url else {}
-        conversions = {other: _converted(given, folder, other, windows) for other in dict.fromkeys(also)}
-        facts |= {"conversions": conversions} if conversions else {}
-
-    return emit(model, given, Path(out), extras=[converted, package], name=name)
-
-
-def _converted(bundle: Bundle, folder: Path, name: str, windows: NDArray[np.int32] | None) -> dict[str, Any]:
-    """Write the network in the format ``name``; return the facts about the file."""
-    done = convert(bundle, folder / CONVERTERS[name].file_name, name, windows=windows)
-    return {
-        "file": done.path.name,
-        "bytes": done.bytes,
-        "largest_difference": done.largest_difference,
-        "notes": list(done.notes),
-    }
+    return emit(integer_model(given), given, Path(out), name=name, url=url, also=also, windows=windows)
 
 
 @dataclass(frozen=True)

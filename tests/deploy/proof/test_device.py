@@ -19,7 +19,7 @@ import pytest
 from plushsense.cli.main import main
 from plushsense.core.gestures import Gesture, GestureSet
 from plushsense.deploy.emit import emit
-from plushsense.deploy.package import ON_CHIP, package
+from plushsense.deploy.package import ON_CHIP
 from plushsense.deploy.proof import device
 from plushsense.deploy.proof.vectors import Export
 from plushsense.deploy.quantize import integer_model
@@ -39,7 +39,7 @@ def export(tmp_path_factory: pytest.TempPathFactory) -> Path:
     gestures = GestureSet("three", (Gesture("pat", "positive"), Gesture("hit", "negative"), Gesture("rest", "none")))
     bundle = bundle_of("accel-3", window=60, gestures=gestures)
     out = tmp_path_factory.mktemp("chip") / "out"
-    emit(integer_model(bundle), bundle, out, extras=[package])
+    emit(integer_model(bundle), bundle, out)
     golden = Export(out).golden
     few = golden.answers[golden.answers[:, 1] < 300]
     (out / "golden" / "frames.bin").write_bytes(golden.frames[:300].astype("<u4").tobytes())

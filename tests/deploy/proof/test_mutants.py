@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from plushsense.core.errors import BadInput
-from plushsense.deploy.emit import library_text
+from plushsense.deploy.code import library_files
 from plushsense.deploy.proof.mutants import mutants_of, source_mutants
 from plushsense.deploy.quantize import integer_model
 from support.exports import bundle_of
 
 
 def test_the_texts_of_the_mutants_occur_in_the_c(small: Path) -> None:
-    source = library_text("plushsense.c")
+    source = library_files()["plushsense.c"]
     found = mutants_of((small / "plush_model.bin").read_bytes(), source)
     assert len({f.name for f in found}) == len(found)
     assert len(found) == len([m for m in source_mutants() if m.when != "vectors"]) + 10
@@ -36,7 +36,7 @@ def test_the_texts_of_the_mutants_occur_in_the_c(small: Path) -> None:
 def test_the_weight_that_is_changed_is_the_largest_of_a_filter(layout: str, symbol: str) -> None:
     model = integer_model(bundle_of(layout, symbol))
     image = np.frombuffer(model.to_bytes(), dtype=np.uint8).astype(int)
-    found = {m.name: m for m in mutants_of(model.to_bytes(), library_text("plushsense.c"))}
+    found = {m.name: m for m in mutants_of(model.to_bytes(), library_files()["plushsense.c"])}
     parts = {f"layer {n}": layer.weights for n, layer in enumerate(model.network.layers, 1)}
     for name, weights in (parts | {"the dense layer": model.network.dense.weights}).items():
         changed = np.frombuffer(found[f"one weight of {name} by one"].image or b"", dtype=np.uint8).astype(int)

@@ -415,9 +415,9 @@ def read_json(file: TableFile) -> ImportedColumns:
         first = next((item for _, item in objects if isinstance(item, dict)), None)
         there = list(dict.fromkeys(_paths(first)))
     except RecursionError:
-        raise file.error("holds JSON objects that are nested too deeply") from None
+        raise file.error("'{file}' holds JSON objects that are nested too deeply") from None
     if first is None:
-        raise file.error("holds no JSON object: accepted is one object a line, or a list of objects")
+        raise file.error("'{file}' holds no JSON object: accepted is one object a line, or a list of objects")
     at = file.choose_columns(there)
     for name in file.pattern.bits:
         _bit_column(file, name, there)
@@ -625,7 +625,9 @@ def read_parquet(file: TableFile) -> ImportedColumns:
     pattern = file.pattern
     if pattern.bits or pattern.missing:
         key = "bits" if pattern.bits else "missing"
-        raise file.error(f"is a Parquet table, whose columns have types: {key} is for text, leave it out")
+        raise file.error(
+            "'{file}' is a Parquet table, whose columns have types: {key} is for text, leave it out", key=key
+        )
     pl = need("polars", extra="tables")
     try:
         with file.path.open("rb") as opened:
@@ -649,7 +651,9 @@ def read_parquet(file: TableFile) -> ImportedColumns:
         numbers = {r: _parquet_numbers(pl, table[n]) for r, n in names.items() if r not in PARTS}
         in_ms = "time" in names and table[names["time"]].dtype.is_temporal()
         if pattern.time_unit == "iso" and "time" in names and not in_ms:
-            raise file.error(f"has no dates in column '{names['time']}': leave time_unit out, or give a unit")
+            raise file.error(
+                "'{file}' has no dates in column '{column}': leave time_unit out, or give a unit", column=names["time"]
+            )
     except FileFormatError:
         raise
     except BaseException as cause:

@@ -283,8 +283,10 @@ class TableImport:
         if len(mine) != 1:
             listed = f"several files of intervals ({', '.join(i.name for i in mine[:3])})" if mine else "no such file"
             raise table.error(
-                f"has its labels in another file, and {listed} belongs to it: intervals in the pattern, now "
-                f"'{self.pattern.intervals}', needs the same parts as paths"
+                "'{file}' has its labels in another file, and {listed} belongs to it: intervals in the pattern, now "
+                "'{intervals}', needs the same parts as paths",
+                listed=listed,
+                intervals=self.pattern.intervals,
             )
         times = columns.numbers["time"]
         factor, _ = self._factor(columns, times)

@@ -42,11 +42,12 @@
 extern "C" {
 #endif
 
-#ifdef PLUSH_CALIBRATE /* models whose sensors find their offset and scale themselves */
+/* #undef PLUSH_CALIBRATE */
+#ifdef PLUSH_CALIBRATE /* a model whose sensors find their offset and scale themselves; see plush_calibrate.h */
 #define PLUSH_IMAGE_VERSION 8
 #else
 #define PLUSH_IMAGE_VERSION 6
-#endif /* PLUSH_CALIBRATE */
+#endif
 #define PLUSH_MAX_LAYERS 4
 #define PLUSH_ONE 32768 /* a confidence or probability of 1 */
 #define PLUSH_NO_GESTURE 255
@@ -141,40 +142,6 @@ typedef struct {
     uint32_t *tap_sums;     /* for each of the next `dilation` samples: sum of the activations already under its taps */
 } plush_layer;
 
-#ifdef PLUSH_CALIBRATE
-/* What is known of an accelerometer: sums over the blocks so far. */
-typedef struct {
-    int64_t first[3], second[6];           /* weighted sums of the means, and of their products */
-    int64_t square, third[3], fourth;      /* of q, the square of the length, of q times the means, and of q times q */
-    int32_t centre[3];
-    uint32_t weight;
-} plush_sphere;
-
-#define PLUSH_KEPT 8
-
-/* What is known of another sensor, of one channel or of three axes: sums of still blocks, and what follows. */
-typedef struct {
-    int64_t spread;                        /* with 10 fraction bits */
-    int32_t kept[PLUSH_KEPT][3], rest[3];
-    uint32_t spare;                        /* so that no compiler adds bytes of its own */
-    uint16_t weight[PLUSH_KEPT];
-} plush_quantiles;
-
-/* A sensor that calibrates itself: the block at hand, what is known, and what follows. */
-typedef struct {
-    union {
-        plush_sphere sphere;
-        plush_quantiles quantiles;
-    } of;
-    int64_t squares, level;                /* of the block at hand; the variance of still blocks */
-    int32_t base[3], sum[3], offset[3];    /* the first sample, from which all is measured; offset: with 4 fraction bits */
-    uint32_t multiplier;
-    uint16_t count;                        /* samples of the block at hand */
-    uint8_t begun, down, exponent;         /* exponent: of the sums of a sphere; of the blocks of an interval */
-    uint8_t kept, blocks, spare;           /* kept blocks; blocks of the interval at hand */
-} plush_sensor;
-
-#endif /* PLUSH_CALIBRATE */
 /* A toy: everything about one stream. Fields from `answer` to `reading` may be read, none may be written. */
 typedef struct plush_toy {
     plush_answer answer;     /* the newest one; its `state` is that of the toy at any time */
@@ -216,12 +183,11 @@ typedef struct plush_toy {
     int32_t *held, *before, *sample;
 
 #ifdef PLUSH_CALIBRATE
-    /* Self-calibration. */
     uint8_t sensors;
     const uint8_t *sensor_plan;
-    plush_sensor *sensor;
+    struct plush_sensor *sensor;
+#endif
 
-#endif /* PLUSH_CALIBRATE */
     /* Inputs: those of the newest sample, for a vector layer without a gate; running means. */
     uint8_t means, mean_shift;
     uint16_t mean_samples;
@@ -297,12 +263,8 @@ uint32_t plush_push(plush_toy *toy, uint32_t ms, const int32_t *values);
  * on where the last one was, or begins again after a gap. */
 void plush_silence(plush_toy *toy);
 
-#ifdef PLUSH_CALIBRATE
-/* Forgets the past, as after a gap: what is going on ends; the counts stay, and so do a fault and what was found out of
- * the offset and scale of sensors, which only plush_begin() and plush_swap() forget. */
-#else
-/* Forgets the past, as after a gap: what is going on ends; the counts stay, and so does a fault. */
-#endif /* PLUSH_CALIBRATE */
+/* Forgets the past, as after a gap: what is going on ends; the counts stay, and so do a fault and what sensors that calibrate
+ * themselves have found out, which only plush_begin() and plush_swap() forget. */
 void plush_restart(plush_toy *toy);
 
 /* The label of a class, and of the model (its architecture and filters). */

@@ -64,6 +64,15 @@ class OnnxGraph:
         """Add a constant with one value per channel, as (C, 1) to broadcast over windows (N, C, T)."""
         return self.constant(name, values[:, None])
 
+    def part(self, out: str, z: str, axis: int, first: int, last: int) -> str:
+        """Add a slice of one axis."""
+        edges = (np.array([v], dtype=np.int64) for v in (first, last, axis))
+        return self.add("Slice", out, z, *(self.constant(f"{out}.{k}", v) for k, v in enumerate(edges)))
+
+    def turned(self, out: str, z: str, axis: int, order: Sequence[int]) -> str:
+        """Add a new order of the indices of one axis."""
+        return self.add("Gather", out, z, self.constant(f"{out}.order", np.array(order, dtype=np.int64)), axis=axis)
+
     def model(self, inputs: dict[str, Shape], outputs: dict[str, Shape], **settings: Any) -> Any:
         """Check the graph and return it as an ONNX model; inputs and outputs map names to shapes of float32 tensors."""
         helper, real = self.onnx.helper, self.onnx.TensorProto.FLOAT
@@ -161,27 +170,20 @@ def _invariants(
     """
     others, one = arch.channels - layer.axes, g.constant("axis.1", np.array([1], dtype=np.int64))
 
-    def part(name: str, z: str, axis: int, first: int, last: int) -> str:
-        edges = (np.array([v], dtype=np.int64) for v in (first, last, axis))
-        return g.add("Slice", name, z, *(g.constant(f"{name}.{k}", v) for k, v in enumerate(edges)))
-
     def length(name: str, z: str) -> str:
         # With keepdims=0, the sums of some filters are wrong in OpenVINO 2026.4 where all shapes are fixed.
         squares = g.add("ReduceSum", f"{name}.squares", g.add("Mul", f"{name}.each", z, z), one, keepdims=1)
         return g.add("Sqrt", name, g.add("Add", f"{name}.sum", squares, small))
 
-    def turned(name: str, z: str, axis: int, order: Sequence[int]) -> str:
-        return g.add("Gather", name, z, g.constant(f"{name}.order", np.array(order, dtype=np.int64)), axis=axis)
-
     small, smaller = (g.constant(f"epsilon.{i}", np.array(e, dtype=np.float32)) for i, e in enumerate(epsilons))
-    newest = part("newest", z, 2, layer.reach, arch.span)
-    gravity = part("gravity", newest, 1, arch.channels - 3, arch.channels)
+    newest = g.part("newest", z, 2, layer.reach, arch.span)
+    gravity = g.part("gravity", newest, 1, arch.channels - 3, arch.channels)
     up = g.add("Div", "up", gravity, length("gravity.length", gravity))
     up = g.add("Unsqueeze", "up.rows", up, g.constant("axis.2", np.array([2], dtype=np.int64)))
-    outputs = [part("others", newest, 1, 0, others)] if others else []
+    outputs = [g.part("others", newest, 1, 0, others)] if others else []
     for v, kernels in enumerate(weights):
         n = f"vector{v}"
-        axes = part(f"{n}.axes", z, 1, others + 3 * v, others + 3 * v + 3)
+        axes = g.part(f"{n}.axes", z, 1, others + 3 * v, others + 3 * v + 3)
         if sizes is not None:
             size, *edges = (np.array(x, dtype=np.float32) for x in (sizes[v], -AXIS_LIMIT, AXIS_LIMIT))
             axes = g.add("Mul", f"{n}.sized", axes, g.constant(f"{n}.size", size))
@@ -195,10 +197,10 @@ def _invariants(
         d = g.add("Reshape", f"{n}.vectors", d, g.constant(f"{n}.shape", shape))
         vertical = g.add("ReduceSum", f"{n}.vertical", g.add("Mul", f"{n}.upward", d, up), one, keepdims=1)
         h = g.add("Sub", f"{n}.horizontal", d, g.add("Mul", f"{n}.lifted", vertical, up))
-        after = turned(f"{n}.next", h, 2, [*range(1, layer.filters), 0])
+        after = g.turned(f"{n}.next", h, 2, [*range(1, layer.filters), 0])
         ahead, back = (1, 2, 0), (2, 0, 1)
-        one_way = g.add("Mul", f"{n}.a", turned(f"{n}.h1", h, 1, ahead), turned(f"{n}.n2", after, 1, back))
-        other_way = g.add("Mul", f"{n}.b", turned(f"{n}.h2", h, 1, back), turned(f"{n}.n1", after, 1, ahead))
+        one_way = g.add("Mul", f"{n}.a", g.turned(f"{n}.h1", h, 1, ahead), g.turned(f"{n}.n2", after, 1, back))
+        other_way = g.add("Mul", f"{n}.b", g.turned(f"{n}.h2", h, 1, back), g.turned(f"{n}.n1", after, 1, ahead))
         cross = g.add("Sub", f"{n}.cross", one_way, other_way)
         turn = g.add("ReduceSum", f"{n}.turn", g.add("Mul", f"{n}.around", cross, up), one, keepdims=0)
         sized = g.add("Add", f"{n}.turn.sum", g.add("Mul", f"{n}.turn.square", turn, turn), smaller)

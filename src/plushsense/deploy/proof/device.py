@@ -13,8 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from plushsense.core.errors import DeviceError
-from plushsense.deploy.proof.vectors import Export, RowComparison, Vectors, compare, counted
-from plushsense.deploy.proof.verify import CHIP, Cycles, Progress, SettingResult, VerificationReport
+from plushsense.deploy.golden import Vectors, counted
+from plushsense.deploy.proof.vectors import Export, RowComparison, compare
+from plushsense.deploy.proof.verify import CHIP, Cycles, Progress, SettingResult, VerificationResult
 from plushsense.devices.bytestreams import Link, open_link
 from plushsense.runtime.image import image_check
 
@@ -105,7 +106,7 @@ class _DeviceInfo:
 
 def verify_device(
     export: Export, url: str, vectors: Sequence[Vectors] = (), *, progress: Progress | None = None
-) -> VerificationReport:
+) -> VerificationResult:
     """Send the vectors of an export to a chip that runs its harness, and compare every result.
 
     Golden vectors, patches, test scenarios and ``vectors`` are run. ``not_run`` names those for which the chip has too
@@ -150,7 +151,7 @@ def verify_device(
         _cycles(chip, measured, fitting),
     )
     decisions = sum(v.decisions for v in fitting if v not in scenarios)
-    return VerificationReport(export.title, export.edited, decisions, counted(fitting), (run,), tuple(not_run), ())
+    return VerificationResult(export.title, export.edited, decisions, counted(fitting), (run,), tuple(not_run), ())
 
 
 def _greet(packets: _PacketLink, export: Export) -> _DeviceInfo:

@@ -19,18 +19,17 @@ from plushsense.core.recorder_csv import Frames
 from plushsense.deploy.golden import (
     ANSWER,
     COLUMNS,
-    EVENT,
     HEAD,
-    HEALTH,
     TRACKING,
     FrameGenerator,
+    Vectors,
     answers_of,
     answers_over_patches,
-    column,
     measured,
+    samples_of,
 )
 from plushsense.runtime.decisions import Rules
-from plushsense.runtime.events import ANSWERS, BEGUN, ENDED, GATE, KINDS, NO_GESTURE, ONE, SOURCES, EventSettings
+from plushsense.runtime.events import NO_GESTURE, ONE, EventSettings
 from plushsense.runtime.fixed import LOGIT_LIMIT, PROBABILITY_BITS, Ints, LogitScale, known_score, split_ratio
 from plushsense.runtime.gate import JERK, LEVEL, Gate, GateSettings, Rule, Signal, Term
 from plushsense.runtime.health import HealthSettings
@@ -79,25 +78,7 @@ SCENARIO_SETTINGS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Scenario:
-    """A test case for the C: a model, frames to feed to it, and the expected answers.
-
-    Attributes:
-        frames: (n, 1 + C), the time in ms and the channels.
-        silences: indices of the frames after which a silence is reported.
-        rows: (m, 12 + 2 K), as `answers_of` computes them.
-        patches: indices of the frames after which a patch is offered, and its bytes; none: the patch is undone.
-    """
-
-    model: IntegerModel
-    frames: Ints
-    silences: tuple[int, ...]
-    rows: NDArray[np.int32]
-    patches: tuple[tuple[int, bytes], ...] = ()
-
-
-def scenarios_of(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[Scenario]:
+def scenarios_of(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[Vectors]:
     """Generate a scenario for each of `SCENARIO_SETTINGS`; deterministic, different for each ``repeat``."""
     return [
         _scenario(replace(model, rules=Rules(), gestures=_gestures(model, settings)), scaler, settings, seed)
@@ -109,7 +90,7 @@ def scenarios_of(model: IntegerModel, scaler: Scaler, repeat: int = 0) -> list[S
 OK, NOT_A_MODEL, DAMAGED, OTHER_MODEL = 0, 1, 3, 6
 
 
-def patches_of(model: IntegerModel, scaler: Scaler) -> Scenario:
+def patches_of(model: IntegerModel, scaler: Scaler) -> Vectors:
     """Generate frames between which patches of the model's last layer are used, refused and undone."""
     dense, arch = model.network.dense, model.network.arch
     scale = LogitScale(*(np.roll(getattr(dense.scale, name), 1) for name in ("before", "multiplier", "after")))
@@ -147,63 +128,10 @@ def patches_of(model: IntegerModel, scaler: Scaler) -> Scenario:
     parts = list(zip(layers, np.split(frames, cuts), strict=True))
     rows = np.concatenate(answers_over_patches(model, parts, [status for _, status, _ in offers]))
     patches = tuple((cut - 1, patch) for cut, (patch, _, _) in zip(cuts, offers, strict=True))
-    return Scenario(model, frames, (), rows, patches)
+    return Vectors("patch", frames, rows, samples_of(frames, model.layout), patches=patches)
 
 
-def all_outcomes() -> set[str]:
-    """Return the outcomes that scenarios should cover; with few classes some cannot occur."""
-    events = {f"{kind} by {source}" for kind in KINDS.values() for source in SOURCES}
-    ends = {"lost in silence", "lost in a gap", "lost in a fault", "replaced", "replaced by the gate"}
-    health = {"fault", "recovery", "suspect only"}
-    return events | ends | health | set(ANSWERS) | {"gate while warming", "unnamed", "without affect", "resting"}
-
-
-def outcomes_of(scenario: Scenario) -> set[str]:
-    """Return the subset of `all_outcomes` that a scenario reaches."""
-    rows, outcomes = scenario.rows.astype(np.int64), set()
-    answered = column(rows, "answer")[column(rows, "state") == TRACKING]
-    outcomes |= {ANSWERS[k] for k in set(answered.tolist())}
-    at = {name: n for n, name in enumerate(COLUMNS[EVENT])}
-    state, warm, ended = COLUMNS[ANSWER].index("state"), False, None
-    frame = COLUMNS[ANSWER].index("frame")
-    for n, row in enumerate(rows.tolist()):
-        after = rows[n + 1].tolist() if n + 1 < len(rows) else None
-        if row[0] == ANSWER:
-            warm = row[state] == TRACKING
-        elif row[0] == HEALTH:
-            fault, suspect = row[state] == 2, row[5]
-            outcomes.add("fault" if fault else "suspect only" if suspect else "recovery")
-        else:
-            kind, source = row[at["what"]], row[at["source"]]
-            outcomes.add(f"{KINDS[kind]} by {SOURCES[source]}")
-            if kind == BEGUN:
-                if source == GATE and not warm:
-                    outcomes.add("gate while warming")
-                if row[at["gesture"]] == NO_GESTURE:
-                    outcomes.add("unnamed")
-                if row[at["affect"]] == 0:
-                    outcomes.add("without affect")
-                if ended is not None and row[at["ms"]] - ended > 0:
-                    outcomes.add("resting")
-            if kind == ENDED:
-                ended = row[at["ms"]]
-                if (
-                    after is not None
-                    and after[0] == EVENT
-                    and after[at["what"]] == BEGUN
-                    and after[frame] == row[frame]
-                ):
-                    outcomes.add("replaced by the gate" if after[at["source"]] == GATE else "replaced")
-                elif after is not None and after[0] == HEALTH and after[frame] == row[frame] and after[state] == 2:
-                    outcomes.add("lost in a fault")
-                elif row[frame] in scenario.silences and row[at["since"]] == row[at["ms"]]:
-                    outcomes.add("lost in silence")
-                elif after is not None and after[HEAD - 2] > row[HEAD - 2]:
-                    outcomes.add("lost in a gap")
-    return outcomes
-
-
-def _scenario(plain: IntegerModel, scaler: Scaler, settings: _ScenarioSettings, seed: int) -> Scenario:
+def _scenario(plain: IntegerModel, scaler: Scaler, settings: _ScenarioSettings, seed: int) -> Vectors:
     rng = np.random.default_rng(seed)
     health = _health(plain, scaler, rng)
     frames, silences = (_troubled if settings.gate else _calm)(plain, scaler, health, rng)
@@ -211,7 +139,8 @@ def _scenario(plain: IntegerModel, scaler: Scaler, settings: _ScenarioSettings, 
     gate = _gate(plain, frames, settings.often, rng) if settings.gate else GateSettings()
     rules = Rules(_events(level, settings, rng), gate, health)
     model = replace(level.model, smoothing=settings.smoothing, rules=rules)
-    return Scenario(model, frames, silences, answers_of(model, frames, silences))
+    answers = answers_of(model, frames, silences)
+    return Vectors("scenario", frames, answers, samples_of(frames, model.layout), model, silences)
 
 
 def _logits(rows: NDArray[np.int32]) -> NDArray[np.float64]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,31 +14,29 @@ from numpy.typing import NDArray
 from plushsense.core.errors import BadInput, ConfigError, nearest
 from plushsense.core.files import read_bytes
 from plushsense.core.layouts import Layout
-from plushsense.core.recorder_csv import Frames
 from plushsense.dataset.store import Dataset
-from plushsense.deploy.emit import (
+from plushsense.deploy.code import (
     BUNDLE,
     FACTS,
     GOLDEN,
     IMAGE,
     LIBRARY,
     MOST_FILE_BYTES,
-    check_page,
+    check_names,
     code_files,
     facts_of,
     prefixed,
     read_facts,
     without_prefix,
 )
-from plushsense.deploy.golden import COLUMNS, HEAD, TRACKING, answers_of, column, golden_frames, read_golden
-from plushsense.deploy.package import foreign_files, package_files
+from plushsense.deploy.golden import COLUMNS, HEAD, Vectors, answers_of, golden_frames, read_golden, samples_of
+from plushsense.deploy.package import export_files, foreign_files
 from plushsense.deploy.proof.scenarios import patches_of, scenarios_of
 from plushsense.deploy.quantize import integer_model
 from plushsense.devices.virtual.stream import ToySpec, received
 from plushsense.models.bundle import Bundle
 from plushsense.runtime.fixed import Ints
-from plushsense.runtime.image import IntegerModel, memory_bytes
-from plushsense.windows.clock import resample
+from plushsense.runtime.image import IntegerModel
 
 _LOW, _HIGH = -(1 << 31), (1 << 31) - 1
 _PAUSE_MS = 1000
@@ -96,77 +93,6 @@ def recorded_frames(dataset: Dataset, layout: Layout, *, subjects: Sequence[str]
 MOST_FRAME_BYTES = 8 << 20
 
 
-@dataclass(frozen=True, eq=False)
-class Vectors:
-    """Frames (n, 1 + C) and the expected rows (m, 12 + 2 K); ``samples`` is the length of the resampled frames.
-
-    ``model``: model to run, if not that of the export; ``silences`` and ``patches``: as in `Scenario`.
-    """
-
-    name: str
-    frames: Ints
-    answers: NDArray[np.int32]
-    samples: int
-    model: IntegerModel | None = None
-    silences: tuple[int, ...] = ()
-    patches: tuple[tuple[int, bytes], ...] = ()
-
-    @property
-    def decisions(self) -> int:
-        """Number of answers after the warm-up."""
-        return int((column(self.answers, "state") == TRACKING).sum())
-
-    @property
-    def memory_bytes(self) -> int:
-        """Bytes of memory that ``model`` needs; 0 for the model of the export."""
-        return memory_bytes(self.model) if self.model else 0
-
-    @property
-    def kept_bytes(self) -> int:
-        """Bytes of the model and the patches, which the test program keeps until the end."""
-        model = len(self.model.to_bytes()) if self.model else 0
-        return sum(-(-n // 4) * 4 for n in (model, *(len(patch) for _, patch in self.patches)))
-
-    def to_bytes(self) -> bytes:
-        """Serialise for the test program, whose source describes the format: model, frames, silences and patches."""
-        pieces = [_counted(self.model.to_bytes() if self.model else b"")]
-        between = [(at, struct.pack("<I", _SILENCE)) for at in self.silences]
-        between += [(at, struct.pack("<I", _PATCH) + _counted(patch)) for at, patch in self.patches]
-        frames, begin = (self.frames & 0xFFFFFFFF).astype("<u4"), 0
-        for at, action in (*sorted(between), (len(frames) - 1, struct.pack("<I", _END))):
-            pieces += [struct.pack("<I", at + 1 - begin), frames[begin : at + 1].tobytes(), action]
-            begin = at + 1
-        return b"".join(pieces)
-
-
-# What comes after frames.
-_END, _SILENCE, _PATCH = range(3)
-
-
-def _counted(data: bytes) -> bytes:
-    """Return the number of bytes, and the bytes, filled up to whole 32-bit numbers."""
-    return struct.pack("<I", len(data)) + data + bytes(-len(data) % 4)
-
-
-@dataclass(frozen=True)
-class Counts:
-    """Number of frames, samples and answers streamed under one name."""
-
-    name: str
-    frames: int
-    samples: int
-    answers: int
-
-
-def counted(streams: Sequence[Vectors]) -> tuple[Counts, ...]:
-    """Return the total counts of the vectors of each name."""
-    return tuple(
-        Counts(name, sum(len(v.frames) for v in own), sum(v.samples for v in own), sum(len(v.answers) for v in own))
-        for name in dict.fromkeys(v.name for v in streams)
-        for own in [[v for v in streams if v.name == name]]
-    )
-
-
 class Export:
     """Export folder, opened for verification. The C of an export with a name is compiled without its prefix.
 
@@ -183,28 +109,20 @@ class Export:
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         facts = read_facts(self.folder)
-        self.title = str(facts["title"])
+        self.title = facts.title
         self._require_file(BUNDLE)
         self.bundle = Bundle.load(self.folder / BUNDLE)
         model = integer_model(self.bundle)
-        smoothing = facts.get("smoothing", model.smoothing)
-        if isinstance(smoothing, bool) or not isinstance(smoothing, int):
-            raise BadInput(f"'{self.folder / FACTS}' has the smoothing {smoothing!r}: export the model again.")
-        self.model: IntegerModel = replace(model, smoothing=smoothing)
+        self.model: IntegerModel = replace(model, smoothing=facts.smoothing)
         self._code = code_files(self.model, self.bundle)
-        name = str(facts.get("name", ""))
+        name = facts.name
         files = {file: self._read_file(prefixed(file, name)) for file in self._code}
-        expected = {
-            prefixed(f, name): c if f == IMAGE else prefixed(c.decode(), name).encode() for f, c in self._code.items()
-        }
-        self.facts = facts_of(self.model, self.bundle, self._code[IMAGE]) | ({"name": name} if name else {})
-        if "url" in facts:
-            check_page(facts["url"])
-            self.facts["url"] = facts["url"]
-        expected |= package_files(self.bundle, self.facts, self._code)
-        changed, self.edited = foreign_files(self.folder, expected, name)
-        written = json.loads(json.dumps(self.facts))
-        self.changed = (*changed, *([FACTS] if any(facts.get(key) != written[key] for key in written) else []))
+        check_names(url=facts.url)
+        self.facts = replace(facts_of(self.model, self.bundle, self._code[IMAGE]), name=name, url=facts.url)
+        changed, self.edited = foreign_files(self.folder, export_files(self.bundle, self.facts, self._code), name)
+        written = replace(self.facts, conversions=facts.conversions, files=facts.files)
+        same = json.dumps(facts.to_json(), sort_keys=True) == json.dumps(written.to_json(), sort_keys=True)
+        self.changed = (*changed, *([] if same else [FACTS]))
         compiled = {prefixed(file, name) for file in files} & set(self.changed)
         self._files = {f: c if f == IMAGE else without_prefix(c, name) for f, c in files.items()} if name else None
         self._compiles_changed = bool(compiled)
@@ -213,7 +131,7 @@ class Export:
         self._patched: Vectors | None = None
         arch = self.model.network.arch
         frames, answers = read_golden(self.folder / GOLDEN, len(self.model.layout.channels), arch.classes)
-        self.golden = Vectors("golden", frames, answers, self.samples_of(frames))
+        self.golden = Vectors("golden", frames, answers, self._samples(frames))
         # The golden vectors of a model edited by hand may differ: the runs report that.
         self.is_own = IMAGE not in self.changed
         if self.is_own:
@@ -259,6 +177,11 @@ class Export:
                 bundle=BUNDLE,
             )
 
+    @property
+    def code_names(self) -> tuple[str, ...]:
+        """Names of the files that a program is compiled from, without the name of the export."""
+        return tuple(self._code)
+
     def code(self, room: Path) -> Path:
         """Return the folder to compile from: the new folder ``room``, or the export itself if its C was changed and it
         has no name.
@@ -281,14 +204,13 @@ class Export:
     def labels(self) -> tuple[str, ...]:
         return self.model.gestures.labels
 
-    def samples_of(self, frames: Ints) -> int:
-        """Return the number of samples that frames are resampled to."""
-        return sum(map(len, resample(Frames(frames[:, 1:], frames[:, 0]), self.model.layout)))
+    def _samples(self, frames: Ints) -> int:
+        return samples_of(frames, self.model.layout)
 
     def answered(self, name: str, frames: Ints) -> Vectors:
         """Compute the expected answers to frames; raise BadInput like `require_own`."""
         self.require_own()
-        return Vectors(name, frames, answers_of(self.model, frames), self.samples_of(frames))
+        return Vectors(name, frames, answers_of(self.model, frames), self._samples(frames))
 
     def require_own(self) -> None:
         """Raise BadInput if plush_model.bin differs from what this version makes of the bundle."""
@@ -306,10 +228,7 @@ class Export:
         if not self.is_own:
             return []
         if repeat not in self._scenarios:
-            self._scenarios[repeat] = [
-                Vectors("scenario", s.frames, s.rows, self.samples_of(s.frames), s.model, s.silences)
-                for s in scenarios_of(self.model, self.bundle.scaler, repeat)
-            ]
+            self._scenarios[repeat] = scenarios_of(self.model, self.bundle.scaler, repeat)
         return self._scenarios[repeat]
 
     def patched(self) -> list[Vectors]:
@@ -317,8 +236,7 @@ class Export:
         if not self.is_own:
             return []
         if self._patched is None:
-            s = patches_of(self.model, self.bundle.scaler)
-            self._patched = Vectors("patch", s.frames, s.rows, self.samples_of(s.frames), patches=s.patches)
+            self._patched = patches_of(self.model, self.bundle.scaler)
         return [self._patched]
 
     def made_up(self, samples: int) -> list[Vectors]:
@@ -328,7 +246,7 @@ class Export:
         while n_samples < samples:
             span, health = self.model.network.arch.span, self.model.rules.health
             pieces.append(golden_frames(self.model.layout, self.bundle.scaler, span, seed, health=health))
-            n_samples += self.samples_of(pieces[-1])
+            n_samples += self._samples(pieces[-1])
             seed += 1
         return [self.answered("made up", p) for p in in_parts(np.concatenate(pieces))] if pieces else []
 
@@ -338,7 +256,7 @@ class Export:
         rows = samples
         while True:
             frames = recorded_frames(dataset, layout, subjects=subjects, rows=rows)
-            n_samples = self.samples_of(frames)
+            n_samples = self._samples(frames)
             if n_samples >= samples or len(frames) < rows:
                 break
             rows += max(samples - n_samples, rows // 4)

@@ -16,17 +16,19 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import repeat
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from plushsense.core.errors import BuildError, ProgramError, ToolError
 from plushsense.core.sentences import Message
-from plushsense.deploy.emit import IMAGE, LIBRARY, MODEL
+from plushsense.deploy.code import IMAGE, LIBRARY, MODEL
+from plushsense.deploy.golden import Counts, Vectors, counted
 from plushsense.deploy.proof.mutants import RULES, Mutant, mutants_of
-from plushsense.deploy.proof.vectors import Counts, Export, RowComparison, Vectors, compare, counted
+from plushsense.deploy.proof.vectors import Export, RowComparison, compare
 from plushsense.deploy.targets import C_FOLDER, TARGETS, build, missing_tools, require, target_named
 
+T = TypeVar("T")
 Progress = Callable[[int, int], None]
 Stream = tuple[Vectors, ...]  # run by one program, one after the other
 Cases = tuple[Stream, Path]  # a stream, and the file with it for the harness
@@ -102,7 +104,7 @@ class SettingResult:
     first: str | None = None
     cycles: Cycles | None = None
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the result as plain values for JSON."""
         cycles = dict(vars(self.cycles)) if self.cycles else None
         return {**vars(self), "seconds": round(self.seconds, 2), "cycles": cycles}
@@ -126,14 +128,14 @@ class MutantResult:
         """
         return not self.caught and self.kind in RULES
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the result as plain values for JSON."""
         values = {"fault" if key == "name" else key: value for key, value in vars(self).items()}
         return values | {"silent": self.silent}
 
 
 @dataclass(frozen=True)
-class VerificationReport:
+class VerificationResult:
     """Result of a verification; ``passed`` if nothing differs and all mutants that affect the model were caught.
 
     ``decisions`` counts the answers after the warm-up, of which there must be some. ``changed`` names the files of the
@@ -170,7 +172,7 @@ class VerificationReport:
     def passed(self) -> bool:
         return self.mismatches == 0 and self.decisions > 0 and all(m.caught or m.silent for m in self.mutants)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the object that ``plushsense verify --json`` prints."""
         return {
             "title": self.title,
@@ -183,9 +185,9 @@ class VerificationReport:
             "max_abs_diff": max((r.max_abs_diff for r in self.runs), default=0),
             "first": self.first,
             "streams": [dict(vars(c)) for c in self.counts],
-            "runs": [r.to_dict() for r in self.runs],
+            "runs": [r.to_json() for r in self.runs],
             "not_run": [{"what": part, "why": reason} for part, reason in self.not_run],
-            "faults": [m.to_dict() for m in self.mutants],
+            "faults": [m.to_json() for m in self.mutants],
         }
 
 
@@ -199,7 +201,7 @@ def verify(
     trust: bool = False,
     jobs: int | None = None,
     progress: Progress | None = None,
-) -> VerificationReport:
+) -> VerificationResult:
     """Compile the C of the export folder for each target, run it, and compare every result.
 
     Args:
@@ -221,64 +223,60 @@ def verify(
     if not trust:
         export.require_unchanged()
     settings, not_run = _choose(targets, only)
-    patched = export.patched()
-    scenarios = (*export.scenarios(), *patched)
-    streams = [(export.golden,), *([scenarios] if scenarios else []), *((v,) for v in vectors)]
+    scenarios = (*export.scenarios(), *export.patched())
+    streams: list[Stream] = [(export.golden,), *([scenarios] if scenarios else []), *((v,) for v in vectors)]
     selected: list[Mutant] = []
     if mutants:
         export.require_own()
         selected = [m for m in mutants_of(export.image, export.source.decode(_ENCODING)) if mutants(m)]
-    chosen = list(dict.fromkeys(s.target for s in settings))
-    total, done = len(settings) + len(selected) * len(chosen), 0
-    runs: list[SettingResult] = []
+    first_of: dict[str, Setting] = {}
+    for setting in settings:
+        first_of.setdefault(setting.target, setting)
+    pairs = [(mutant, setting) for mutant in selected for setting in first_of.values()]
     results: list[MutantResult] = []
-
-    def report() -> None:
-        nonlocal done
-        done += 1
-        if progress:
-            progress(done, total)
-
     with (
         tempfile.TemporaryDirectory(prefix="plushsense-verify-", ignore_cleanup_errors=True) as work,
         ThreadPoolExecutor(jobs or os.cpu_count() or 1) as pool,
     ):
-        runner = _Runner(export, Path(work))
+        runner = _Runner(export, Path(work), pool, progress, len(settings) + len(pairs))
         cases = [runner.write_cases(stream) for stream in streams]
-        for result in pool.map(runner.run, settings, repeat(cases)):
-            runs.append(result)
-            report()
+        runs = runner.report(pool.map(runner.run, settings, repeat(cases)))
         # If the C differs already, every mutant would count as caught.
-        if any(r.mismatches for r in runs):
-            selected = []
-        first_of = {target: next(s for s in settings if s.target == target) for target in chosen}
-        pairs = [(mutant, first_of[target]) for mutant in selected for target in chosen]
-        mutant_cases = cases[: 1 + bool(scenarios)]
-        patch_cases = [runner.write_cases(tuple(patched))] if selected else []
-
-        def outcome_of(mutant: Mutant, setting: Setting) -> MutantResult:
-            return runner.run_mutant(mutant, setting, patch_cases if mutant.kind == "patch" else mutant_cases)
-
-        for outcome in pool.map(outcome_of, *zip(*pairs, strict=True)) if pairs else ():
-            results.append(outcome)
-            report()
-        # Other scenarios may contain the rare sequences of steps that a mutant affects.
-        for again in range(1, 1 + MORE_SCENARIOS):
-            missed = [n for n, result in enumerate(results) if result.silent]
-            if not missed:
-                break
-            more = [runner.write_cases(tuple(export.scenarios(again)))]
-            unchanged = [runner.run(first_of[target], more) for target in chosen]
-            if any(r.mismatches for r in unchanged):
-                runs += unchanged
-                break
-            repeated = pool.map(lambda n: runner.run_mutant(*pairs[n], more), missed)  # noqa: B023
-            for at, outcome in zip(missed, repeated, strict=True):
-                results[at] = outcome
+        if pairs and not any(r.mismatches for r in runs):
+            results = _run_mutants(runner, pairs, cases[: 1 + bool(scenarios)], runs)
     all_vectors = [v for stream in streams for v in stream]
     decisions = sum(v.decisions for v in all_vectors if v not in scenarios)
     changed, counts = (*export.changed, *export.edited), counted(all_vectors)
-    return VerificationReport(export.title, changed, decisions, counts, tuple(runs), tuple(not_run), tuple(results))
+    return VerificationResult(export.title, changed, decisions, counts, tuple(runs), tuple(not_run), tuple(results))
+
+
+def _run_mutants(
+    runner: _Runner, pairs: Sequence[tuple[Mutant, Setting]], cases: Sequence[Cases], runs: list[SettingResult]
+) -> list[MutantResult]:
+    """Run each mutant with its setting on the cases, and silent ones on other scenarios too.
+
+    These may contain the rare sequences of steps that a mutant affects. If the unchanged C differs on one of them, that
+    is added to ``runs``.
+    """
+    patches = [runner.write_cases(tuple(runner.export.patched()))]
+
+    def outcome(pair: tuple[Mutant, Setting]) -> MutantResult:
+        return runner.run_mutant(*pair, patches if pair[0].kind == "patch" else cases)
+
+    results = runner.report(runner.pool.map(outcome, pairs))
+    for again in range(1, 1 + MORE_SCENARIOS):
+        missed = [n for n, result in enumerate(results) if result.silent]
+        if not missed:
+            break
+        more = [runner.write_cases(tuple(runner.export.scenarios(again)))]
+        unchanged = [runner.run(setting, more) for setting in dict.fromkeys(setting for _, setting in pairs)]
+        if any(r.mismatches for r in unchanged):
+            runs += unchanged
+            break
+        repeated = runner.pool.map(lambda n: runner.run_mutant(*pairs[n], more), missed)  # noqa: B023
+        for at, result in zip(missed, repeated, strict=True):
+            results[at] = result
+    return results
 
 
 def _choose(targets: Sequence[str], only: Callable[[Setting], bool]) -> tuple[list[Setting], list[tuple[str, str]]]:
@@ -333,8 +331,11 @@ def _no_sanitizers(setting: Setting) -> str:
 class _Runner:
     """Compiles and runs the C of an export in a work folder; programs may run at the same time."""
 
-    def __init__(self, export: Export, work: Path) -> None:
+    def __init__(
+        self, export: Export, work: Path, pool: ThreadPoolExecutor, progress: Progress | None, total: int
+    ) -> None:
         self.export, self.work, self.objects = export, work, work / "objects"
+        self.pool, self.progress, self.done, self.total = pool, progress, 0, total
         self.objects.mkdir()
         self.memory_bytes = 0  # that the models of all streams need: one harness for all of them
         self.code = export.code(work / "code")
@@ -345,6 +346,16 @@ class _Runner:
         self.memory_bytes = max(self.memory_bytes, *(v.memory_bytes for v in stream))
         path.write_bytes(b"".join(v.to_bytes() for v in stream))
         return stream, path
+
+    def report(self, results: Iterable[T]) -> list[T]:
+        """Return the results, and report the progress as each is there."""
+        finished = []
+        for result in results:
+            finished.append(result)
+            self.done += 1
+            if self.progress:
+                self.progress(self.done, self.total)
+        return finished
 
     def _new_folder(self) -> Path:
         return Path(tempfile.mkdtemp(dir=self.work))
@@ -390,7 +401,7 @@ class _Runner:
         out = self._new_folder()
         copy = out / "export"
         copy.mkdir()
-        for name in (*LIBRARY, *MODEL, IMAGE):
+        for name in self.export.code_names:
             shutil.copyfile(self.code / name, copy / name)
         if mutant.image is not None:
             (copy / IMAGE).write_bytes(mutant.image)

@@ -8,8 +8,10 @@ import socket
 import sys
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 from plushsense.core.errors import ConfigError, DeviceError
 from plushsense.core.layouts import Layout, load_layout
@@ -123,54 +125,7 @@ class ToyServer:
             raise ConfigError(f"The port is {port}; a whole number from 0 (a free one) to 65535 is accepted.")
         if not 0.0 <= self.speed < float("inf"):
             raise ConfigError(f"The toy's speed is {self.speed}: accepted are 0 (fastest) and finite numbers above.")
-        stream = ToyStream(self.spec, self.layout, self.prompts)
-        counters = ToyCounters()
-        listening = _listen(port)
-        port = listening.getsockname()[1]
-        server: socket.socket | None = listening
-        client: socket.socket | None = None
-        outlet: _Outlet | None = None
-        self.on_ready(f"tcp://{HOST}:{port}")
-
-        def send(data: bytes) -> bool:
-            nonlocal server, client, outlet
-            if server is None:
-                server = _listen(port)
-            while client is None and not self.stop.is_set():
-                try:
-                    client, _ = server.accept()
-                except BlockingIOError:
-                    if data and self.speed > 0.0:
-                        return False
-                    select.select([server], [], [], 0.05)
-                    continue
-                client.setblocking(False)
-                client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                outlet = _Outlet(client.send, client.fileno(), self._stall_s)
-                counters.connections += 1
-            if client is None or outlet is None:
-                return False
-            try:
-                return outlet.send(data, self.stop)
-            except OSError:  # the reader has disconnected: accept the next one
-                client.close()
-                client = outlet = None
-                return False
-
-        def disconnect() -> None:
-            nonlocal server, client, outlet
-            for end in (client, server):
-                if end is not None:
-                    end.close()
-            server = client = outlet = None
-
-        try:
-            if self.spec.scenario is not None:
-                send(b"")  # waits for the first reader
-            self._run(stream, send, counters, disconnect)
-        finally:
-            disconnect()
-        return counters
+        return self._run(_TcpPort(self, port))
 
     def serve_pty(self) -> ToyCounters:
         """Serve on a pseudo terminal that looks like a serial port, until `stop` is set. Linux and macOS.
@@ -185,70 +140,19 @@ class ToyServer:
         """
         if sys.platform == "win32":
             raise DeviceError("Windows has no pseudo terminals: serve the toy over TCP instead (toy --tcp PORT).")
-        import pty
-        import tty
-
         if not 0.0 < self.speed < float("inf"):
             raise ConfigError(f"The toy's speed on a terminal is {self.speed:g}: accepted are finite numbers above 0.")
-        stream = ToyStream(self.spec, self.layout, self.prompts)
-        counters = ToyCounters()
-        fast = self.speed > 1.0
-        outlet: _Outlet | None = None
-        ends: tuple[int, int] = (-1, -1)
-        name = ""
-
-        def plug() -> _Outlet:
-            nonlocal ends, name
-            master, slave = ends = _open_pty(pty.openpty, name)
-            # Raw mode: no echo, unchanged line ends. The slave stays open, so that readers may come and go.
-            tty.setraw(slave)
-            os.set_blocking(master, False)
-            if os.ttyname(slave) != name:
-                name = os.ttyname(slave)
-                self.on_ready(f"serial://{name}")
-            return _Outlet(
-                lambda data: os.write(master, data),
-                master,
-                self._stall_s,
-                absent=not fast,
-                unread=(lambda: _unread(slave)) if fast else None,
-            )
-
-        def send(data: bytes) -> bool:
-            nonlocal outlet
-            outlet = outlet or plug()
-            return outlet.send(data, self.stop)
-
-        def disconnect() -> None:
-            nonlocal outlet
-            if outlet is not None:
-                # Closing discards what was not read, and the last bytes take a moment to arrive.
-                outlet.wait_for_reader(0, self.stop)
-                self.stop.wait(_LAST_S if fast else 0.0)
-                outlet.wait_for_reader(0, self.stop)
-                outlet = None
-                for end in ends:
-                    os.close(end)
-
-        outlet = plug()
-        try:
-            self._run(stream, send, counters, disconnect)
-        finally:
-            disconnect()
-        return counters
+        return self._run(_Terminal(self))
 
     @property
-    def _stall_s(self) -> float:
+    def stall_s(self) -> float:
+        """Time after which lines are dropped if nobody reads them."""
         return _STALL_S if 0.0 < self.speed <= 1.0 else _FAST_STALL_S
 
-    def _run(
-        self,
-        stream: ToyStream,
-        send: Callable[[bytes], bool],
-        counters: ToyCounters,
-        disconnect: Callable[[], None],
-    ) -> None:
-        """Send each line when it is due, and call ``disconnect`` while the toy shall not be connected."""
+    def _run(self, port: _Port) -> ToyCounters:
+        """Send each line when it is due; disconnect while the toy shall not be connected."""
+        counters = ToyCounters()
+        stream = ToyStream(self.spec, self.layout, self.prompts)
         pacer = Pacer(self.speed)
         batch, lines = bytearray(), 0
         largest = 4096 if self.speed <= 1.0 else _FAST_QUEUE
@@ -257,7 +161,7 @@ class ToyServer:
             nonlocal lines
             if not batch:
                 return
-            if send(bytes(batch)):
+            if port.send(bytes(batch)):
                 counters.sent += lines
                 self.on_sent(bytes(batch))
             else:
@@ -265,25 +169,143 @@ class ToyServer:
             batch.clear()
             lines = 0
 
-        for line in stream:
-            if self.stop.is_set():
-                break
-            if self.seconds and line.passed_ms >= self.seconds * 1000.0:
-                break
-            due = pacer.due_s(line.passed_ms)
-            if due > 0.0 or len(batch) > largest:
-                flush()
-                if due > 0.0 and self.stop.wait(due):
+        try:
+            port.open()
+            for line in stream:
+                if self.stop.is_set() or (self.seconds and line.passed_ms >= self.seconds * 1000.0):
                     break
-            if line.begins is not None:
-                counters.gestures += 1
-                self.on_performed(line.begins)
-            if not line.connected:
-                flush()
-                disconnect()
-            batch += line.data
-            lines += max(line.data.count(b"\n"), bool(line.data))
-        flush()
+                due = pacer.due_s(line.passed_ms)
+                if due > 0.0 or len(batch) > largest:
+                    flush()
+                    if due > 0.0 and self.stop.wait(due):
+                        break
+                if line.begins is not None:
+                    counters.gestures += 1
+                    self.on_performed(line.begins)
+                if not line.connected:
+                    flush()
+                    port.disconnect()
+                batch += line.data
+                lines += max(line.data.count(b"\n"), bool(line.data))
+            flush()
+        finally:
+            port.disconnect()
+        counters.connections = port.connections
+        return counters
+
+
+class _Port(ABC):
+    """The end of a connection at which the toy of a server is, and which others read."""
+
+    def __init__(self, toy: ToyServer) -> None:
+        self.toy = toy
+        self.connections = 0
+        self.outlet: _Outlet | None = None
+
+    @abstractmethod
+    def open(self) -> None:
+        """Make the port ready for its first reader, after which `ToyServer.on_ready` is called."""
+
+    @abstractmethod
+    def send(self, data: bytes) -> bool:
+        """Send lines, connected again if needed; return False if some were dropped."""
+
+    @abstractmethod
+    def disconnect(self) -> None:
+        """Close what is open."""
+
+
+class _TcpPort(_Port):
+    """A port of this computer, with one reader at a time."""
+
+    def __init__(self, toy: ToyServer, port: int) -> None:
+        super().__init__(toy)
+        self.port = port
+        self.server: socket.socket | None = None
+        self.client: socket.socket | None = None
+
+    def open(self) -> None:
+        """As in `_Port`; for a scenario, wait for the first reader."""
+        self.server = _listen(self.port)
+        self.port = self.server.getsockname()[1]
+        self.toy.on_ready(f"tcp://{HOST}:{self.port}")
+        if self.toy.spec.scenario is not None:
+            self.send(b"")
+
+    def send(self, data: bytes) -> bool:
+        """As in `_Port`; wait for a reader if there are no lines, or they need not be on time."""
+        server = self.server = self.server or _listen(self.port)
+        while self.client is None and not self.toy.stop.is_set():
+            try:
+                self.client, _ = server.accept()
+            except BlockingIOError:
+                if data and self.toy.speed > 0.0:
+                    return False
+                select.select([server], [], [], 0.05)
+                continue
+            self.client.setblocking(False)
+            self.client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self.outlet = _Outlet(self.client.send, self.client.fileno(), self.toy.stall_s)
+            self.connections += 1
+        if self.client is None or self.outlet is None:
+            return False
+        try:
+            return self.outlet.send(data, self.toy.stop)
+        except OSError:  # the reader has disconnected: accept the next one
+            self.client.close()
+            self.client = self.outlet = None
+            return False
+
+    def disconnect(self) -> None:
+        """As in `_Port`."""
+        for end in (self.client, self.server):
+            if end is not None:
+                end.close()
+        self.server = self.client = self.outlet = None
+
+
+class _Terminal(_Port):
+    """A pseudo terminal, whose slave end stays open, so that readers may come and go."""
+
+    def __init__(self, toy: ToyServer) -> None:
+        super().__init__(toy)
+        self.ends: tuple[int, int] = (-1, -1)
+        self.name = ""
+
+    def open(self) -> None:
+        """As in `_Port`."""
+        if sys.platform == "win32":
+            return
+        import pty
+        import tty
+
+        master, slave = self.ends = _open_pty(pty.openpty, self.name)
+        tty.setraw(slave)  # no echo, unchanged line ends
+        os.set_blocking(master, False)
+        if os.ttyname(slave) != self.name:
+            self.name = os.ttyname(slave)
+            self.toy.on_ready(f"serial://{self.name}")
+        fast = self.toy.speed > 1.0
+        unread = (lambda: _unread(slave)) if fast else None
+        write = partial(os.write, master)
+        self.outlet = _Outlet(write, master, self.toy.stall_s, absent=not fast, unread=unread)
+
+    def send(self, data: bytes) -> bool:
+        """As in `_Port`."""
+        if self.outlet is None:
+            self.open()
+        return self.outlet is not None and self.outlet.send(data, self.toy.stop)
+
+    def disconnect(self) -> None:
+        """As in `_Port`."""
+        outlet, self.outlet = self.outlet, None
+        if outlet is not None:
+            # Closing discards what was not read, and the last bytes take a moment to arrive.
+            outlet.wait_for_reader(0, self.toy.stop)
+            self.toy.stop.wait(_LAST_S if self.toy.speed > 1.0 else 0.0)
+            outlet.wait_for_reader(0, self.toy.stop)
+            for end in self.ends:
+                os.close(end)
 
 
 def _listen(port: int) -> socket.socket:

@@ -9,9 +9,6 @@ Units: seconds, hertz, g (gravity), counts (raw integers of the toy). Places run
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
-import json
 import math
 from dataclasses import dataclass
 
@@ -123,11 +120,6 @@ class World:
     lost: float = 0.0005  # share of the lines that never arrive
     garbled: float = 0.0003
     glitch: float = 0.00002  # share of the frames in which an electrode reads nonsense
-
-    def fingerprint(self) -> str:
-        """Return the SHA-256 of all the numbers."""
-        text = json.dumps(dataclasses.asdict(self), sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()
 
 
 WORLD = World()

@@ -30,7 +30,7 @@ from starlette.requests import ClientDisconnect
 from plushsense.core.errors import ConfigError
 from plushsense.dataset.importing.archives import zip_entry
 from plushsense.dataset.publishing.tables import list_package_files
-from plushsense.deploy.emit import FACTS
+from plushsense.deploy.code import FACTS
 from plushsense.studio.app.workspace import BACKUPS, EXPORTS, PACKAGES, Workspace
 
 Scope = dict[str, Any]

@@ -5,13 +5,12 @@ from __future__ import annotations
 import importlib.util
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from plushsense.core.errors import PlushSenseError
 from plushsense.core.sentences import Message
 from plushsense.dataset.publishing.tables import list_package_files
+from plushsense.deploy.code import FACTS, ModelFacts, read_facts
 from plushsense.deploy.convert import CONVERTERS
-from plushsense.deploy.emit import FACTS, TOY_BYTES, read_facts
 from plushsense.deploy.quantize import integer_model
 from plushsense.deploy.targets import TARGETS, missing_tools
 from plushsense.models.bundle import Bundle
@@ -83,7 +82,7 @@ class ExportFacts:
 
     folder: Path
     problem: Message | None = None
-    facts: dict[str, Any] = field(default_factory=dict)
+    facts: ModelFacts | None = None
     files: dict[str, int] = field(default_factory=dict)
     digest: str = ""
     made_s: float = 0.0
@@ -91,16 +90,6 @@ class ExportFacts:
     @property
     def name(self) -> str:
         return self.folder.name
-
-    @property
-    def flash_bytes(self) -> int:
-        """Bytes of flash memory for the data of the model, without code."""
-        return int(self.facts["model_bytes"])
-
-    @property
-    def ram_bytes(self) -> int:
-        """Bytes of RAM for one toy, on a processor with 32-bit pointers."""
-        return int(self.facts["memory_bytes"]) + TOY_BYTES
 
     @classmethod
     def of(cls, folder: Path) -> ExportFacts:

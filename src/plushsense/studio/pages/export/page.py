@@ -11,6 +11,7 @@ from nicegui import run, ui
 
 from plushsense.core.gestures import NOBODY
 from plushsense.dataset.store import UNKNOWN_SUBJECT
+from plushsense.deploy.code import ModelFacts
 from plushsense.deploy.convert import CONVERTERS
 from plushsense.deploy.package import ARDUINO, IDF, IDF_EXAMPLE, SKETCH
 from plushsense.deploy.targets import TARGETS
@@ -171,9 +172,10 @@ def _missing_target(words: Words, title: str, packages: Sequence[str]) -> str:
 
 def show_facts(page: Page, export: ExportFacts, made: StudioJob | None) -> None:
     """Build the card with facts, files and download of an export; ``made`` is the job that wrote it, if known."""
-    words, card = page.words, export.facts
+    words, model = page.words, export.facts
+    assert model is not None
     with tag(ui.column().classes("ps-card w-full"), "export-facts"):
-        if card.get("simulated"):
+        if model.simulated:
             notice(words("Simulation: these data say nothing about a real toy."))
         for warning in made.warnings if made else ():
             notice(words.sentence(warning))
@@ -181,7 +183,7 @@ def show_facts(page: Page, export: ExportFacts, made: StudioJob | None) -> None:
         download = ui.link(words("Download as a zip"), download_address(EXPORTS, export.name)).classes("ps-link")
         tag(download.props("download"), "download")
         with _folded(words("Details for the engineer")):
-            _list_facts(words, export)
+            _list_facts(words, export, model)
 
 
 def _folded(title: str) -> ui.element:
@@ -192,31 +194,30 @@ def _folded(title: str) -> ui.element:
     return box
 
 
-def _list_facts(words: Words, export: ExportFacts) -> None:
+def _list_facts(words: Words, export: ExportFacts, model: ModelFacts) -> None:
     """List the facts and the files of an export."""
-    card = export.facts
-    step = words.significant(card["step_ms"], 3)
+    step = words.significant(model.step_ms, 3)
     facts(
         [
-            (words("Network structure"), str(card["title"])),
-            (words("Gestures"), str(card["classes"])),
-            (words("Sensors"), str(card.get("layout", ""))),
+            (words("Network structure"), model.title),
+            (words("Gestures"), str(model.classes)),
+            (words("Sensors"), model.layout),
             (
                 words("Flash for the network"),
-                words("{n} bytes, without the code; see the cost below", n=words.count(export.flash_bytes)),
+                words("{n} bytes, without the code; see the cost below", n=words.count(model.flash_bytes)),
             ),
-            (words("RAM"), words("{n} bytes for each toy", n=words.count(export.ram_bytes))),
+            (words("RAM"), words("{n} bytes for each toy", n=words.count(model.ram_bytes))),
             (
                 words("A step"),
-                words("every {ms} ms, {macs} multiplications", ms=step, macs=words.count(card["macs_per_step"])),
+                words("every {ms} ms, {macs} multiplications", ms=step, macs=words.count(model.macs_per_step)),
             ),
             (words("Created"), moment(export.made_s)),
             (words("Folder"), str(export.folder)),
         ]
     )
-    for name, each in card.get("conversions", {}).items():
-        apart = each.get("largest_difference")
-        message = words("{name}: {file}, {n} bytes.", file=each["file"], n=words.count(each["bytes"]), name=name)
+    for name, each in model.conversions.items():
+        apart = each.largest_difference
+        message = words("{name}: {file}, {n} bytes.", file=each.file, n=words.count(each.bytes), name=name)
         if apart is not None:
             difference = words.significant(apart, 1)
             message += f" {words('Its outputs differ by up to {d} from those of the trained network.', d=difference)}"
@@ -661,8 +662,8 @@ class _Exporting:
             rows.append(
                 (
                     link(each.name, address("export", name=each.name)),
-                    words.sentence(each.problem) if each.problem else str(each.facts["title"]),
-                    words("simulation") if each.facts.get("simulated") else "",
+                    each.facts.title if each.facts else words.sentence(each.problem) if each.problem else "",
+                    words("simulation") if each.facts and each.facts.simulated else "",
                     moment(each.made_s) if each.made_s else "",
                     verification_verdict(words, each, proof),
                 )

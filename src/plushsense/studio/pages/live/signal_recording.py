@@ -26,7 +26,7 @@ from plushsense.recording.plan import Protocol, Step
 from plushsense.recording.recorder import store_take
 from plushsense.recording.session import OpenSession, check_subject, new_event, new_session
 from plushsense.recording.session_files import SessionEvent, SessionHead
-from plushsense.recording.takes import FrameReceiver, RecordingTake, gap_entry
+from plushsense.recording.takes import FrameReceiver, RecordingTake, StreamGap
 from plushsense.recording.writer import BackgroundWriter, StreamFile
 from plushsense.studio.app.toys import TappedDevice
 from plushsense.studio.app.workspace import Workspace
@@ -144,7 +144,7 @@ class SignalRecording:
             running.writer.add_frames([r.frame for r in received], running.receiver.toy_ms)
             for gap in (r.gap for r in received):
                 if gap is not None:
-                    running.writer.submit(new_event("gap", **gap))
+                    running.writer.submit(new_event("gap", **gap.to_json()))
             running.ended = running.passed_s >= running.longest_s
         if running.ended:
             threading.Thread(target=self.end, args=(running,), daemon=True).start()
@@ -253,7 +253,7 @@ def _count_losses(take: RecordingTake, layout: Layout) -> None:
             step_ms = frame.device_ms - last.device_ms
             if step_ms < 0 or step_ms > layout.gap_ms:
                 reason = "the toy's clock restarted" if step_ms < 0 else "nothing came"
-                take.gaps.append(gap_entry(at, last, frame, max(step_ms, frame.host_ms - last.host_ms, 0), reason))
+                take.gaps.append(StreamGap.of(at, last, frame, max(step_ms, frame.host_ms - last.host_ms, 0), reason))
         last = frame
 
 
