@@ -98,8 +98,8 @@ def test_facts_of_bundles(tmp_path: Path) -> None:
         18,
     )
     assert "train 5d1_4d3 with --padding stream" in causal.cannot and causal.problem is None
-    assert "bytes are missing at its end" in broken.problem
-    assert BundleFacts.of(tmp_path / "none.plush").problem.startswith("There is no bundle")
+    assert "its file is damaged" in broken.problem
+    assert BundleFacts.of(tmp_path / "none.plush").problem.startswith("The network “none” cannot be read")
 
 
 def test_a_zip_on_the_way(little: Workspace) -> None:

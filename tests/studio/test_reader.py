@@ -68,11 +68,11 @@ def test_a_bundle_is_swapped_without_opening_the_toy_again(workspace: Workspace)
     ("name", "engine", "reactions", "kind", "told"),
     [
         ("accel", "float", "", ConfigError, "'plush-15'.*'accel-3'"),
-        ("circus", "float", "", ConfigError, "'circus'"),
+        ("circus", "float", "", ConfigError, "circus"),
         ("one", "int8", "", BundleError, "calibration"),
         ("one", "float", "wild", ConfigError, "wild"),
-        ("gone", "float", "", BundleError, "no bundle"),
-        ("../../elsewhere", "float", "", ConfigError, "outside"),
+        ("gone", "float", "", BundleError, "cannot be read"),
+        ("../../elsewhere", "float", "", ConfigError, "not in the studio's folder"),
     ],
 )
 def test_what_does_not_fit_is_refused_and_what_ran_goes_on(
